@@ -1,0 +1,45 @@
+# One word per task. Needs make, python3 (3.12 or newer, with venv) and a package index; everything else is installed
+# into .venv from requirements.lock.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/pip --disable-pip-version-check --quiet
+OUT ?= demo
+
+.PHONY: demo test lint bench lock clean help
+
+help: ## list the tasks
+	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
+
+demo: $(VENV)/installed ## the whole experiment, simulated; the last line is the path of its report
+	$(BIN)/faintfield demo $(OUT)
+
+test: $(VENV)/installed ## all tests
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed ## style, types and import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/installed ## speed against peers, as ratios
+	$(BIN)/python -m benchmarks
+
+lock: ## renew requirements.lock from pyproject.toml
+	$(PYTHON) -m venv .uv
+	.uv/bin/pip --disable-pip-version-check --quiet install uv
+	.uv/bin/uv pip compile pyproject.toml --all-extras --universal --upgrade --generate-hashes --no-annotate \
+	  --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
+
+clean: ## remove what the tasks made
+	rm -rf $(VENV) .uv build *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
+
+$(VENV)/installed: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \
+	  { echo "faintfield needs Python 3.12 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1). Try: make PYTHON=python3.13"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	@echo "Installing the locked packages into $(VENV) ..."
+	$(PIP) install --no-deps --require-hashes -r requirements.lock
+	$(PIP) install --no-deps --no-build-isolation -e .
+	@touch $@

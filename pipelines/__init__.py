@@ -1,0 +1,1 @@
+"""The commands: load, call, save, show. The only package that parses arguments, prints or draws."""

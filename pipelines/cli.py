@@ -1,0 +1,67 @@
+"""The command line: which commands there are, and how their ends become exit codes.
+
+A command is a function that takes its arguments and returns its result, a JSON-able object. Commands are registered
+by name, so that a module is imported only when its command runs.
+"""
+
+import sys
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated, Any
+
+import msgspec
+from cyclopts import App, CycloptsError, Parameter
+
+from calib.errors import CalibrationError
+from pipelines.console import console, say
+from pipelines.errors import InputError
+from recon.errors import ReconstructionError
+from rig.errors import RigError
+
+DONE, FAILED, WRONG_USAGE = 0, 1, 2
+NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)
+
+app = App(
+    name="faintfield",
+    help="See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.",
+    version=version("faintfield"),
+    error_console=console,
+    result_action="return_value",
+)
+
+
+@app.meta.default
+def _launch(
+    *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
+    json: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
+    """See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.
+
+    Parameters
+    ----------
+    json
+        Print the result as one JSON object on standard output.
+    """
+    result: Any = app(tokens, exit_on_error=False, print_error=True)
+    if json and result is not None:
+        sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one command and exit: 0 done, 1 a named failure (one line), 2 wrong usage."""
+    sys.exit(run(sys.argv[1:] if arguments is None else arguments))
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command and return its exit code; any other exception than a named failure is a bug."""
+    try:
+        app.meta(arguments, exit_on_error=False, print_error=True)
+    except CycloptsError:
+        return WRONG_USAGE
+    except NAMED_FAILURES as failure:
+        say(f"faintfield: {type(failure).__name__}: {failure}")
+        return FAILED
+    except KeyboardInterrupt:
+        say("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, nothing is half-written")
+        return FAILED
+    return DONE

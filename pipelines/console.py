@@ -1,0 +1,44 @@
+"""Words and progress for people, always on standard error; standard output is for results alone."""
+
+from collections.abc import Iterable, Iterator
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+console = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def say(text: str) -> None:
+    """Print one line of human words."""
+    console.print(text, markup=False)
+
+
+def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """Yield `items`, drawing a bar with a time to go on a terminal and nothing elsewhere.
+
+    Parameters
+    ----------
+    items : iterable
+        What to go through; the bar advances as each is taken.
+    label : str
+        What is being done, in a few words.
+    total : int, optional
+        How many items there are, when `items` has no length.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("to go"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield from bar.track(items, description=label, total=total)

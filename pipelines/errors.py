@@ -1,0 +1,50 @@
+"""The failures of files and folders given to a command, one tree: catch `InputError` to catch them all.
+
+InputError
+├── MissingFile
+├── UnreadableImage
+├── WrongSize
+├── BadValue
+│   └── UnknownKey
+├── OutputExists
+└── CannotWrite
+    └── DiskFull
+
+Every message says what is wrong, the value found, the limit it broke, and what to do.
+"""
+
+
+class InputError(Exception):
+    """A file or folder given to a command cannot be used."""
+
+
+class MissingFile(InputError):
+    """A file or folder that is named does not exist."""
+
+
+class UnreadableImage(InputError):
+    """An image file cannot be decoded, or holds something else than was promised."""
+
+
+class WrongSize(InputError):
+    """An image does not have the size that its camera states."""
+
+
+class BadValue(InputError):
+    """A setting in a file has a value that cannot be."""
+
+
+class UnknownKey(BadValue):
+    """A file has a key that nothing reads: most often a misspelt one."""
+
+
+class OutputExists(InputError):
+    """The place to write to holds something already."""
+
+
+class CannotWrite(InputError):
+    """A result could not be written; nothing half-written is left behind."""
+
+
+class DiskFull(CannotWrite):
+    """The disk has no room for the result; nothing half-written is left behind."""

@@ -1,0 +1,131 @@
+"""Files written whole or not at all, and the fingerprints by which results name their inputs."""
+
+import errno
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from pipelines.errors import CannotWrite, DiskFull, OutputExists
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[BinaryIO]:
+    """Open `path` for writing such that it appears whole, on disk, or not at all.
+
+    The bytes go to a temporary name in the same folder, are flushed to the disk, and take their name in one step.
+
+    Raises
+    ------
+    DiskFull, CannotWrite
+        In words, with the path; the temporary file is gone and what stood at `path` before still stands.
+    """
+    with reported_as_cannot_write(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(name, 0o666 & ~_umask())
+            os.replace(name, path)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Write `content` to `path`, whole or not at all."""
+    with writing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+@contextmanager
+def building_folder(out: Path, *, replace_if: str | None = None) -> Iterator[Path]:
+    """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
+
+    Parameters
+    ----------
+    out : Path
+        Where the folder will stand. It may exist when it is empty.
+    replace_if : str, optional
+        A file name by which a folder made earlier by the same command is known: such a folder is replaced, any other
+        is left alone.
+
+    Raises
+    ------
+    OutputExists
+        `out` holds something that would be lost.
+    """
+    check_free(out, replace_if=replace_if)
+    with reported_as_cannot_write(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        building = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        try:
+            yield building
+            os.chmod(building, 0o777 & ~_umask())
+            if out.exists():
+                shutil.rmtree(out)
+            os.replace(building, out)
+        except BaseException:
+            shutil.rmtree(building, ignore_errors=True)
+            raise
+        _sync_folder(out.parent)
+
+
+def check_free(out: Path, *, replace_if: str | None = None) -> None:
+    """Refuse `out` when it holds something, unless it is a folder that holds the file `replace_if`."""
+    if not out.exists() or (replace_if is not None and (out / replace_if).is_file()):
+        return
+    if not out.is_dir():
+        raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
+    if any(out.iterdir()):
+        raise OutputExists(
+            f"{out}: holds files already, and none are overwritten; name a new or empty folder"
+        )
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+@contextmanager
+def reported_as_cannot_write(path: Path) -> Iterator[None]:
+    """Turn what the system says about a failed write into a named failure with the path in it."""
+    try:
+        yield
+    except OSError as failure:
+        place = failure.filename or path
+        if failure.errno in _NO_ROOM:
+            existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+            free_mb = shutil.disk_usage(existing).free / 1e6
+            raise DiskFull(
+                f"{path}: {failure.strerror}; {free_mb:.1f} MB are free; make room or name another disk"
+            ) from failure
+        raise CannotWrite(f"{place}: {failure.strerror}; name a place that can be written") from failure
+
+
+def _umask() -> int:
+    """Return the permission bits that this process withholds from new files."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _sync_folder(folder: Path) -> None:
+    """Flush a folder's entries, so that a rename survives a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

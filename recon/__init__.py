@@ -1,0 +1,1 @@
+"""Mathematics only: the operator, solvers, penalties and metrics. No files, no cameras, no printing."""

@@ -1,0 +1,18 @@
+"""The failures of reconstruction, one tree: catch `ReconstructionError` to catch them all.
+
+ReconstructionError
+├── GeometryMismatch
+└── NotConverged
+"""
+
+
+class ReconstructionError(Exception):
+    """The plane asked for cannot be reconstructed from the views given."""
+
+
+class GeometryMismatch(ReconstructionError):
+    """Poses, lens, images and plane do not fit together (a plane behind the camera, say)."""
+
+
+class NotConverged(ReconstructionError):
+    """An iteration left the numbers it is defined on."""
