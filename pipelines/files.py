@@ -88,9 +88,7 @@ def check_free(out: Path, *, replace_if: str | None = None) -> None:
     if not out.is_dir():
         raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
     if any(out.iterdir()):
-        raise OutputExists(
-            f"{out}: holds files already, and none are overwritten; name a new or empty folder"
-        )
+        raise OutputExists(f"{out}: holds files already, and none are overwritten; name a new or empty folder")
 
 
 def sha256(path: Path) -> str:
