@@ -1,0 +1,77 @@
+"""What a sensor adds to the light: the numbers by which digital numbers become electrons with known statistics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+type Map = float | NDArray[np.floating]
+"""One number for the whole sensor, or one per pixel as an array (row, column)."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """A linear sensor: `dn = offset + gain · (Poisson(η Φ t + D t) + N(0, σ²))`, rounded to whole DN.
+
+    Eq. (6) of Stern, Aloni and Javidi adds the same variances: `η Φ t + D t + σ²`.
+
+    Parameters
+    ----------
+    offset_dn : Map
+        Mean of a dark frame of no exposure, in DN.
+    gain_dn_per_e : Map
+        DN per electron.
+    read_noise_e : Map
+        σ, standard deviation of the read noise, in electrons.
+    dark_current_e_per_s : Map
+        D, electrons per pixel and second with no light.
+    quantum_efficiency : float
+        η, electrons per photon.
+    saturation_dn : float
+        Pixels at or above this value are saturated and carry no number.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, a gain is not positive, or a noise is negative.
+    """
+
+    offset_dn: Map
+    gain_dn_per_e: Map
+    read_noise_e: Map
+    dark_current_e_per_s: Map = 0.0
+    quantum_efficiency: float = 1.0
+    saturation_dn: float = np.inf
+
+    def __post_init__(self) -> None:
+        _require("offset_dn", self.offset_dn, at_least=-np.inf)
+        _require("gain_dn_per_e", self.gain_dn_per_e, at_least=np.finfo(float).tiny)
+        _require("read_noise_e", self.read_noise_e, at_least=0.0)
+        _require("dark_current_e_per_s", self.dark_current_e_per_s, at_least=0.0)
+        _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
+
+    def electrons(self, frame_dn: NDArray[np.generic]) -> NDArray[np.float32]:
+        """Return a frame (row, column) in electrons, negative where the read noise made it so."""
+        difference = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
+        return np.divide(difference, self.gain_dn_per_e, dtype=np.float32)
+
+    def saturated(self, frame_dn: NDArray[np.generic]) -> NDArray[np.bool_]:
+        """Return where a frame (row, column) is saturated."""
+        return np.asarray(frame_dn >= self.saturation_dn)
+
+    def background_e(self, exposure_s: float) -> Map:
+        """Return the expected dark electrons `D t` of one exposure."""
+        return self.dark_current_e_per_s * exposure_s
+
+    def read_variance_e2(self) -> Map:
+        """Return the variance that is added whatever the light: read noise, and rounding to whole DN (1/12 DN²)."""
+        return self.read_noise_e**2 + 1.0 / (12.0 * self.gain_dn_per_e**2)
+
+
+def _require(name: str, value: Map, *, at_least: float, at_most: float = np.inf) -> None:
+    """Raise ValueError unless every number of `value` is finite and within its limits."""
+    numbers = np.asarray(value)
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{name} must be finite everywhere, got {value}")
+    if (numbers < at_least).any() or (numbers > at_most).any():
+        raise ValueError(f"{name} must lie within [{at_least:.3g}, {at_most:.3g}], got {value}")
