@@ -1,6 +1,7 @@
 """What a sensor adds to the light: the numbers by which digital numbers become electrons with known statistics."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +51,13 @@ class NoiseModel:
         _require("dark_current_e_per_s", self.dark_current_e_per_s, at_least=0.0)
         _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
 
-    def electrons(self, frame_dn: NDArray[np.generic]) -> NDArray[np.float32]:
+    def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
         """Return a frame (row, column) in electrons, negative where the read noise made it so."""
-        difference = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
-        return np.divide(difference, self.gain_dn_per_e, dtype=np.float32)
+        electrons = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
+        electrons /= np.asarray(self.gain_dn_per_e, np.float32)
+        return electrons
 
-    def saturated(self, frame_dn: NDArray[np.generic]) -> NDArray[np.bool_]:
+    def saturated(self, frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
         """Return where a frame (row, column) is saturated."""
         return np.asarray(frame_dn >= self.saturation_dn)
 

@@ -1,6 +1,7 @@
 """Image files as the sensor gave them: 16-bit TIFF or PNG, photographs, and raw files with their mosaic."""
 
 import contextlib
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,12 @@ TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
+
+# What tifffile is known to raise on files that are damaged or end early.
+_TIFF_FAILURES = (tifffile.TiffFileError, zlib.error, OSError, LookupError, RuntimeError, TypeError, ValueError)
+
+# OpenCV fills the rest of a truncated photograph with grey and says nothing; a whole one ends with these bytes.
+_END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 # The pixels next to the edge of the active area catch a little of its light.
 _MASKED_GUARD_PX = 4
@@ -78,7 +85,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
     """Read a TIFF; the compressions that tifffile leaves to extra packages are read by OpenCV."""
     try:
         return np.asarray(tifffile.imread(path))
-    except (tifffile.TiffFileError, OSError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as failure:
+    except _TIFF_FAILURES as failure:
         if "imagecodecs" in str(failure):
             return _read_with_opencv(path)
         raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
@@ -86,7 +93,10 @@ def _read_tiff(path: Path) -> NDArray[Any]:
 
 def _read_with_opencv(path: Path) -> NDArray[Any]:
     """Read what OpenCV decodes, as (row, column) or (row, column, RGB), bit depth and orientation untouched."""
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
+    content = path.read_bytes()
+    whole = _END_MARKS.get(path.suffix.lower(), b"") in content[-1024:]
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content and whole else None
     if pixels is None:
         raise UnreadableImage(_cannot_decode(path, "not an image, or truncated"))
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
