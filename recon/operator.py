@@ -1,10 +1,10 @@
 """The operator H of eq. (1): what each detector pixel of each view sees of a plane, and its exact adjoint."""
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -65,8 +65,8 @@ class PlaneOperator:
         workers: int | None = None,
     ) -> None:
         self.grid = grid
-        self.dtype = dtype
-        self._workers = workers or len(os.sched_getaffinity(0))
+        self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
+        self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         self._geometry = _checked_geometry(plane_from_ray, rays, grid, flat, valid, lattice_of_view, dtype)
         self.images_shape = (len(plane_from_ray), *self._geometry.ray_x.shape[1:])
         self.all_views = np.arange(len(plane_from_ray))

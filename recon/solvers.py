@@ -21,6 +21,9 @@ _LARGEST_PENALTY_GRADIENT = 2 + 2**0.5
 
 _START_BLUR_PX = 2.0
 
+# Where the mean of the views is not positive there is no light to speak of.
+_LEAST_LEVEL_E = 1e-6
+
 
 @dataclass(frozen=True)
 class Iterate:
@@ -49,7 +52,8 @@ def back_projection(
 ) -> Image:
     """Return `Hᵀ(g − b) / Hᵀ H 1` (row, column): the mean of what the views say of each sample.
 
-    It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that contribute, as in the paper.
+    It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that
+    contribute, as in the paper.
     """
     light = operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
     coverage = operator.coverage(views)
@@ -65,7 +69,7 @@ def smooth_start(operator: PlaneOperator, images: ElementalImages) -> Image:
     coverage = gaussian_filter(operator.coverage(), _START_BLUR_PX)
     light = operator.adjoint(images.electrons) - operator.adjoint_of_map(images.background_e)
     light = gaussian_filter(light, _START_BLUR_PX)
-    level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), np.finfo(np.float32).tiny * 1e6)
+    level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), _LEAST_LEVEL_E)
     start = np.divide(light, coverage, out=np.full_like(light, level), where=coverage > 1e-3 * coverage.max())
     return np.maximum(start, 0.01 * level)
 
