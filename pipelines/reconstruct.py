@@ -211,9 +211,10 @@ def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[n
 
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     """Tell of planes on which the iteration swings to and fro."""
-    for record in records:
-        if record["certificate"] and record["certificate"]["oscillates"]:
-            say(
-                f"{record['file']} ({record['channel']}): the one-step-late iteration does not settle; it swings by "
-                f"{record['certificate']['relative_change']:.1%} per pass. A smaller --penalty-weight calms it."
-            )
+    certificates = [record["certificate"] for record in records if record["certificate"]]
+    swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
+    if swings:
+        say(
+            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes; it swings "
+            f"by up to {max(swings):.1%} per pass (see reconstruction.json). A smaller --penalty-weight calms it."
+        )

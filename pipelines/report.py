@@ -84,6 +84,7 @@ def write_report(directory: Path) -> Path:
             columns=[{"name": name, "title": _column_title(name)} for name in columns],
             rows=_rows(planes, columns, _shown_depths(depths, focus), white),
             slider=_slider(planes, columns, white) if len(depths) > 1 else None,
+            slider_column=_slider_column(columns),
             white=white,
             focus_curve=_focus_curve(focus) if focus else None,
             sharp_mm=focus["sharp_mm"] if focus else [],
@@ -200,6 +201,11 @@ def _slider(planes: list[_Plane], columns: list[str], white: float) -> list[dict
         }
         for column in columns
     ]
+
+
+def _slider_column(columns: list[str]) -> int:
+    """Return which column the slider shows first: one that was penalised, where there is one."""
+    return next((index for index, name in enumerate(columns) if "pmlem" in name), 0)
 
 
 def _set_section(folder: Path) -> dict[str, Any]:
