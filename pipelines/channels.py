@@ -160,6 +160,12 @@ def lattice_noise(loaded: LoadedSet, lattice: Lattice, frame: Frame | None) -> N
     return noise
 
 
+def require_in_front(depth_mm: float) -> None:
+    """Refuse a plane that is not in front of the reference camera (GeometryMismatch)."""
+    if not (np.isfinite(depth_mm) and depth_mm > 0):
+        raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
+
+
 def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
     """Return the samples of the plane at a depth: by default those that overlay the reference view pixel for pixel.
 
@@ -168,8 +174,7 @@ def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None
     GeometryMismatch
         The plane is not in front of the camera.
     """
-    if not (np.isfinite(depth_mm) and depth_mm > 0):
-        raise GeometryMismatch(f"a plane at {depth_mm} mm is behind the camera; depth_mm must be positive")
+    require_in_front(depth_mm)
     camera = loaded.settings.camera
     cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
     width, height = camera.size_px

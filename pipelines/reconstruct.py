@@ -11,11 +11,18 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive
-from pipelines.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel, plane_grid
+from pipelines.channels import (
+    ChannelLayout,
+    OperatorFactory,
+    channel_layouts,
+    load_channel,
+    plane_grid,
+    require_in_front,
+)
 from pipelines.console import progress, say
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
-from pipelines.files import write_json
+from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
@@ -76,6 +83,7 @@ def reconstruct(
     depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
     folders = {name: out if len(methods) == 1 else out / name for name in methods}
     run = _Run(loaded, {depth: plane_grid(loaded, depth, pitch_mm) for depth in depths}, folders)
+    require_room(out, run.needed_bytes())
     run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
     write_overview(loaded, out)
     metrics = assess(loaded, run.written)
@@ -108,6 +116,7 @@ class _Run:
 
     def __init__(self, loaded: LoadedSet, grids: dict[float, PlaneGrid], folders: dict[Method, Path]) -> None:
         self._loaded = loaded
+        self._layouts = channel_layouts(loaded)
         self._grids = grids
         self._folders = folders
         self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
@@ -116,11 +125,15 @@ class _Run:
         self.records: list[dict[str, Any]] = []
         self.written: dict[tuple[Method, float], Path] = {}
 
+    def needed_bytes(self) -> int:
+        """Return about how much disk the results take: planes, previews, and the report that shows them again."""
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self._folders)
+        return samples * len(self._layouts) * (np.dtype(np.float32).itemsize + 3)
+
     def reconstruct(self, settings: Settings, *, with_focus: bool) -> None:
         """Go through the channels, one in memory at a time."""
         self._with_focus = with_focus
-        layouts = channel_layouts(self._loaded)
-        tasks = [(layout, depth) for layout in layouts for depth in self._grids]
+        tasks = [(layout, depth) for layout in self._layouts for depth in self._grids]
         factory_of: ChannelLayout | None = None
         for layout, depth in progress(tasks, "reconstructing planes"):
             if layout is not factory_of:
@@ -138,7 +151,7 @@ class _Run:
                 self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
                 colours = self._colours.setdefault((method, depth), [])
                 colours.append(solution.plane)
-                if len(colours) == len(layouts):
+                if len(colours) == len(self._layouts):
                     self._write(method, depth)
 
     def focus(self) -> dict[str, Any] | None:
@@ -181,9 +194,10 @@ class _Run:
 
 
 def _distinct(depths: list[float]) -> list[float]:
-    """Return each depth once; two that would share a file name but differ are refused."""
+    """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
     by_name: dict[str, float] = {}
     for depth in depths:
+        require_in_front(depth)
         other = by_name.setdefault(plane_name(depth), depth)
         if other != depth:
             raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")

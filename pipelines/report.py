@@ -88,7 +88,7 @@ def write_report(directory: Path) -> Path:
             white=white,
             focus_curve=_focus_curve(focus) if focus else None,
             sharp_mm=focus["sharp_mm"] if focus else [],
-            metrics=[row for path in _below(directory, METRICS_FILE) for row in _read_json(path)["planes"]],
+            metrics=_metrics(directory),
             method_names=METHOD_NAMES,
             results=[
                 {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
@@ -114,6 +114,16 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("planes", []), list):
         raise BadValue(f"{path}: is not a result of this program; reconstruct again")
     return content
+
+
+def _metrics(directory: Path) -> list[dict[str, Any]]:
+    """Return the errors against the truth: the folder's own, or those of the folders within it."""
+    own = directory / METRICS_FILE
+    return [
+        row
+        for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))
+        for row in _read_json(path)["planes"]
+    ]
 
 
 def _planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[_Plane]:

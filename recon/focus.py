@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.signal import find_peaks
 
 from recon.images import ElementalImages
 from recon.operator import PlaneOperator
@@ -49,6 +48,8 @@ def sharp_depths_mm(depths_mm: Sequence[float], measures: Sequence[float]) -> li
     span = float(np.ptp(curve)) if len(curve) else 0.0
     if len(curve) < 3 or span == 0:
         return []
+    from scipy.signal import find_peaks  # 40 MB of code that only sweeps need
+
     padded = np.concatenate([[curve.min()], curve, [curve.min()]])
     peaks, _ = find_peaks(padded, prominence=_LEAST_PROMINENCE * span)
     return [_vertex(depth, curve, int(peak) - 1) for peak in peaks]
