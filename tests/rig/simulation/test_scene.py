@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -71,15 +72,21 @@ def test_a_card_covers_its_rectangle_with_the_right_share_of_each_pixel(x_mm: fl
     np.testing.assert_allclose(view.light, 0.6 * np.outer(down, across), atol=1e-5)
 
 
-@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
-def test_the_nearer_card_hides_the_farther_by_its_opacity_in_whatever_order_they_are_given(order: list[int]) -> None:
-    cards = [card("near", 200.0, reflectance=0.8, opacity=0.25), card("far", 400.0, reflectance=0.5, pitch_mm=5.0)]
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+def test_nearer_cards_hide_farther_ones_by_their_opacity_in_whatever_order_they_are_given(
+    order: tuple[int, ...],
+) -> None:
+    cards = [
+        card("near", 200.0, reflectance=0.8, opacity=0.25),
+        card("far", 400.0, reflectance=0.5, opacity=0.5),
+        card("wall", 600.0, reflectance=0.3, pitch_mm=10.0),
+    ]
     view = view_of([cards[k] for k in order])
-    assert view.light[15, 20] == pytest.approx(0.25 * 0.8 + 0.75 * 0.5)
-    assert view.visible["near"][15, 20] == pytest.approx(0.25)
-    assert view.visible["far"][15, 20] == pytest.approx(0.75)
-    assert view.light[15, 5] == pytest.approx(0.5)
-    assert (view.visible["near"] + view.visible["far"] <= 1 + 1e-6).all()
+    shares = {"near": 0.25, "far": 0.75 * 0.5, "wall": 0.75 * 0.5}
+    for name, share in shares.items():
+        assert view.visible[name][15, 20] == pytest.approx(share)
+    assert view.light[15, 20] == pytest.approx(0.25 * 0.8 + 0.375 * 0.5 + 0.375 * 0.3)
+    assert view.light[15, 5] == pytest.approx(0.3)
 
 
 def test_from_the_other_side_the_farther_card_is_the_nearer() -> None:
