@@ -30,7 +30,7 @@ from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from recon.errors import GeometryMismatch
-from recon.focus import focus_measure, sharp_depths_mm
+from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
 
@@ -120,7 +120,7 @@ class _Run:
         self._grids = grids
         self._folders = folders
         self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
-        self._focus_e2 = dict.fromkeys(grids, 0.0)
+        self._focus = dict.fromkeys(grids, Focus(0.0, 0.0))
         self._with_focus = False
         self.records: list[dict[str, Any]] = []
         self.written: dict[tuple[Method, float], Path] = {}
@@ -145,7 +145,8 @@ class _Run:
             assert factory is not None
             operator = self._operator(factory, depth)
             if with_focus:
-                self._focus_e2[depth] += focus_measure(operator, images, _halves(self._loaded, len(layout.lattices)))
+                halves = _halves(self._loaded, len(layout.lattices))
+                self._add_focus(depth, focus_measure(operator, images, halves))
             for method in self._folders:
                 solution = solve(operator, images, method, settings)
                 self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
@@ -158,8 +159,19 @@ class _Run:
         """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
         if not self._with_focus:
             return None
-        depths, measures = list(self._focus_e2), list(self._focus_e2.values())
-        return {"depth_mm": depths, "measure_e2": measures, "sharp_mm": sharp_depths_mm(depths, measures)}
+        depths, curve = list(self._focus), list(self._focus.values())
+        return {
+            "depth_mm": depths,
+            "detail_e2": [point.detail_e2 for point in curve],
+            "sigma_e2": [point.sigma_e2 for point in curve],
+            "sharp_mm": sharp_depths_mm(depths, curve),
+        }
+
+    def _add_focus(self, depth: float, of_channel: Focus) -> None:
+        """Add what one more channel says of a depth."""
+        known = self._focus[depth]
+        sigma_e2 = float(np.hypot(known.sigma_e2, of_channel.sigma_e2))
+        self._focus[depth] = Focus(known.detail_e2 + of_channel.detail_e2, sigma_e2)
 
     def _operator(self, factory: OperatorFactory, depth_mm: float) -> PlaneOperator:
         try:
@@ -189,7 +201,7 @@ class _Run:
         plane = colours[0] if len(colours) == 1 else np.dstack(colours)
         path = self._folders[method] / f"{plane_name(depth)}.tiff"
         write_plane(path, plane, self._grids[depth].pitch_mm)
-        write_png(path.with_suffix(".png"), grey_levels(plane, white_level([plane])))
+        write_png(path.with_suffix(".png"), grey_levels(plane, white_level(plane)))
         self.written[method, depth] = path
 
 
