@@ -166,8 +166,20 @@ def require_in_front(depth_mm: float) -> None:
         raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
 
 
+def default_pitch_px(loaded: LoadedSet, layouts: list[ChannelLayout]) -> int:
+    """Return how many detector pixels apart a plane's samples are by default: one, where the views can fill that.
+
+    A view sees only some pixels in each colour of a mosaic; with fewer views than it takes to fill the gaps, the
+    samples are a period of the mosaic apart.
+    """
+    views = len(loaded.settings.view)
+    step = layouts[0].lattices[0].step
+    fewest_per_sample = min(views * len(layout.lattices) / (step[0] * step[1]) for layout in layouts)
+    return 1 if fewest_per_sample >= 1 else max(step)
+
+
 def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
-    """Return the samples of the plane at a depth: by default those that overlay the reference view pixel for pixel.
+    """Return the samples of the plane at a depth: by default they overlay the reference view pixel for pixel.
 
     Raises
     ------

@@ -15,6 +15,7 @@ from pipelines.channels import (
     ChannelLayout,
     OperatorFactory,
     channel_layouts,
+    default_pitch_px,
     load_channel,
     plane_grid,
     require_in_front,
@@ -32,7 +33,6 @@ from pipelines.report import RECONSTRUCTION_FILE, write_report
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
 
 
 def reconstruct(
@@ -72,7 +72,7 @@ def reconstruct(
     passes
         At most this many passes over the data.
     pitch_mm
-        Distance of the plane's samples; one detector pixel by default.
+        Distance of the plane's samples; by default one detector pixel of the reference view.
     """
     started = time.monotonic()
     methods: list[Method] = list(dict.fromkeys(method or ["pmlem-osl"]))
@@ -82,7 +82,7 @@ def reconstruct(
     loaded = load_set(elemental_set)
     depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
     folders = {name: out if len(methods) == 1 else out / name for name in methods}
-    run = _Run(loaded, {depth: plane_grid(loaded, depth, pitch_mm) for depth in depths}, folders)
+    run = _Run(loaded, depths, pitch_mm, folders)
     require_room(out, run.needed_bytes())
     run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
     write_overview(loaded, out)
@@ -114,13 +114,16 @@ def plane_name(depth_mm: float) -> str:
 class _Run:
     """The planes of one call: every channel, depth and method, written as soon as all colours of a plane are there."""
 
-    def __init__(self, loaded: LoadedSet, grids: dict[float, PlaneGrid], folders: dict[Method, Path]) -> None:
+    def __init__(
+        self, loaded: LoadedSet, depths: list[float], pitch_mm: float | None, folders: dict[Method, Path]
+    ) -> None:
         self._loaded = loaded
         self._layouts = channel_layouts(loaded)
-        self._grids = grids
+        mm_per_depth = default_pitch_px(loaded, self._layouts) / loaded.settings.camera.fx_px
+        self._grids = {depth: plane_grid(loaded, depth, pitch_mm or depth * mm_per_depth) for depth in depths}
         self._folders = folders
         self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
-        self._focus = dict.fromkeys(grids, Focus(0.0, 0.0))
+        self._focus = dict.fromkeys(depths, Focus(0.0, 0.0))
         self._with_focus = False
         self.records: list[dict[str, Any]] = []
         self.written: dict[tuple[Method, float], Path] = {}

@@ -130,8 +130,9 @@ def pmlem_one_step_late(
         raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
     sensitivity = operator.sensitivity()
     updated = updated_samples(sensitivity, penalty_weight)
-    if 2 * np.count_nonzero(updated) < np.count_nonzero(sensitivity):
-        limit = float(np.median(sensitivity[sensitivity > 0])) / _LARGEST_PENALTY_GRADIENT
+    seen = well_seen_samples(sensitivity)
+    if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
+        limit = float(np.median(sensitivity[seen])) / _LARGEST_PENALTY_GRADIENT
         raise NotConverged(
             f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
             f"must stay below {limit:.3g}: give a smaller one"
@@ -173,6 +174,11 @@ def _one_step_late(
         yield Iterate(plane, Step(passes, change, alternation))
 
 
+def well_seen_samples(sensitivity: Image) -> NDArray[np.bool_]:
+    """Return which samples count for a plane as a whole: those seen at least a hundredth as much as the best seen."""
+    return np.asarray(sensitivity > 0.01 * sensitivity.max())
+
+
 def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.bool_]:
     """Return which samples one-step-late PMLEM changes: those whose denominator is positive whatever the plane."""
     return np.asarray(sensitivity > _LARGEST_PENALTY_GRADIENT * penalty_weight)
@@ -206,6 +212,6 @@ def universal_penalty_weight(operator: PlaneOperator, images: ElementalImages, p
     tuning, not the best weight for a scene.
     """
     sensitivity = operator.sensitivity()
-    seen = sensitivity > 0
+    seen = well_seen_samples(sensitivity)
     per_view_e = plane[seen].mean() + np.mean(images.background_e) + np.mean(images.read_variance_e2)
     return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))
