@@ -117,7 +117,6 @@ def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
         background_e=_stacked([noise.background_e(exposure_s) for noise in noises], shape),
         read_variance_e2=_stacked([noise.read_variance_e2() for noise in noises], shape),
         valid=_valid(electrons.shape, saturated),
-        lattice_of_view=np.tile(np.arange(phases), views),
     )
 
 
@@ -222,7 +221,7 @@ class OperatorFactory:
             grid,
             flat=self._response,
             valid=self._images.valid,
-            lattice_of_view=self._images.lattice_of_view,
+            lattice_of_view=np.tile(np.arange(self._phases), len(homographies)),
         )
 
 
