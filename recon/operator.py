@@ -231,7 +231,7 @@ def _checked_geometry(
         lattice_of_view,
         np.ascontiguousarray(rays[..., 0], dtype),
         np.ascontiguousarray(rays[..., 1], dtype),
-        np.ascontiguousarray(np.broadcast_to(flat, (lattices, *detector)), dtype),
+        np.array(np.broadcast_to(flat, (lattices, *detector)), dtype),
         valid,
     )
 
