@@ -306,9 +306,9 @@ def _read_noise_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int])
     if not path.is_file():
         return {}
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             maps = {name: file[name] for name in names if name in file}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as failure:
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as failure:
         raise BadValue(f"{path}: cannot be read ({failure}); run `faintfield noise` again") from failure
     for name, values in maps.items():
         if values.shape != shape:
