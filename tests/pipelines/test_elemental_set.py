@@ -269,18 +269,15 @@ class TestNoiseJson:
         with pytest.raises(BadValue, match=rf"(noise\.json|elemental\.toml): .*{words}"):
             load_set(folder)
 
-    @pytest.mark.parametrize(
-        "content",
-        [
-            b"",
-            b"PK\x03\x04 no more",
-            b"nothing like it",
-            b"\x93NUMPY\x01\0&\0{'descr':'<f8','fortran_order':0,'shape':()}\n",
-        ],
-        ids=["empty", "truncated", "text", "array"],
-    )
+    @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no more", b"nothing like it"])
     def test_maps_that_cannot_be_read_are_refused(self, folder: Path, content: bytes) -> None:
         (folder / "noise_maps.npz").write_bytes(content)
+        with pytest.raises(BadValue, match=r"noise_maps\.npz: cannot be read"):
+            load_set(folder)
+
+    def test_one_array_is_no_set_of_maps(self, folder: Path) -> None:
+        with (folder / "noise_maps.npz").open("wb") as file:
+            np.save(file, np.zeros((12, 16)))
         with pytest.raises(BadValue, match=r"noise_maps\.npz: cannot be read"):
             load_set(folder)
 
