@@ -81,7 +81,9 @@ def read_frame(path: Path) -> Frame:
     pixels = _read_tiff(path) if suffix in TIFF_SUFFIXES else _read_with_opencv(path)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         pixels = pixels[:, :, :3]
-    if pixels.ndim not in (2, 3) or pixels.size == 0 or (pixels.ndim == 3 and pixels.shape[2] != 3):
+    if pixels.size == 0:
+        raise UnreadableImage(_cannot_decode(path, "no pixels"))
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise UnreadableImage(f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted")
     return Frame(pixels)
 
