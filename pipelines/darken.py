@@ -77,6 +77,8 @@ def darken(
     )
     reference_light = _light(loaded, loaded.image_paths[loaded.reference_view], layouts)
     region = object_region(reference_light)
+    if not region.any():
+        raise BadValue(f"{elemental_set}: cannot be darkened: its reference view is black; is it the bright set?")
     dark_e = dark_current_e_per_s * exposure_s
     try:
         scale = signal_scale_for_snr(reference_light[region], snr, dark_e, read_noise_e)

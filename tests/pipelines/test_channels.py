@@ -1,0 +1,271 @@
+"""From frames to electrons: offset, gain, saturation, colours and mosaics, and where a plane's samples lie."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from pipelines.channels import (
+    OperatorFactory,
+    channel_layouts,
+    default_pitch_px,
+    load_channel,
+    plane_grid,
+)
+from pipelines.elemental_set import load_set
+from pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages
+from recon.solvers import back_projection
+
+type SetMaker = Callable[..., Path]
+type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+
+BAYER = ["RG", "GB"]
+
+
+def _channels(folder: Path) -> dict[str, ElementalImages]:
+    loaded = load_set(folder)
+    return {layout.name: load_channel(loaded, layout) for layout in channel_layouts(loaded)}
+
+
+def _back_projected(folder: Path, depth_mm: float = 100.0) -> NDArray[np.floating]:
+    loaded = load_set(folder)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout)
+    operator = OperatorFactory(loaded, layout, images).at_depth(depth_mm, plane_grid(loaded, depth_mm))
+    return back_projection(operator, images)
+
+
+def test_digital_numbers_become_electrons_by_offset_and_gain_and_keep_their_sign(make_set: SetMaker) -> None:
+    folder = make_set(
+        [np.array([[100, 103], [97, 65535]], np.uint16)],
+        noise={"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.2},
+        exposure_s=0.5,
+    )
+    images = _channels(folder)["grey"]
+    assert images.electrons.dtype == np.float32
+    assert images.electrons.tolist() == [[[0.0, 1.5], [-1.5, 32717.5]]]
+    assert images.background_e == pytest.approx(0.1, rel=1e-12)  # 0.2 e⁻/s in 0.5 s
+    assert images.read_variance_e2 == pytest.approx(9 + 1 / 48, rel=1e-12)  # and rounding to 0.5 e⁻
+    assert images.valid is None
+
+
+def test_saturated_pixels_carry_no_number(make_set: SetMaker) -> None:
+    views = [np.full((2, 3), 500, np.uint16), np.array([[500, 999, 1000], [1001, 500, 500]], np.uint16)]
+    noise = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "saturation_dn": 1000.0}
+    valid = _channels(make_set(views, noise=noise))["grey"].valid
+    assert valid is not None
+    assert valid.tolist() == [[[True] * 3] * 2, [[True, True, False], [False, True, True]]]
+
+
+@pytest.mark.parametrize("saturation_dn", [None, 255.0])
+def test_8_bit_images_will_do_when_the_noise_model_is_theirs(saturation_dn: float | None, make_set: SetMaker) -> None:
+    noise: dict[str, Any] = {"offset_dn": 5.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0}
+    folder = make_set([np.full((2, 3), 15, np.uint8)], noise=noise | _stated(saturation_dn=saturation_dn))
+    np.testing.assert_array_equal(_channels(folder)["grey"].electrons, 10.0)
+
+
+def _stated(**values: Any) -> dict[str, Any]:
+    return {key: value for key, value in values.items() if value is not None}
+
+
+SIXTEEN_BITS = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "saturation_dn": 65535.0}
+
+
+@pytest.mark.parametrize(
+    ("image", "failure", "words"),
+    [
+        (np.zeros((12, 15), np.uint16), WrongSize, r"is 15 x 12 px, the camera 16 x 12 px"),
+        (np.zeros((16, 12), np.uint16), WrongSize, r"is 12 x 16 px"),
+        (
+            np.zeros((12, 16), np.uint8),
+            WrongBitDepth,
+            r"has 8 bits per pixel, but the noise model saturates at 65535 DN",
+        ),
+        (np.zeros((12, 16), np.float32), WrongBitDepth, r"holds float32 pixels"),
+        (np.zeros((12, 16), np.int16), WrongBitDepth, r"holds int16 pixels"),
+        (np.zeros((12, 16, 3), np.uint16), UnreadableImage, r"is colour, unlike the set's first view"),
+    ],
+)
+def test_a_view_unlike_what_the_set_says_is_refused_by_name(
+    image: NDArray[Any],
+    failure: type[InputError],
+    words: str,
+    make_set: SetMaker,
+    grey_images: Sequence[NDArray[np.uint16]],
+) -> None:
+    folder = make_set(grey_images, noise=SIXTEEN_BITS)
+    tifffile.imwrite(folder / "view_1.tiff", image, photometric="rgb" if image.ndim == 3 else "minisblack")
+    with pytest.raises(failure, match=rf"view_1\.tiff: {words}"):
+        _channels(folder)
+
+
+def test_a_grey_view_among_colour_ones_is_refused(make_set: SetMaker, grey_images: Sequence[NDArray[Any]]) -> None:
+    folder = make_set([np.dstack([image] * 3) for image in grey_images])
+    tifffile.imwrite(folder / "view_1.tiff", grey_images[1])
+    with pytest.raises(UnreadableImage, match=r"view_1\.tiff: is grey"):
+        _channels(folder)
+
+
+def test_files_without_a_black_level_need_it_stated(
+    make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]
+) -> None:
+    folder = make_set(grey_images, noise={"gain_dn_per_e": 2.0, "read_noise_e": 3.0})
+    with pytest.raises(BadValue, match=r"view_0\.tiff: brings no black level of its own; state noise\.offset_dn"):
+        _channels(folder)
+
+
+def test_each_colour_of_rgb_frames_is_a_channel(make_set: SetMaker) -> None:
+    views = list(np.random.default_rng(1).integers(100, 900, (2, 5, 6, 3)).astype(np.uint16))
+    channels = _channels(make_set(views))
+    assert list(channels) == ["red", "green", "blue"]
+    for index, images in enumerate(channels.values()):
+        np.testing.assert_allclose(images.electrons, (np.stack(views)[..., index] - 100.0) / 2.0)
+
+
+def test_each_phase_of_a_mosaic_is_a_lattice_of_its_colour(make_set: SetMaker) -> None:
+    first, second = np.random.default_rng(1).integers(100, 900, (2, 5, 7)).astype(np.uint16)  # incomplete periods
+    folder = make_set([first, second], camera={"mosaic": BAYER})
+    loaded = load_set(folder)
+    layouts = {layout.name: layout for layout in channel_layouts(loaded)}
+    assert {name: [lattice.first for lattice in layout.lattices] for name, layout in layouts.items()} == {
+        "red": [(0, 0)],
+        "green": [(0, 1), (1, 0)],
+        "blue": [(1, 1)],
+    }
+    channels = _channels(folder)
+    of_a_view = {"red": [(0, 0)], "green": [(0, 1), (1, 0)], "blue": [(1, 1)]}
+    for name, phases in of_a_view.items():
+        # View by view, and within a view phase by phase
+        expected = [view[row:4:2, column:6:2] for view in (first, second) for row, column in phases]
+        np.testing.assert_allclose(channels[name].electrons, (np.stack(expected) - 100.0) / 2.0)
+
+
+def test_maps_of_the_noise_follow_the_lattices(make_set: SetMaker) -> None:
+    folder = make_set([np.zeros((4, 6), np.uint16)], camera={"mosaic": BAYER}, noise="noise.json", exposure_s=2.0)
+    values = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "dark_current_e_per_s": 1.0}
+    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    offset_dn, dark_e_per_s = np.random.default_rng(1).uniform(1, 9, (2, 4, 6))
+    np.savez(folder / "noise_maps.npz", offset_dn=offset_dn, dark_current_e_per_s=dark_e_per_s)
+    green = _channels(folder)["green"]
+    np.testing.assert_allclose(green.electrons, [-offset_dn[0::2, 1::2], -offset_dn[1::2, 0::2]], rtol=1e-6)
+    np.testing.assert_allclose(
+        green.background_e, [2 * dark_e_per_s[0::2, 1::2], 2 * dark_e_per_s[1::2, 0::2]], rtol=1e-6
+    )
+
+
+def test_hot_pixels_do_not_reach_the_plane(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
+    planes = []
+    for name, level in (("cold", 100), ("hot", 60_000)):
+        images = [image.copy() for image in grey_images]
+        for image in images:
+            image[5, 9] = level
+        folder = make_set(images, name=name, noise="noise.json")
+        values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.0}
+        fitted = {name: {"value": value} for name, value in values.items()} | {"hot_pixels": [[5, 9]]}
+        (folder / "noise.json").write_text(json.dumps(fitted))
+        planes.append(_back_projected(folder))
+    np.testing.assert_array_equal(planes[0], planes[1])
+    assert planes[0].max() > 100
+
+
+def test_the_flat_field_is_divided_out(make_set: SetMaker) -> None:
+    response = np.linspace(0.3, 1.0, 12 * 16, dtype=np.float32).reshape(12, 16)
+    frame = np.rint(1000.0 * response).astype(np.uint16)
+    noise = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 0.0}
+    folder = make_set([frame], camera={"flat": "flat.tiff"}, noise=noise)
+    tifffile.imwrite(folder / "flat.tiff", response)
+    np.testing.assert_allclose(_back_projected(folder), 1000.0, rtol=0.5 / 300)  # frames are rounded to whole DN
+
+
+@pytest.mark.parametrize("depth_mm", [40.0, 700.0])
+def test_a_plane_overlays_the_reference_view_pixel_for_pixel(depth_mm: float, make_set: SetMaker) -> None:
+    frame = np.random.default_rng(1).integers(100, 60_000, (12, 16)).astype(np.uint16)
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 4.0}
+    folder = make_set([frame], camera={"cx_px": 3.3, "cy_px": 9.1}, noise=noise, exposure_s=0.5)
+    plane = _back_projected(folder, depth_mm)
+    assert plane.shape == frame.shape
+    # Interior: at the border half a sample lies outside
+    np.testing.assert_allclose(plane[1:-1, 1:-1], (frame[1:-1, 1:-1] - 100.0) / 2.0 - 2.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize("own_centre", [False, True])
+@pytest.mark.parametrize("depth_mm", [0.5, 500.0, 1e6])
+def test_samples_lie_where_the_reference_views_undistorted_pixels_look(
+    depth_mm: float, own_centre: bool, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
+) -> None:
+    folder = make_set(grey_images, camera={"fx_px": 40.0, "fy_px": 40.0, "cx_px": 6.2, "cy_px": 7.7})
+    centre = (6.2, 7.7)
+    if own_centre:
+        centre = (9.5, 2.25)
+        edit(folder, lambda settings: settings["view"][0].update(cx_px=9.5, cy_px=2.25))
+    grid = plane_grid(load_set(folder), depth_mm)
+    assert grid.shape == (12, 16)
+    assert grid.pitch_mm == pytest.approx(depth_mm / 40.0, rel=1e-12)
+    for column, row in [(0.0, 0.0), (15.0, 11.0), (6.2, 3.0)]:
+        x_mm, y_mm = depth_mm * (column - centre[0]) / 40.0, depth_mm * (row - centre[1]) / 40.0
+        np.testing.assert_allclose(grid.index_from_plane() @ [x_mm, y_mm, 1.0], [column, row, 1.0], atol=1e-9)
+
+
+def test_another_pitch_keeps_the_field_of_view(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
+    loaded = load_set(make_set(grey_images))
+    default, finer = plane_grid(loaded, 500.0), plane_grid(loaded, 500.0, pitch_mm=2.5)
+    assert default.pitch_mm == 10.0
+    assert finer.shape == (48, 64)
+    for axis in (0, 1):
+        edge = default.origin_mm[axis] - default.pitch_mm / 2
+        assert finer.origin_mm[axis] - finer.pitch_mm / 2 == pytest.approx(edge, rel=1e-12)
+
+
+@pytest.mark.parametrize(("views", "pitch_px"), [(1, 2), (3, 2), (4, 1)])
+def test_few_views_through_a_mosaic_get_samples_as_far_apart_as_its_period(
+    views: int, pitch_px: int, make_set: SetMaker
+) -> None:
+    loaded = load_set(make_set([np.zeros((4, 6), np.uint16)] * views, camera={"mosaic": BAYER}))
+    assert default_pitch_px(loaded, channel_layouts(loaded)) == pitch_px
+
+
+@pytest.mark.parametrize("depth_mm", [0.0, -500.0, float("nan"), float("inf")])
+def test_planes_that_are_not_in_front_are_refused(
+    depth_mm: float, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]
+) -> None:
+    with pytest.raises(GeometryMismatch, match="not in front of the camera; depth_mm must be positive"):
+        plane_grid(load_set(make_set(grey_images)), depth_mm)
+
+
+@pytest.mark.parametrize("pitch_mm", [200.0, 1e9])
+def test_a_pitch_that_leaves_no_samples_is_refused(
+    pitch_mm: float, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]
+) -> None:
+    with pytest.raises(GeometryMismatch, match=r"plane at 500 mm: .* at least 2 x 2 samples"):
+        plane_grid(load_set(make_set(grey_images)), 500.0, pitch_mm)
+
+
+def test_a_principal_point_per_view_and_distortion_exclude_each_other(
+    make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
+) -> None:
+    folder = make_set(grey_images, camera={"distortion": [-0.1]})
+    _back_projected(folder)
+    edit(folder, lambda settings: settings["view"][1].update(cx_px=9.0))
+    with pytest.raises(GeometryMismatch, match=r"view\[1\] has a principal point of its own .* distortion \[-0\.1\]"):
+        _back_projected(folder)
+
+
+def test_views_with_a_principal_point_of_their_own_look_past_it(make_set: SetMaker, edit: Edit) -> None:
+    """Two pictures aligned on a plane: what is at the same pixel of both is on it."""
+    frame = np.random.default_rng(1).integers(100, 60_000, (12, 16)).astype(np.uint16)
+    folder = make_set([frame, frame])
+    # At 100 mm a point moves by −50 · 10 / 100 = −5 px to the second camera; its picture was moved back by as much
+    edit(folder, lambda settings: settings["view"][1].update(cx_px=settings["camera"]["cx_px"] + 5.0))
+    plane = _back_projected(folder, 100.0)
+    np.testing.assert_allclose(plane[1:-1, 1:-1], (frame[1:-1, 1:-1] - 100.0) / 2.0, rtol=1e-3)
+    edit(folder, lambda settings: settings["view"][1].update(cx_px=settings["camera"]["cx_px"]))
+    moved = _back_projected(folder, 100.0)
+    expected = ((frame[1:-1, 6:-1] - 100.0) / 2.0 + (frame[1:-1, 1:-6] - 100.0) / 2.0) / 2.0
+    np.testing.assert_allclose(moved[1:-1, 6:-1], expected, rtol=1e-3)

@@ -1,0 +1,237 @@
+"""`simulate`: what it writes is what the simulated world gives, with its truth beside it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pipelines.brightness import brightness
+from pipelines.elemental_set import load_set
+from pipelines.frames import read_frame
+from recon.metrics import photons_from_linear_snr, photons_from_moments
+from rig.simulation.experiment import paper_experiment
+from rig.simulation.scene import render
+
+type Command = Callable[..., CompletedProcess[str]]
+
+# The paper's camera
+READ_NOISE_E, ETA, DARK_E, GAIN, OFFSET_DN = 12**0.5, 0.5, 0.2 * 0.1, 2.0, 100.0
+READ_VARIANCE_E2 = 12 + 1 / 12 / GAIN**2
+
+
+def _truth(folder: Path) -> dict[str, Any]:
+    truth: dict[str, Any] = json.loads((folder / "truth.json").read_text())
+    return truth
+
+
+def _electrons(folder: Path) -> NDArray[np.float32]:
+    loaded = load_set(folder)
+    return np.stack([loaded.noise.electrons(read_frame(path).pixels_dn) for path in loaded.image_paths])
+
+
+def _all_files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_set_holds_views_a_noise_reference_and_its_truth(simulated_scene: Path) -> None:
+    views = [f"view_r{row}_c{column}.tiff" for row in range(3) for column in range(3)]
+    truth = [
+        f"truth/{name}" for depth in ("00500.0", "00700.0") for name in (f"plane_{depth}.tiff", f"visible_{depth}.png")
+    ]
+    own = ["elemental.toml", "flat.tiff", "noise_reference.tiff", "object_region.png", "provenance.json", "truth.json"]
+    noise_free = [f"noise_free/{name}" for name in ("elemental.toml", "flat.tiff", *views)]
+    assert set(_all_files(simulated_scene)) == {*views, *truth, *own, *noise_free}
+    for name in (*views, "noise_reference.tiff"):
+        frame = read_frame(simulated_scene / name).pixels_dn
+        assert frame.shape == (72, 96)
+        assert frame.dtype == np.uint16
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
+    simulated_scene: Path, tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    done("simulate", tmp_path / "again", *small_options)
+    done("simulate", tmp_path / "other", *small_options, "--seed", 2)
+    first, again, other = (_all_files(folder) for folder in (simulated_scene, tmp_path / "again", tmp_path / "other"))
+    assert first == again
+    assert set(first) == set(other)
+    same = {name for name in first if first[name] == other[name]}
+    # What chance has no part in: the lens, and what the reference camera would see of each object
+    assert same >= {"flat.tiff", "noise_free/flat.tiff", "truth/visible_00500.0.png"}
+    assert not any("view" in name or "reference" in name for name in same)
+
+
+def test_the_options_and_versions_are_recorded(simulated_scene: Path) -> None:
+    record = json.loads((simulated_scene / "provenance.json").read_text())
+    assert record["command"] == "simulate"
+    assert (record["options"]["size_px"], record["options"]["snr"], record["options"]["seed"]) == ([96, 72], 0.16, 1)
+    assert set(record["versions"]) >= {"python", "faintfield", "numpy", "numba"}
+
+
+def test_the_noise_free_set_holds_the_electrons_that_rays_carry(simulated_scene: Path) -> None:
+    truth, experiment = _truth(simulated_scene), paper_experiment(96, 72).grey()
+    light = [view.light for view in render(experiment.planes, experiment.optics, np.array(truth["true_rt_cam_ref"]))]
+    region = read_frame(simulated_scene / "object_region.png").pixels_dn > 127
+    scale_e = truth["photons_on_object"] * ETA / light[4][region].mean(dtype=float)
+    found, expected = _electrons(simulated_scene / "noise_free"), np.stack(light) * scale_e
+    np.testing.assert_allclose(found, expected, atol=0.51 / 60_000 * expected.max())  # 16 bits, rounded
+    settings = load_set(simulated_scene / "noise_free").settings
+    np.testing.assert_array_equal([view.rt_cam_ref for view in settings.view], truth["true_rt_cam_ref"])
+
+
+def test_dark_views_differ_from_the_noise_free_ones_by_noise_of_eq_6(simulated_scene: Path) -> None:
+    expected = _electrons(simulated_scene / "noise_free").astype(float) + DARK_E
+    residual = _electrons(simulated_scene) - expected
+    variance = expected + READ_VARIANCE_E2
+    normalised = residual / np.sqrt(variance)
+    count = normalised.size
+    assert abs(normalised.mean()) < 4 / np.sqrt(count)
+    # A nearly normal number's square has the variance 2, and a Poisson count of mean μ adds μ / variance² to it
+    deviation = np.sqrt(np.mean(2 + expected / variance**2) / count)
+    assert np.mean(normalised**2) == pytest.approx(1, abs=4 * deviation)
+
+
+def test_the_noise_reference_saw_nothing(simulated_scene: Path) -> None:
+    frame = read_frame(simulated_scene / "noise_reference.tiff").pixels_dn
+    electrons = (frame.astype(float) - OFFSET_DN) / GAIN
+    deviation = np.sqrt(READ_VARIANCE_E2 + DARK_E)
+    assert electrons.mean() == pytest.approx(DARK_E, abs=4 * deviation / np.sqrt(frame.size))
+    assert electrons.std() == pytest.approx(deviation, rel=4 / np.sqrt(2 * frame.size))
+
+
+@pytest.mark.parametrize(("snr", "seed"), [(0.16, 1), (0.16, 2), (1.0, 1), (20.0, 1)])
+def test_the_snr_of_eq_4_measured_over_the_objects_is_the_one_asked_for(
+    snr: float, seed: int, tmp_path: Path, done: Command
+) -> None:
+    options = ("--size-px", 320, 240, "--rows", 1, "--columns", 1)
+    result = json.loads(done("--json", "simulate", tmp_path / "set", "--snr", snr, "--seed", seed, *options).stdout)
+    assert result["snr"] == pytest.approx(snr, rel=1e-6)
+    measured = brightness(load_set(tmp_path / "set"))
+    assert (measured.region, measured.noise_from) == ("object region", "noise reference")
+    assert measured.snr is not None
+    # (4) is <g²> / <n²> − 1. Means of squares of m ± s: the variance is 2 s⁴ + 4 m² s² and, for a Poisson count,
+    # m + 4 m² more, over the number of pixels
+    region = read_frame(tmp_path / "set" / "object_region.png").pixels_dn > 127
+    mean_e = _electrons(tmp_path / "set" / "noise_free")[0][region].astype(float)
+    variance = mean_e + READ_VARIANCE_E2
+    of_object = np.mean(2 * variance**2 + 4 * mean_e**2 * variance + mean_e + 4 * mean_e**2) / region.sum()
+    of_reference = 2 * READ_VARIANCE_E2**2 / region.size
+    deviation = np.sqrt(of_object + (1 + snr) ** 2 * of_reference) / READ_VARIANCE_E2
+    assert measured.snr == pytest.approx(snr, abs=4 * deviation)
+    assert deviation < 0.15 * snr
+
+
+def test_photons_are_told_by_the_papers_formula_and_by_counting(simulated_scene: Path) -> None:
+    truth = _truth(simulated_scene)
+    known = {"quantum_efficiency": ETA, "read_noise_e": READ_NOISE_E}
+    assert truth["photons_linear"] == pytest.approx(photons_from_linear_snr(0.16, **known))
+    assert truth["photons_linear"] == pytest.approx(3.84)
+    assert truth["photons_from_moments"] == pytest.approx(photons_from_moments(0.16, dark_e=DARK_E, **known))
+    region = read_frame(simulated_scene / "object_region.png").pixels_dn > 127
+    on_object = _electrons(simulated_scene / "noise_free")[4][region].mean(dtype=float) / ETA
+    assert truth["photons_on_object"] == pytest.approx(on_object, rel=1e-4)
+
+
+def test_truth_planes_are_what_the_reference_view_shows_of_each_object(simulated_scene: Path) -> None:
+    """Undistorted, the noise-free reference view is the texture wherever its object is visible."""
+    truth, view = _truth(simulated_scene), _electrons(simulated_scene / "noise_free")[4]
+    lens = load_set(simulated_scene).lens
+    rays = lens.rays()
+    flat = read_frame(simulated_scene / "flat.tiff").pixels_dn
+    seen = np.rint(rays @ np.diag([lens.fx_px, lens.fy_px]) + [lens.cx_px, lens.cy_px]).astype(int)
+    inside = ((seen >= 1) & (seen < (95, 71))).all(axis=2)
+    assert [(plane["name"], plane["depth_mm"]) for plane in truth["planes"]] == [("truck", 500.0), ("airplane", 700.0)]
+    for plane in truth["planes"]:
+        texture = read_frame(simulated_scene / plane["texture"]).pixels_dn
+        visible = read_frame(simulated_scene / plane["visible"]).pixels_dn > 127
+        assert texture.dtype == np.float32
+        assert 0.03 < visible.mean() < 0.3
+        column, row = seen[inside].T
+        # Pixels on the object's edge and on fine detail differ by what half a pixel holds
+        there = visible[row, column]
+        difference = (view / flat)[inside][there] - texture[row, column][there]
+        assert np.sqrt(np.mean(difference**2)) < 0.1 * texture[visible].mean()
+        assert abs(difference.mean()) < 0.02 * texture[visible].mean()
+
+
+@pytest.mark.parametrize("poses", ["true", "nominal"])
+def test_the_set_states_true_or_nominal_poses(
+    poses: str, tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    done("simulate", tmp_path / "set", *small_options, "--poses", poses)
+    truth, stated = _truth(tmp_path / "set"), load_set(tmp_path / "set").poses_rt_cam_ref
+    nodes = np.array([view.node for view in load_set(tmp_path / "set").settings.view])
+    nominal = np.zeros((9, 6))
+    nominal[:, 3:5] = 50.0 * (1 - nodes[:, ::-1])
+    true = np.array(truth["true_rt_cam_ref"])
+    assert truth["poses"] == poses
+    np.testing.assert_array_equal(stated, true if poses == "true" else nominal)
+    errors = np.delete(true - nominal, 4, axis=0)
+    np.testing.assert_array_equal((true - nominal)[4], 0.0)
+    # 24 numbers each: their deviation is known to a seventh
+    assert errors[:, 3:].std() == pytest.approx(0.3, rel=4 / np.sqrt(48))
+    assert errors[:, :3].std() == pytest.approx(3.5e-3, rel=4 / np.sqrt(48))
+
+
+def test_a_perfect_gantry_has_no_errors(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
+    options = ("--position-error-mm", 0, "--rotation-error-mrad", 0, "--pitch-mm", 20)
+    done("simulate", tmp_path / "set", *small_options, *options)
+    poses = load_set(tmp_path / "set").poses_rt_cam_ref
+    assert np.unique(poses[:, 3:5]).tolist() == [-20.0, 0.0, 20.0]
+    assert not poses[:, [0, 1, 2, 5]].any()
+
+
+def test_a_bayer_sensor_gives_each_pixel_the_colour_of_its_filter(
+    tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
+    assert load_set(tmp_path / "set").settings.camera.mosaic == ("RG", "GB")
+    truth, experiment = _truth(tmp_path / "set"), paper_experiment(96, 72)
+    colours = next(render(experiment.planes, experiment.optics, np.array(truth["true_rt_cam_ref"])[4:5])).light
+    found = _electrons(tmp_path / "set" / "noise_free")[4]
+    scale_e = found.sum() / sum(
+        colours[r::2, c::2, i].sum() for r, c, i in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2))
+    )
+    for row, column, colour in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
+        expected = scale_e * colours[row::2, column::2, colour]
+        np.testing.assert_allclose(found[row::2, column::2], expected, atol=2e-4 * found.max())
+    assert read_frame(tmp_path / "set" / "truth" / "plane_00500.0.tiff").pixels_dn.shape == (72, 96, 3)
+
+
+def test_a_folder_that_holds_something_else_is_refused_even_to_overwrite(
+    tmp_path: Path, faintfield: Command, small_options: tuple[object, ...]
+) -> None:
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "thesis.tex").write_text("years of work")
+    before = _all_files(tmp_path)
+    for options in ((), ("--overwrite",)):
+        ended = faintfield("simulate", tmp_path / "theirs", *small_options, *options)
+        assert ended.returncode == 1
+        assert "OutputExists" in ended.stderr
+    assert _all_files(tmp_path) == before
+
+
+def test_a_set_is_replaced_only_when_asked(
+    scene: Path, faintfield: Command, done: Command, small_options: tuple[object, ...]
+) -> None:
+    (scene / "stale.txt").touch()
+    before = _all_files(scene)
+    assert faintfield("simulate", scene, *small_options).returncode == 1
+    assert _all_files(scene) == before
+    done("simulate", scene, *small_options, "--seed", 2, "--overwrite")
+    after = _all_files(scene)
+    assert set(after) == set(before) - {"stale.txt"}
+    assert after["view_r0_c0.tiff"] != before["view_r0_c0.tiff"]
+    assert [path.name for path in scene.parent.iterdir()] == [scene.name]
+
+
+def test_a_detector_too_small_for_the_objects_is_refused(tmp_path: Path, faintfield: Command) -> None:
+    ended = faintfield("simulate", tmp_path / "set", "--size-px", 2, 2)
+    assert ended.returncode == 1
+    assert "BadValue: --size-px 2 2: the objects cover no pixel" in ended.stderr
+    assert not list(tmp_path.iterdir())
