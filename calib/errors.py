@@ -1,6 +1,7 @@
 """The failures of calibration, one tree: catch `CalibrationError` to catch them all.
 
 CalibrationError
+├── LensNotInvertible
 ├── NotIdentifiable
 │   └── TooFewFrames
 ├── BadFrame
@@ -14,6 +15,10 @@ CalibrationError
 
 class CalibrationError(Exception):
     """The measurements given cannot support the calibration asked for."""
+
+
+class LensNotInvertible(CalibrationError):
+    """The distortion folds the image over itself within the detector."""
 
 
 class NotIdentifiable(CalibrationError):

@@ -53,7 +53,7 @@ class NoiseModel:
 
     def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
         """Return a frame (row, column) in electrons, negative where the read noise made it so."""
-        electrons = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
+        electrons: NDArray[np.float32] = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
         electrons /= np.asarray(self.gain_dn_per_e, np.float32)
         return electrons
 

@@ -26,14 +26,18 @@ app = App(
     help="See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.",
     version=version("faintfield"),
     error_console=console,
+    default_parameter=Parameter(negative=()),
     result_action="return_value",
 )
+
+
+app.command("pipelines.simulate:simulate")
 
 
 @app.meta.default
 def _launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    json: Annotated[bool, Parameter(negative=())] = False,
+    json: bool = False,
 ) -> None:
     """See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.
 

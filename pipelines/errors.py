@@ -4,6 +4,7 @@ InputError
 ├── MissingFile
 ├── UnreadableImage
 ├── WrongSize
+├── WrongBitDepth
 ├── BadValue
 │   └── UnknownKey
 ├── OutputExists
@@ -28,6 +29,10 @@ class UnreadableImage(InputError):
 
 class WrongSize(InputError):
     """An image does not have the size that its camera states."""
+
+
+class WrongBitDepth(InputError):
+    """An image has another bit depth than its noise model."""
 
 
 class BadValue(InputError):

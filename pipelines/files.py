@@ -8,7 +8,9 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import msgspec
 
 from pipelines.errors import CannotWrite, DiskFull, OutputExists
 
@@ -30,7 +32,8 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         path.parent.mkdir(parents=True, exist_ok=True)
         descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
         try:
-            with os.fdopen(descriptor, "wb") as file:
+            os.close(descriptor)
+            with open(name, "wb") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -46,6 +49,11 @@ def write_whole(path: Path, content: bytes | str) -> None:
     """Write `content` to `path`, whole or not at all."""
     with writing(path) as file:
         file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON-able value or msgspec Struct, indented for people, whole or not at all."""
+    write_whole(path, msgspec.json.format(msgspec.json.encode(value)) + b"\n")
 
 
 @contextmanager

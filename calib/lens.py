@@ -1,0 +1,91 @@
+"""The lens: where each detector pixel looks."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import LensNotInvertible
+
+# Undistorting and distorting again must return to the pixel within this.
+_ROUND_TRIP_PX = 1e-3
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A pinhole with OpenCV's rational distortion; pixel centres are integers, the first pixel's centre is (0, 0).
+
+    Parameters
+    ----------
+    size_px : (int, int)
+        Width and height of the detector.
+    fx_px, fy_px, cx_px, cy_px : float
+        Focal lengths and principal point.
+    distortion : tuple of float
+        k1, k2, p1, p2, k3, k4, k5, k6 in OpenCV's order; may be shorter.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, a focal length is not positive, or there are more than eight coefficients.
+    """
+
+    size_px: tuple[int, int]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
+        if not np.isfinite(numbers).all() or min(self.fx_px, self.fy_px) <= 0:
+            raise ValueError(f"focal lengths must be positive and all numbers finite, got {numbers}")
+        if len(self.distortion) > 8:
+            raise ValueError(f"distortion takes at most 8 coefficients, got {len(self.distortion)}")
+        if min(self.size_px) < 1:
+            raise ValueError(f"size_px must be positive, got {self.size_px}")
+
+    def camera_matrix(self) -> NDArray[np.float64]:
+        """Return the 3 x 3 matrix from undistorted rays (x, y, 1) to pixels (column, row, 1)."""
+        return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]])
+
+    def rays(self, first: tuple[int, int] = (0, 0), step: tuple[int, int] = (1, 1)) -> NDArray[np.float64]:
+        """Return x, y at unit depth of each pixel of a lattice, distortion undone: (row, column, 2).
+
+        Parameters
+        ----------
+        first, step : (int, int)
+            Row and column of the lattice's first pixel, and the distance to its next; all pixels by default, one
+            phase of a Bayer mosaic with step (2, 2).
+
+        Raises
+        ------
+        LensNotInvertible
+            Some pixel is the image of no ray, or of several.
+        """
+        width, height = self.size_px
+        columns, rows = np.meshgrid(
+            np.arange(first[1], width, step[1], dtype=float), np.arange(first[0], height, step[0], dtype=float)
+        )
+        if not any(self.distortion):
+            return np.stack([(columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px], axis=-1)
+        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+        matrix, distortion = self.camera_matrix(), self._coefficients()
+        rays = cv2.undistortPoints(pixels, matrix, distortion, criteria=criteria)
+        homogeneous = cv2.convertPointsToHomogeneous(rays)
+        again, _ = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), matrix, distortion)
+        miss_px = float(np.abs(again - pixels).max())
+        if not miss_px <= _ROUND_TRIP_PX:
+            raise LensNotInvertible(
+                f"distortion {self.distortion} cannot be undone over the {width} x {height} px detector: off by "
+                f"{miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach the corners, or crop"
+            )
+        return np.asarray(rays.reshape(*rows.shape, 2), np.float64)
+
+    def _coefficients(self) -> NDArray[np.float64]:
+        """Return the distortion in one of the lengths that OpenCV takes: 4, 5 or 8."""
+        length = next(length for length in (4, 5, 8) if length >= len(self.distortion))
+        return np.array([*self.distortion, *[0.0] * (length - len(self.distortion))])

@@ -1,0 +1,252 @@
+"""From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from calib.noise_model import NoiseModel
+from pipelines.elemental_set import LoadedSet, noise_of_phase, phase_of
+from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
+from pipelines.frames import Frame, read_frame
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+
+_COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
+_RGB = ("red", "green", "blue")
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The detector pixels of one phase of a mosaic; all of them without colour filters.
+
+    Attributes
+    ----------
+    first, step : (int, int)
+        Row and column of its first pixel, and the distance to its next.
+    shape : (int, int)
+        Rows and columns.
+    """
+
+    first: tuple[int, int]
+    step: tuple[int, int]
+    shape: tuple[int, int]
+
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the lattice's part of an image (row, column)."""
+        rows, columns = (slice(first, None, step) for first, step in zip(self.first, self.step, strict=True))
+        return pixels[rows, columns][: self.shape[0], : self.shape[1]]
+
+
+@dataclass(frozen=True)
+class ChannelLayout:
+    """Where in the frames one colour is found.
+
+    Attributes
+    ----------
+    name : str
+        "grey", "red", "green" or "blue".
+    plane_of_colour : int, optional
+        Index of the colour in RGB frames.
+    lattices : tuple of Lattice
+        One per phase of the mosaic that has this colour.
+    """
+
+    name: str
+    plane_of_colour: int | None
+    lattices: tuple[Lattice, ...]
+
+
+def channel_layouts(loaded: LoadedSet) -> list[ChannelLayout]:
+    """Return the colours that a set's frames hold, judged by its first frame."""
+    width, height = loaded.settings.camera.size_px
+    frame = read_frame(loaded.image_paths[0])
+    mosaic = loaded.settings.camera.mosaic or frame.mosaic
+    everything = Lattice((0, 0), (1, 1), (height, width))
+    if frame.pixels_dn.ndim == 3:
+        return [ChannelLayout(name, index, (everything,)) for index, name in enumerate(_RGB)]
+    if mosaic is None:
+        return [ChannelLayout("grey", None, (everything,))]
+    period = (len(mosaic), len(mosaic[0]))
+    shape = (height // period[0], width // period[1])
+    layouts = []
+    for letter in sorted(set("".join(mosaic)), key="RGB".find):
+        phases = [(r, c) for r, c in np.ndindex(*period) if mosaic[r][c] == letter]
+        lattices = tuple(Lattice(phase, period, shape) for phase in phases)
+        layouts.append(ChannelLayout(_COLOUR_NAMES.get(letter, letter), None, lattices))
+    return layouts
+
+
+def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
+    """Read one colour of all views into electrons; frames are read one at a time, straight into the stack.
+
+    Raises
+    ------
+    WrongSize, WrongBitDepth, UnreadableImage
+        A frame is not what the set says it is; the message names it.
+    """
+    phases = len(layout.lattices)
+    views = len(loaded.image_paths)
+    shape = layout.lattices[0].shape
+    electrons = np.empty((views * phases, *shape), np.float32)
+    saturated: dict[int, NDArray[np.bool_]] = {}
+    for view, path in enumerate(loaded.image_paths):
+        frame = checked_frame(loaded, path, layout)
+        pixels = frame.pixels_dn if layout.plane_of_colour is None else frame.pixels_dn[:, :, layout.plane_of_colour]
+        for phase, lattice in enumerate(layout.lattices):
+            noise = _noise_of_lattice(loaded, lattice, frame)
+            stack_index = view * phases + phase
+            pixels_dn = lattice.of(pixels)
+            electrons[stack_index] = noise.electrons(pixels_dn)
+            over = noise.saturated(pixels_dn)
+            if over.any():
+                saturated[stack_index] = over
+    noises = [_noise_of_lattice(loaded, lattice, None) for lattice in layout.lattices]
+    exposure_s = loaded.settings.exposure_s
+    return ElementalImages(
+        electrons,
+        background_e=_stacked([noise.background_e(exposure_s) for noise in noises], shape),
+        read_variance_e2=_stacked([noise.read_variance_e2() for noise in noises], shape),
+        valid=_valid(electrons.shape, saturated),
+        lattice_of_view=np.tile(np.arange(phases), views),
+    )
+
+
+def checked_frame(loaded: LoadedSet, path: Path, layout: ChannelLayout) -> Frame:
+    """Read a frame and refuse one that does not fit the set's camera and noise model."""
+    frame = read_frame(path)
+    width, height = loaded.settings.camera.size_px
+    found = frame.pixels_dn
+    if found.shape[:2] != (height, width):
+        raise WrongSize(
+            f"{path}: is {found.shape[1]} x {found.shape[0]} px, the camera {width} x {height} px; "
+            "correct camera.size_px or take the view again"
+        )
+    if (found.ndim == 3) != (layout.plane_of_colour is not None):
+        kind = "colour" if found.ndim == 3 else "grey"
+        raise UnreadableImage(f"{path}: is {kind}, unlike the set's first view; all views must be of one kind")
+    if found.dtype not in (np.uint8, np.uint16):
+        raise WrongBitDepth(f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers")
+    saturation_dn = loaded.noise.saturation_dn
+    if found.dtype == np.uint8 and np.isfinite(saturation_dn) and saturation_dn > 255:
+        raise WrongBitDepth(
+            f"{path}: has 8 bits per pixel, but the noise model saturates at {saturation_dn:.0f} DN; "
+            "export 16-bit images, or state the noise of the 8-bit ones (saturation_dn = 255)"
+        )
+    if loaded.offset_from_files and frame.black_dn is None:
+        raise BadValue(f"{path}: brings no black level of its own; state noise.offset_dn in {loaded.folder}")
+    return frame
+
+
+def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
+    """Return the samples of the plane at a depth: by default those that overlay the reference view pixel for pixel.
+
+    Raises
+    ------
+    GeometryMismatch
+        The plane is not in front of the camera.
+    """
+    if not (np.isfinite(depth_mm) and depth_mm > 0):
+        raise GeometryMismatch(f"a plane at {depth_mm} mm is behind the camera; depth_mm must be positive")
+    camera = loaded.settings.camera
+    cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view]
+    width, height = camera.size_px
+    mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
+    return PlaneGrid.covering(
+        left_mm=(-0.5 - cx_px) * mm_per_px_x,
+        top_mm=(-0.5 - cy_px) * mm_per_px_y,
+        right_mm=(width - 0.5 - cx_px) * mm_per_px_x,
+        bottom_mm=(height - 0.5 - cy_px) * mm_per_px_y,
+        pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
+    )
+
+
+class OperatorFactory:
+    """Makes the operators of one channel; what they share (rays, response, mask) is computed once."""
+
+    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages) -> None:
+        self._loaded = loaded
+        self._images = images
+        self._phases = len(layout.lattices)
+        lattices = layout.lattices
+        self._rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
+        self._response = np.stack([_response(loaded, lattice) for lattice in lattices])
+        self._principal_shift = _principal_shift(loaded)
+
+    def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
+        """Return H of the plane across the reference camera's axis at a depth."""
+        rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
+        homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
+        return PlaneOperator(
+            np.repeat(homographies, self._phases, axis=0),
+            self._rays,
+            grid,
+            flat=self._response,
+            valid=self._images.valid,
+            lattice_of_view=self._images.lattice_of_view,
+        )
+
+
+def _noise_of_lattice(loaded: LoadedSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
+    """Return the noise model of a lattice; a raw frame brings its own black level and saturation if none is stated."""
+    noise = noise_of_phase(loaded.noise, lattice.first, lattice.step, lattice.shape)
+    if frame is None:
+        return noise
+    if loaded.offset_from_files and frame.black_dn is not None:
+        black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
+        noise = replace(noise, offset_dn=float(black_dn))
+    if not np.isfinite(noise.saturation_dn) and frame.saturation_dn is not None:
+        noise = replace(noise, saturation_dn=frame.saturation_dn)
+    return noise
+
+
+def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:
+    """Return one number when all lattices share it, else the maps (lattice, row, column)."""
+    if all(np.ndim(part) == 0 and part == parts[0] for part in parts):
+        return float(parts[0])
+    return np.stack([np.broadcast_to(part, shape) for part in parts]).astype(np.float32)
+
+
+def _valid(shape: tuple[int, ...], saturated: dict[int, NDArray[np.bool_]]) -> NDArray[np.bool_] | None:
+    """Return the mask of pixels that carry a number, None when all do."""
+    if not saturated:
+        return None
+    valid = np.ones(shape, bool)
+    for index, over in saturated.items():
+        valid[index] = ~over
+    return valid
+
+
+def _cropped_rays(loaded: LoadedSet, lattice: Lattice) -> NDArray[np.float32]:
+    """Return the rays of a lattice (row, column, 2); an incomplete period at the far edges is left out."""
+    rays = loaded.lens.rays(lattice.first, lattice.step)
+    return rays[: lattice.shape[0], : lattice.shape[1]].astype(np.float32)
+
+
+def _response(loaded: LoadedSet, lattice: Lattice) -> NDArray[np.float32]:
+    """Return the flat field of a lattice (row, column), zero at unusable pixels."""
+    flat = np.ones(lattice.shape, np.float32) if loaded.flat is None else lattice.of(loaded.flat).copy()
+    unusable = phase_of(loaded.unusable, lattice.first, lattice.step, lattice.shape)
+    if unusable is not None:
+        flat[unusable] = 0
+    return flat
+
+
+def _principal_shift(loaded: LoadedSet) -> NDArray[np.float64] | None:
+    """Return what is added to the rays of views whose principal point differs from the camera's."""
+    camera = loaded.settings.camera
+    shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()
+    if not shift_px.any():
+        return None
+    if any(camera.distortion):
+        view = int(np.flatnonzero(shift_px.any(axis=1))[0])
+        raise GeometryMismatch(
+            f"view[{view}] has a principal point of its own while the camera has distortion {list(camera.distortion)}; "
+            "a sheared or rectified light field has none: remove one of the two"
+        )
+    return np.asarray(shift_px / [camera.fx_px, camera.fy_px])

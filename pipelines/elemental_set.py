@@ -1,0 +1,292 @@
+"""The elemental set: a folder of images with `elemental.toml`, the way in for anyone's images and poses."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from calib.lens import Lens
+from calib.noise_model import Map, NoiseModel
+from pipelines.errors import BadValue, MissingFile
+from pipelines.files import sha256, write_whole
+from pipelines.frames import read_frame
+from pipelines.toml_files import inside, read_toml
+
+FILE_NAME = "elemental.toml"
+
+# How far the reference view's pose may be from zero: less than any calibration can tell.
+_ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
+
+
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[camera]` table. `mosaic` and `flat` extend the format for colour filters and vignetting."""
+
+    size_px: tuple[int, int]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    mosaic: tuple[str, ...] | None = None
+    flat: str | None = None
+
+
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated."""
+
+    gain_dn_per_e: float
+    read_noise_e: float
+    offset_dn: float | None = None
+    dark_current_e_per_s: float = 0.0
+    quantum_efficiency: float = 1.0
+    saturation_dn: float | None = None
+
+
+class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One `[[view]]`: an image and the pose it was taken from."""
+
+    image: str
+    rt_cam_ref: tuple[float, float, float, float, float, float]
+    node: tuple[int, int] | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+
+
+class ElementalSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The whole of `elemental.toml`."""
+
+    format: Literal[1]
+    exposure_s: float
+    reference_view: int
+    camera: Camera
+    noise: Noise | str
+    view: list[View]
+
+
+@dataclass(frozen=True)
+class LoadedSet:
+    """An elemental set that has been checked: everything but the pixels.
+
+    Attributes
+    ----------
+    folder : Path
+        Where it lies; every path in it is relative to this.
+    settings : ElementalSet
+        What `elemental.toml` says.
+    lens : Lens
+        Of the camera.
+    noise : NoiseModel
+        Offset NaN-free; zero where each raw file brings its own (`offset_from_files`).
+    offset_from_files : bool
+        The offset is each raw file's masked black level.
+    flat : float array (row, column), optional
+        Relative response.
+    unusable : bool array (row, column), optional
+        Pixels that never count (hot, dead).
+    """
+
+    folder: Path
+    settings: ElementalSet
+    lens: Lens
+    noise: NoiseModel
+    offset_from_files: bool
+    flat: NDArray[np.float32] | None
+    unusable: NDArray[np.bool_] | None
+
+    @property
+    def reference_view(self) -> int:
+        """Index of the view whose frame is the reference."""
+        return self.settings.reference_view
+
+    @property
+    def poses_rt_cam_ref(self) -> NDArray[np.float64]:
+        """All poses (view, 6)."""
+        return np.array([view.rt_cam_ref for view in self.settings.view])
+
+    @property
+    def image_paths(self) -> list[Path]:
+        """Where the images lie."""
+        return [self.folder / view.image for view in self.settings.view]
+
+    def principal_points_px(self) -> NDArray[np.float64]:
+        """Return cx, cy of each view (view, 2)."""
+        camera = self.settings.camera
+        return np.array(
+            [
+                [camera.cx_px if view.cx_px is None else view.cx_px, camera.cy_px if view.cy_px is None else view.cy_px]
+                for view in self.settings.view
+            ]
+        )
+
+    def input_hashes(self) -> Iterator[tuple[str, str]]:
+        """Yield name and SHA-256 of every file that a reconstruction reads."""
+        for name in [FILE_NAME, *_named_files(self.settings)]:
+            yield name, sha256(self.folder / name)
+
+
+def load_set(folder: Path) -> LoadedSet:
+    """Read and check `elemental.toml` and the files it names, except the images' pixels.
+
+    Raises
+    ------
+    InputError
+        A file is missing, a key unknown, or a value cannot be; the message names it.
+    """
+    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    folder = path.parent
+    settings = read_toml(path, ElementalSet)
+    _check_numbers(path, settings)
+    _check_views(path, settings)
+    for name in _named_files(settings):
+        if not inside(folder, name, f"{path}: file").is_file():
+            raise MissingFile(f"{path}: {name} is named but missing in {folder}; put it there or remove its entry")
+    noise, unusable = _read_noise(path, settings)
+    offset_from_files = isinstance(settings.noise, Noise) and settings.noise.offset_dn is None
+    try:
+        camera = settings.camera
+        lens = Lens(camera.size_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
+    except ValueError as failure:
+        raise BadValue(f"{path}: camera: {failure}; correct it") from failure
+    flat = None if settings.camera.flat is None else _read_flat(folder / settings.camera.flat, camera.size_px)
+    return LoadedSet(folder, settings, lens, noise, offset_from_files, flat, unusable)
+
+
+def write_set(folder: Path, settings: ElementalSet) -> None:
+    """Write `elemental.toml`; the images come first, so that a folder with this file is whole."""
+    write_whole(folder / FILE_NAME, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
+
+
+def _without_none(value: Any) -> Any:
+    """Drop the keys that say nothing: TOML has no null."""
+    if isinstance(value, dict):
+        return {key: _without_none(part) for key, part in value.items() if part is not None}
+    return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value
+
+
+def _named_files(settings: ElementalSet) -> list[str]:
+    """Return the names of the files that `elemental.toml` names."""
+    optional = [settings.camera.flat, settings.noise if isinstance(settings.noise, str) else None]
+    return [*(name for name in optional if name is not None), *(view.image for view in settings.view)]
+
+
+def _check_numbers(path: Path, settings: ElementalSet) -> None:
+    """Refuse exposures and poses that are no numbers, and mosaics that are no mosaics."""
+    if not (np.isfinite(settings.exposure_s) and settings.exposure_s > 0):
+        raise BadValue(f"{path}: exposure_s = {settings.exposure_s}; it must be positive: give the exposure in seconds")
+    for index, view in enumerate(settings.view):
+        numbers = (*view.rt_cam_ref, view.cx_px or 0.0, view.cy_px or 0.0)
+        if not np.isfinite(numbers).all():
+            raise BadValue(
+                f"{path}: view[{index}] ({view.image}): pose {list(view.rt_cam_ref)} is not finite; "
+                "give rt_cam_ref in rad and mm, or remove the view"
+            )
+    mosaic = settings.camera.mosaic
+    if mosaic is not None and (not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1):
+        raise BadValue(f'{path}: camera.mosaic = {list(mosaic)}; give rows of equal length, such as ["RG", "GB"]')
+
+
+def _check_views(path: Path, settings: ElementalSet) -> None:
+    """Refuse a set without views, without its reference, or with a view named twice."""
+    count = len(settings.view)
+    if not 0 <= settings.reference_view < count:
+        raise BadValue(
+            f"{path}: reference_view = {settings.reference_view}, but there are {count} views; give 0…{count - 1}"
+        )
+    reference = np.array(settings.view[settings.reference_view].rt_cam_ref)
+    if (np.abs(reference) > _ZERO_POSE).any():
+        raise BadValue(
+            f"{path}: view[{settings.reference_view}] is the reference but its pose is {reference.tolist()}; "
+            "poses are relative to the reference view, whose own is zero"
+        )
+    _refuse_repeated(path, "image", [view.image for view in settings.view])
+    _refuse_repeated(path, "node", [list(view.node) for view in settings.view if view.node is not None])
+
+
+def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
+    """Refuse a name that more than one view has."""
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
+
+
+def _read_noise(path: Path, settings: ElementalSet) -> tuple[NoiseModel, NDArray[np.bool_] | None]:
+    """Return the noise model, and the pixels that it calls unusable."""
+    try:
+        if isinstance(settings.noise, str):
+            return read_noise_json(path.parent / settings.noise, settings.camera.size_px)
+        stated = msgspec.structs.asdict(settings.noise)
+        stated["offset_dn"] = stated["offset_dn"] or 0.0
+        if stated["saturation_dn"] is None:
+            stated["saturation_dn"] = np.inf
+        return NoiseModel(**stated), None
+    except ValueError as failure:
+        raise BadValue(f"{path}: noise: {failure}; correct it") from failure
+
+
+def read_noise_json(path: Path, size_px: tuple[int, int]) -> tuple[NoiseModel, NDArray[np.bool_] | None]:
+    """Return the model that `faintfield noise` fitted, with its maps when they lie beside it, and the unusable pixels.
+
+    Raises
+    ------
+    BadValue
+        The file is no noise result, or a number that a reconstruction needs was not identifiable.
+    """
+    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
+    try:
+        fitted = json.loads(path.read_text())
+        values = {name: fitted[name]["value"] for name in names}
+        missing = [name for name in names if values[name] is None]
+        hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int)
+        extra = {
+            key: fitted[key]["value"] if isinstance(fitted[key], dict) else fitted[key]
+            for key in ("quantum_efficiency", "saturation_dn")
+            if fitted.get(key) is not None
+        }
+    except (ValueError, KeyError, TypeError) as failure:
+        raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure!r}); run that again") from failure
+    if missing:
+        why = fitted[missing[0]].get("why", "no reason stated")
+        raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
+    unusable = np.zeros(size_px[::-1], bool)
+    unusable[tuple(hot.reshape(-1, 2).T)] = True
+    maps_path = path.with_name("noise_maps.npz")
+    if maps_path.is_file():
+        with np.load(maps_path, allow_pickle=False) as maps:
+            values |= {name: maps[name] for name in names if name in maps and maps[name].shape == unusable.shape}
+            if "mask" in maps:
+                unusable |= maps["mask"]
+    return NoiseModel(**values, **extra), unusable
+
+
+def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the relative response (row, column) from a float TIFF."""
+    flat = np.asarray(read_frame(path).pixels_dn, np.float32)
+    if flat.shape != size_px[::-1] or not np.isfinite(flat).all() or (flat < 0).any():
+        raise BadValue(
+            f"{path}: the flat field must be {size_px[0]} x {size_px[1]} px, finite and not negative; "
+            f"got {flat.shape[::-1]}, least {np.nanmin(flat)}"
+        )
+    return flat
+
+
+def phase_of(
+    value: Map | NDArray[np.bool_] | None, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]
+) -> Any:
+    """Return the part of a map (or the one number, or None) that lies on one phase of a mosaic."""
+    if value is None or np.ndim(value) == 0:
+        return value
+    return np.asarray(value)[first[0] :: period[0], first[1] :: period[1]][: shape[0], : shape[1]]
+
+
+def noise_of_phase(
+    noise: NoiseModel, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]
+) -> NoiseModel:
+    """Return the noise model of one phase of a mosaic."""
+    maps = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
+    return replace(noise, **{name: phase_of(getattr(noise, name), first, period, shape) for name in maps})

@@ -1,0 +1,211 @@
+"""The operator H of eq. (1): what each detector pixel of each view sees of a plane, and its exact adjoint."""
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from recon import kernels
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages, Image
+from recon.plane import PlaneGrid
+
+
+class PlaneOperator:
+    """H of one plane: matrix-free, linear, with the adjoint that shares its weights.
+
+    Every view is taken by one camera, so the lens (distortion included) is one shared map from detector pixel to ray,
+    and a view is one homography from rays to the plane. H interpolates the plane bilinearly at each detector pixel;
+    Hᵀ spreads each pixel to the same four samples with the same weights. The images themselves are never resampled.
+    A pixel sees the plane when all four samples around its point exist; otherwise its row of H is zero.
+
+    Parameters
+    ----------
+    plane_from_ray : array (view, 3, 3)
+        Homography from a ray (x, y, 1) to plane coordinates (x, y, 1) in mm; the homogeneous scale is positive for
+        points in front of the camera.
+    rays : array (row, column, 2) or (lattice, row, column, 2)
+        Where each detector pixel looks: x, y at unit depth, lens distortion undone.
+    grid : PlaneGrid
+        The samples of the plane.
+    flat : array (row, column) or (lattice, row, column), optional
+        Relative response of each pixel (vignetting); zero for pixels that never count.
+    valid : bool array (view, row, column), optional
+        False for pixels that do not count in one view.
+    lattice_of_view : int array (view,), optional
+        Which lattice of detector pixels each view has; all the first by default.
+    dtype : dtype
+        Of planes and images: float32 for work, float64 for tests.
+    workers : int, optional
+        Threads; as many as the process may use by default. Sums depend on it in the last digits.
+
+    Raises
+    ------
+    GeometryMismatch
+        Shapes do not fit together, a number is not finite, or no pixel of any view sees the plane.
+
+    Notes
+    -----
+    f is in expected electrons per detector pixel before flat field; see docs/physics.md, "The operator".
+    """
+
+    def __init__(
+        self,
+        plane_from_ray: NDArray[np.floating],
+        rays: NDArray[np.floating],
+        grid: PlaneGrid,
+        *,
+        flat: NDArray[np.floating] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        lattice_of_view: NDArray[np.intp] | None = None,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
+        workers: int | None = None,
+    ) -> None:
+        self.grid = grid
+        self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
+        self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
+        self._geometry = _checked_geometry(plane_from_ray, rays, grid, flat, valid, lattice_of_view, dtype)
+        self.images_shape = (len(plane_from_ray), *self._geometry.ray_x.shape[1:])
+        self.all_views = np.arange(len(plane_from_ray))
+        if not self.sensitivity().any():
+            raise GeometryMismatch(
+                f"no pixel of any of the {len(self.all_views)} views sees the plane of {grid.shape[1]} x "
+                f"{grid.shape[0]} samples at {grid.pitch_mm:.3g} mm; check its depth, the poses and their signs"
+            )
+
+    def forward(self, plane: Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
+        """Return H f: the plane (row, column) as each view sees it, (view, row, column)."""
+        views = self._views(views)
+        seen = np.empty((len(views), *self.images_shape[1:]), self.dtype)
+        image_of_view = np.zeros(self.images_shape[0], np.intp)
+        image_of_view[views] = np.arange(len(views))
+        self._sweep(kernels.FORWARD, views, image_of_view, plane=self._plane(plane), seen=seen)
+        return seen
+
+    def adjoint(self, images: Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
+        """Return Hᵀ g (row, column) of images (view, row, column), summed over `views` (all by default)."""
+        if images.shape != self.images_shape:
+            raise GeometryMismatch(f"images have shape {images.shape}, the operator {self.images_shape}")
+        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images)
+
+    def adjoint_of_map(self, value: float | Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
+        """Return Hᵀ applied to images that all equal one map, broadcastable to (lattice, row, column)."""
+        lattices = self._geometry.lattice_of_view
+        return self._sweep(kernels.ADJOINT, self._views(views), lattices, images=self._map(value))
+
+    def sensitivity(self, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
+        """Return s = Hᵀ 1 (row, column): without flat field, the number of views that see each sample."""
+        return self.adjoint_of_map(1.0, views)
+
+    def coverage(self, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
+        """Return Hᵀ H 1 (row, column), by which a back-projection is divided to keep a constant plane constant."""
+        return self.adjoint_of_map(self._geometry.response, views)
+
+    def adjoint_of_ratio(
+        self, plane: Image, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
+    ) -> Image:
+        """Return Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ] (row, column) in one sweep; with σ = 0 the ratio of eq. (2)."""
+        return self._sweep(
+            kernels.RATIO,
+            self._views(views),
+            self.all_views,
+            plane=self._plane(plane),
+            images=images.electrons,
+            background=self._map(images.background_e),
+            variance=self._map(images.read_variance_e2),
+        )
+
+    def _sweep(
+        self,
+        operation: int,
+        views: NDArray[np.intp],
+        image_of_view: NDArray[np.intp],
+        *,
+        plane: Image | None = None,
+        images: Image | None = None,
+        seen: Image | None = None,
+        background: Image | None = None,
+        variance: Image | None = None,
+    ) -> Image:
+        """Run one kernel on all workers and return the sum of their accumulators."""
+        nothing = np.empty((1, 1, 1), self.dtype)
+        images = nothing if images is None else np.ascontiguousarray(images, self.dtype)
+        sums = np.zeros((self._workers, *self.grid.shape) if seen is None else (self._workers, 1, 1), self.dtype)
+
+        def work(worker: int) -> None:
+            kernels.sweep(
+                operation,
+                nothing[0] if plane is None else plane,
+                nothing if seen is None else seen,
+                sums[worker],
+                images,
+                image_of_view,
+                nothing if background is None else background,
+                nothing if variance is None else variance,
+                self._geometry,
+                views,
+                worker,
+                self._workers,
+            )
+
+        _on_all(work, self._workers)
+        return np.asarray(sums.sum(axis=0))
+
+    def _plane(self, plane: Image) -> Image:
+        if plane.shape != self.grid.shape:
+            raise GeometryMismatch(f"plane has shape {plane.shape}, the operator {self.grid.shape}")
+        return np.ascontiguousarray(plane, self.dtype)
+
+    def _map(self, value: float | Image) -> Image:
+        return np.array(np.broadcast_to(value, self._geometry.ray_x.shape), self.dtype)
+
+    def _views(self, views: Sequence[int] | NDArray[np.intp] | None) -> NDArray[np.intp]:
+        return self.all_views if views is None else np.asarray(views, np.intp)
+
+
+def _checked_geometry(
+    plane_from_ray: NDArray[Any],
+    rays: NDArray[Any],
+    grid: PlaneGrid,
+    flat: NDArray[Any] | None,
+    valid: NDArray[np.bool_] | None,
+    lattice_of_view: NDArray[np.intp] | None,
+    dtype: type[Any],
+) -> kernels.Geometry:
+    """Bring the pieces into the form that the kernels read, refusing what does not fit."""
+    rays = rays[np.newaxis] if rays.ndim == 3 else rays
+    views, lattices, detector = len(plane_from_ray), len(rays), rays.shape[1:3]
+    flat = np.ones(detector) if flat is None else flat
+    lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.asarray(lattice_of_view, np.intp)
+    valid = np.zeros((0, 0, 0), bool) if valid is None or valid.all() else np.ascontiguousarray(valid)
+    if plane_from_ray.shape != (views, 3, 3) or rays.shape != (lattices, *detector, 2) or views == 0:
+        raise GeometryMismatch(
+            f"homographies {plane_from_ray.shape} and rays {rays.shape} do not fit: (view, 3, 3) wanted"
+        )
+    if valid.size and valid.shape != (views, *detector):
+        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}")
+    if flat.shape[-2:] != detector or lattice_of_view.shape != (views,) or lattice_of_view.max() >= lattices:
+        raise GeometryMismatch(f"flat {flat.shape} or lattices {lattice_of_view.shape} do not fit rays {rays.shape}")
+    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):
+        raise GeometryMismatch("a pose, ray or flat field is not a finite number; check the calibration they came from")
+    return kernels.Geometry(
+        np.ascontiguousarray(grid.index_from_plane() @ plane_from_ray, dtype),
+        lattice_of_view,
+        np.ascontiguousarray(rays[..., 0], dtype),
+        np.ascontiguousarray(rays[..., 1], dtype),
+        np.ascontiguousarray(np.broadcast_to(flat, (lattices, *detector)), dtype),
+        valid,
+    )
+
+
+def _on_all(work: Callable[[int], None], workers: int) -> None:
+    """Call `work` for each worker, each in a thread of its own when there are several."""
+    if workers == 1:
+        work(0)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        for _ in pool.map(work, range(workers)):
+            pass

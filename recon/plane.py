@@ -1,0 +1,47 @@
+"""The samples of a plane: where they lie, and how many there are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PlaneGrid:
+    """A regular grid of samples on a plane; x runs along columns and y along rows, as in the reference camera.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns.
+    pitch_mm : float
+        Distance of neighbouring samples.
+    origin_mm : (float, float)
+        x, y of the first sample's centre.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two samples along an axis (nothing to interpolate between), or a pitch that is not positive.
+    """
+
+    shape: tuple[int, int]
+    pitch_mm: float
+    origin_mm: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 2:
+            raise ValueError(f"a plane needs at least 2 x 2 samples, got {self.shape}; take a finer pitch_mm")
+        if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0):
+            raise ValueError(f"pitch_mm must be positive, got {self.pitch_mm}")
+
+    @classmethod
+    def covering(cls, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, pitch_mm: float) -> "PlaneGrid":
+        """Return the grid whose samples, each a square of `pitch_mm`, tile the rectangle of the given outer edges."""
+        rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
+        return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
+
+    def index_from_plane(self) -> NDArray[np.float64]:
+        """Return the 3 x 3 matrix from plane coordinates (x, y, 1) in mm to sample indices (column, row, 1)."""
+        x_mm, y_mm = self.origin_mm
+        return np.array([[1, 0, -x_mm], [0, 1, -y_mm], [0, 0, self.pitch_mm]]) / self.pitch_mm

@@ -1,0 +1,193 @@
+"""Back-projection, MLEM and one-step-late PMLEM: from elemental images to a plane.
+
+The iterations are generators of iterates; when to stop, what to show and what to save is the caller's business. None
+knows it has converged: `settled` and `oscillates` judge what the caller has seen.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from recon.errors import NotConverged
+from recon.images import ElementalImages, Image
+from recon.operator import PlaneOperator
+from recon.penalties import total_variation_gradient
+
+# |P| of eq. (3) is at most 1 + 1 + √2: two differences that cannot exceed their own magnitude, and the sum of two.
+_LARGEST_PENALTY_GRADIENT = 2 + 2**0.5
+
+_START_BLUR_PX = 2.0
+
+# Where the mean of the views is not positive there is no light to speak of.
+_LEAST_LEVEL_E = 1e-6
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """What one pass over the data made.
+
+    Attributes
+    ----------
+    passes : int
+        Passes over all views so far.
+    plane : float array (row, column)
+        Expected electrons per detector pixel.
+    relative_change : float
+        ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
+    alternation : float
+        Cosine between this step and the one before: −1 when the iteration swings to and fro, 0 at the first pass.
+    """
+
+    passes: int
+    plane: Image
+    relative_change: float
+    alternation: float
+
+
+def back_projection(
+    operator: PlaneOperator, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
+) -> Image:
+    """Return `Hᵀ(g − b) / Hᵀ H 1` (row, column): the mean of what the views say of each sample.
+
+    It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that
+    contribute, as in the paper.
+    """
+    light = operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
+    coverage = operator.coverage(views)
+    return np.divide(light, coverage, out=np.zeros_like(light), where=coverage > 0)
+
+
+def smooth_start(operator: PlaneOperator, images: ElementalImages) -> Image:
+    """Return a positive plane to start from: the back-projection, blurred, at least a hundredth of its mean.
+
+    A multiplicative iteration can neither leave zero nor start below it. The blur weighs by coverage, so that samples
+    that no view sees take the level of their neighbours.
+    """
+    coverage = gaussian_filter(operator.coverage(), _START_BLUR_PX)
+    light = operator.adjoint(images.electrons) - operator.adjoint_of_map(images.background_e)
+    light = gaussian_filter(light, _START_BLUR_PX)
+    level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), _LEAST_LEVEL_E)
+    start = np.divide(light, coverage, out=np.full_like(light, level), where=coverage > 1e-3 * coverage.max())
+    return np.maximum(start, 0.01 * level)
+
+
+def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
+    """Yield iterates of MLEM, eq. (2) with β = 0: maximum likelihood, which fits the noise when carried far."""
+    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
+
+
+def pmlem_one_step_late(
+    operator: PlaneOperator, images: ElementalImages, start: Image, *, penalty_weight: float, epsilon: float
+) -> Iterator[Iterate]:
+    """Yield iterates of Green's one-step-late PMLEM with total variation, eqs. (2) and (3) as published.
+
+    `f ← f / ( s + β P{f} ) · Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ]`: the shifted Poisson model adds the read noise's
+    variance to data and model, after which the data are nearly Poisson; with σ = 0 it is eq. (2) itself.
+
+    Parameters
+    ----------
+    start : float array (row, column)
+        Positive where it shall be able to change.
+    penalty_weight : float
+        β ≥ 0, in the unit of s.
+    epsilon : float
+        ε > 0 of eq. (3), in the unit of f squared.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of its range, or `start` is not positive.
+    NotConverged
+        The weight is so large that most denominators could become negative, or an iterate is not finite.
+
+    Notes
+    -----
+    The denominator is positive for every f only where `s > (2 + √2) β`. Samples seen by fewer views keep their start
+    value, see `updated_samples`; the denominator is not clamped. Iterates need not converge: with a large β they swing
+    without end, which `oscillates` tells.
+    """
+    if not (penalty_weight >= 0 and epsilon > 0):
+        raise ValueError(f"need penalty_weight >= 0 and epsilon > 0, got {penalty_weight} and {epsilon}")
+    if not (start > 0).all():
+        raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
+    sensitivity = operator.sensitivity()
+    updated = updated_samples(sensitivity, penalty_weight)
+    if 2 * np.count_nonzero(updated) < np.count_nonzero(sensitivity):
+        limit = float(np.median(sensitivity[sensitivity > 0])) / _LARGEST_PENALTY_GRADIENT
+        raise NotConverged(
+            f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
+            f"must stay below {limit:.3g}: give a smaller one"
+        )
+    return _one_step_late(operator, images, start, penalty_weight, epsilon, sensitivity, updated)
+
+
+def _one_step_late(
+    operator: PlaneOperator,
+    images: ElementalImages,
+    start: Image,
+    penalty_weight: float,
+    epsilon: float,
+    sensitivity: Image,
+    updated: NDArray[np.bool_],
+) -> Iterator[Iterate]:
+    """Iterate eq. (2) for ever."""
+    plane = np.array(start, operator.dtype)
+    step = np.zeros_like(plane)
+    passes = 0
+    while True:
+        denominator = sensitivity
+        if penalty_weight > 0:
+            denominator = sensitivity + plane.dtype.type(penalty_weight) * total_variation_gradient(plane, epsilon)
+        ratio = operator.adjoint_of_ratio(plane, images)
+        next_plane = plane.copy()
+        np.divide(plane * ratio, denominator, out=next_plane, where=updated)
+        if not np.isfinite(next_plane).all():
+            raise NotConverged(f"pass {passes + 1} left the finite numbers; give a smaller penalty weight")
+        passes += 1
+        last_step, step = step, next_plane - plane
+        norms = float(np.linalg.norm(step)) * float(np.linalg.norm(last_step))
+        alternation = float(np.vdot(step, last_step)) / norms if norms > 0 else 0.0
+        change = float(np.linalg.norm(step) / np.linalg.norm(plane))
+        plane = next_plane
+        yield Iterate(passes, plane, change, alternation)
+
+
+def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.bool_]:
+    """Return which samples one-step-late PMLEM changes: those whose denominator is positive whatever the plane."""
+    return np.asarray(sensitivity > _LARGEST_PENALTY_GRADIENT * penalty_weight)
+
+
+def settled(iterates: Sequence[Iterate], tolerance: float) -> bool:
+    """Return whether the last pass changed the plane by less than `tolerance`, relatively."""
+    return bool(iterates) and iterates[-1].relative_change < tolerance
+
+
+def oscillates(iterates: Sequence[Iterate], tolerance: float, window: int = 10) -> bool:
+    """Return whether the iteration swings to and fro instead of settling.
+
+    True when over the last `window` passes successive steps oppose each other on the whole (mean cosine below −0.5),
+    are larger than `tolerance`, and do not shrink (the window's second half moves at least 0.8 times as far).
+    """
+    if len(iterates) < window:
+        return False
+    last = iterates[-window:]
+    changes = [iterate.relative_change for iterate in last]
+    early, late = np.mean(changes[: window // 2]), np.mean(changes[window // 2 :])
+    alternation = np.mean([iterate.alternation for iterate in last])
+    return bool(alternation < -0.5 and late > tolerance and late >= 0.8 * early)
+
+
+def universal_penalty_weight(operator: PlaneOperator, images: ElementalImages, plane: Image) -> float:
+    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), with medians for s and means else.
+
+    The noise of the likelihood's gradient has the standard deviation √( s / (f + b + σ²) ) at each sample, and eq. (3)
+    is of the order of one, so this weight removes fluctuations of about that size. It is a starting point that needs no
+    tuning, not the best weight for a scene.
+    """
+    sensitivity = operator.sensitivity()
+    seen = sensitivity > 0
+    per_view_e = plane[seen].mean() + np.mean(images.background_e) + np.mean(images.read_variance_e2)
+    return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))

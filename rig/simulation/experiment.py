@@ -1,0 +1,79 @@
+"""The paper's experiment, assembled: two toys, a grid of nodes, a lens and a cooled 16-bit sensor."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.grid import centre_node, nominal_poses_rt_cam_ref
+from rig.simulation.objects import toy_airplane, toy_truck
+from rig.simulation.optics import SimulatedOptics
+from rig.simulation.scene import TexturedPlane
+from rig.simulation.sensor import SimulatedSensor
+
+
+@dataclass(frozen=True)
+class SimulatedExperiment:
+    """What stands where, and what it is taken with.
+
+    Parameters
+    ----------
+    planes : tuple of TexturedPlane
+        The scene, in front of darkness.
+    optics, sensor : SimulatedOptics, SimulatedSensor
+        The camera.
+    rows, columns, pitch_mm : int, int, float
+        The grid.
+    exposure_s : float
+        Of one dark-scene view.
+    """
+
+    planes: tuple[TexturedPlane, ...]
+    optics: SimulatedOptics
+    sensor: SimulatedSensor = field(default_factory=SimulatedSensor)
+    rows: int = 7
+    columns: int = 7
+    pitch_mm: float = 50.0
+    exposure_s: float = 0.1
+
+    @property
+    def reference_view(self) -> int:
+        """Index of the view at the centre node, in raster order."""
+        row, column = centre_node(self.rows, self.columns)
+        return row * self.columns + column
+
+    def nominal_poses_rt_cam_ref(self) -> NDArray[np.float64]:
+        """Return the poses (view, 6) that the gantry is told to take."""
+        return nominal_poses_rt_cam_ref(self.rows, self.columns, self.pitch_mm)
+
+    def poses_rt_cam_ref(
+        self, position_sd_mm: float, rotation_sd_rad: float, generator: np.random.Generator
+    ) -> NDArray[np.float64]:
+        """Return the poses (view, 6) that it takes: normal errors of each axis, none at the reference view."""
+        poses = self.nominal_poses_rt_cam_ref()
+        errors = generator.normal(size=poses.shape) * np.repeat([rotation_sd_rad, position_sd_mm], 3)
+        errors[self.reference_view] = 0
+        return np.asarray(poses + errors)
+
+    def grey(self) -> "SimulatedExperiment":
+        """Return the experiment with a sensor without colour filters in mind."""
+        return replace(self, planes=tuple(plane.grey() for plane in self.planes))
+
+
+def paper_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedExperiment:
+    """Return the paper's scene: a toy truck at 500 mm and a toy airplane at 700 mm.
+
+    The lens has the field of view of 800 px focal length at 640 px width, a mild barrel distortion and a principal
+    point beside the centre, as real ones have.
+    """
+    f_px = 800.0 * width_px / 640.0
+    optics = SimulatedOptics(
+        size_px=(width_px, height_px),
+        fx_px=f_px,
+        fy_px=f_px,
+        cx_px=(width_px - 1) / 2 + 0.006 * width_px,
+        cy_px=(height_px - 1) / 2 - 0.004 * height_px,
+        distortion=(-0.08, 0.02, 0.0005, -0.0003, 0.0),
+    )
+    planes = (toy_truck(-62.0, 50.0, 500.0), toy_airplane(78.0, -55.0, 700.0))
+    return SimulatedExperiment(planes, optics)

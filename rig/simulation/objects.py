@@ -1,0 +1,115 @@
+"""The toys of the simulated experiment, drawn with their markings: a truck from the side, an airplane from above."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simulation.scene import TexturedPlane
+
+# Drawn this many times finer than the texture and averaged down, so that edges have soft shares.
+_OVERSAMPLING = 4
+_TEXTURE_PITCH_MM = 0.25
+
+type Colour = tuple[float, float, float]
+
+_RED, _YELLOW, _WHITE = (0.95, 0.30, 0.25), (1.0, 0.85, 0.35), (1.0, 1.0, 1.0)
+_BLUE, _GREY, _DARK = (0.35, 0.55, 0.95), (0.60, 0.62, 0.65), (0.18, 0.18, 0.20)
+
+
+class _Canvas:
+    """A drawing in millimetres, x to the right and y down from its centre, that remembers where something is drawn."""
+
+    def __init__(self, width_mm: float, height_mm: float) -> None:
+        self._scale = _OVERSAMPLING / _TEXTURE_PITCH_MM
+        self._size = (round(width_mm * self._scale), round(height_mm * self._scale))
+        self._colour = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        self._opacity = np.zeros((self._size[1], self._size[0]), np.float32)
+
+    def polygon(self, corners_mm: list[tuple[float, float]], colour: Colour) -> None:
+        points = self._pixels(corners_mm)
+        cv2.fillPoly(self._colour, [points], _levels(colour))
+        cv2.fillPoly(self._opacity, [points], 1.0)
+
+    def box(self, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, colour: Colour) -> None:
+        self.polygon([(left_mm, top_mm), (right_mm, top_mm), (right_mm, bottom_mm), (left_mm, bottom_mm)], colour)
+
+    def ellipse(self, x_mm: float, y_mm: float, radius_x_mm: float, radius_y_mm: float, colour: Colour) -> None:
+        angle = np.linspace(0, 2 * np.pi, 240)
+        self.polygon([(x_mm + radius_x_mm * np.cos(a), y_mm + radius_y_mm * np.sin(a)) for a in angle], colour)
+
+    def text(self, words: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
+        """Write words whose lower left corner is at x, y, where something is drawn already."""
+        scale = height_mm * self._scale / 21  # the font's capitals are 21 px high at scale 1
+        at = tuple(int(value) for value in self._pixels([(x_mm, y_mm)])[0])
+        thickness = round(3 * scale)
+        cv2.putText(self._colour, words, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
+
+    def plane(self, name: str, x_mm: float, y_mm: float, depth_mm: float, shading: float) -> TexturedPlane:
+        """Return the drawing as an object at x, y and a depth, a little darker towards its lower right."""
+        size = (self._size[0] // _OVERSAMPLING, self._size[1] // _OVERSAMPLING)
+        colour = cv2.resize(self._colour, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+        opacity = cv2.resize(self._opacity, size, interpolation=cv2.INTER_AREA)
+        rows, columns = np.mgrid[0 : 1 : size[1] * 1j, 0 : 1 : size[0] * 1j]
+        light = (1 - shading * (rows + columns) / 2)[:, :, np.newaxis]
+        # The mean colour of partly covered samples includes nothing of what lies beside the object
+        inside = colour * light / np.maximum(opacity, 1e-3)[:, :, np.newaxis]
+        reflectance = np.clip(inside, 0, 1).astype(np.float32)
+        return TexturedPlane(name, reflectance, opacity, _TEXTURE_PITCH_MM, (0, 0, 0, x_mm, y_mm, depth_mm))
+
+    def _pixels(self, points_mm: list[tuple[float, float]]) -> NDArray[np.int32]:
+        centre = np.array(self._size) / 2
+        return np.rint(np.array(points_mm) * self._scale + centre).astype(np.int32)
+
+
+def _levels(colour: Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in colour)
+    return red, green, blue
+
+
+def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
+    """Return a toy truck of 190 mm, seen from its side, standing at x, y and a depth."""
+    canvas = _Canvas(200, 120)
+    canvas.box(-95, 22, 90, 32, _GREY)
+    canvas.box(-95, -48, 38, 24, _YELLOW)
+    for x_mm_plank in range(-95, 30, 19):
+        canvas.box(x_mm_plank, -48, x_mm_plank + 2, 24, (0.75, 0.55, 0.15))
+    canvas.box(-95, -48, 38, -43, (0.85, 0.35, 0.20))
+    canvas.box(-95, 14, 38, 18, (0.85, 0.35, 0.20))
+    canvas.box(-80, -32, 26, 4, _WHITE)
+    canvas.text("TOYS 49", -72, -7, 14, _DARK)
+    canvas.polygon([(42, 32), (42, -34), (70, -34), (86, -4), (94, 2), (94, 32)], _RED)
+    canvas.polygon([(50, -27), (67, -27), (78, -4), (50, -4)], (0.80, 0.92, 1.0))
+    canvas.box(48, 4, 60, 8, _WHITE)
+    canvas.box(86, 10, 94, 17, _YELLOW)
+    canvas.box(80, 25, 96, 32, _GREY)
+    for x_mm_wheel in (-68, -38, 68):
+        canvas.ellipse(x_mm_wheel, 34, 17, 17, _DARK)
+        canvas.ellipse(x_mm_wheel, 34, 10, 10, (0.85, 0.85, 0.88))
+        for angle in np.arange(5) * 2 * np.pi / 5:
+            canvas.ellipse(x_mm_wheel + 6 * np.cos(angle), 34 + 6 * np.sin(angle), 1.8, 1.8, _DARK)
+        canvas.ellipse(x_mm_wheel, 34, 2.5, 2.5, _RED)
+    return canvas.plane("truck", x_mm, y_mm, depth_mm, shading=0.25)
+
+
+def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
+    """Return a toy airplane of 260 mm, seen from above, at x, y and a depth."""
+    canvas = _Canvas(280, 250)
+    for side in (-1, 1):
+        canvas.polygon([(28, 10 * side), (-22, 116 * side), (-48, 116 * side), (-28, 10 * side)], _BLUE)
+        canvas.polygon([(-3, 76 * side), (-22, 116 * side), (-48, 116 * side), (-42, 76 * side)], _WHITE)
+        canvas.polygon([(-12, 95 * side), (-17, 106 * side), (-46, 106 * side), (-44, 95 * side)], _RED)
+        canvas.polygon([(-92, 8 * side), (-116, 46 * side), (-130, 46 * side), (-122, 8 * side)], _RED)
+        canvas.ellipse(16, 42 * side, 20, 9, _WHITE)
+        canvas.ellipse(32, 42 * side, 4, 8, _DARK)
+        canvas.ellipse(-18, 52 * side, 12, 12, _WHITE)
+        canvas.ellipse(-18, 52 * side, 8, 8, _RED)
+        canvas.ellipse(-18, 52 * side, 3.5, 3.5, _YELLOW)
+    canvas.ellipse(0, 0, 132, 17, _WHITE)
+    canvas.polygon([(-128, -3), (-70, -2), (-70, 2), (-128, 3)], _RED)
+    canvas.ellipse(84, 0, 22, 11, (0.25, 0.35, 0.50))
+    canvas.box(82, -11, 85, 11, _WHITE)
+    canvas.box(-60, -9, 48, -5, _DARK)
+    canvas.box(-60, 5, 48, 9, _DARK)
+    canvas.text("FAINT", -42, 4.2, 8, _BLUE)
+    canvas.ellipse(126, 0, 7, 8, _RED)
+    return canvas.plane("airplane", x_mm, y_mm, depth_mm, shading=0.2)

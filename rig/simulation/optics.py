@@ -1,0 +1,95 @@
+"""The simulated camera's optics: where each point of the detector looks, and how much light reaches it.
+
+This is the world, not the calibration: it shares no code with `calib` or `recon`, so that either can be tested
+against it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+type Points = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedOptics:
+    """A lens and the detector behind it; pixel centres are integers, the first is (0, 0).
+
+    Parameters
+    ----------
+    size_px : (int, int)
+        Width and height.
+    fx_px, fy_px, cx_px, cy_px : float
+        Focal lengths and principal point.
+    distortion : tuple of float
+        Up to eight coefficients in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6.
+    vignetting : bool
+        Light falls off with the fourth power of the cosine of the field angle.
+    """
+
+    size_px: tuple[int, int]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    vignetting: bool = True
+
+    def rays(self, samples_per_px: int = 1) -> NDArray[np.float32]:
+        """Return x, y at unit depth of every detector sample, (row, column, 2).
+
+        With several samples per pixel and axis they lie evenly within each pixel, so that their mean over a pixel is
+        the mean over its area.
+        """
+        width, height = self.size_px
+        inside = (np.arange(samples_per_px) + 0.5) / samples_per_px - 0.5
+        columns = (np.arange(width)[:, np.newaxis] + inside).ravel()
+        rows = (np.arange(height)[:, np.newaxis] + inside).ravel()
+        x, y = np.meshgrid((columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px)
+        return np.stack(_undistort(x, y, self.distortion), axis=-1).astype(np.float32)
+
+    def relative_illumination(self) -> NDArray[np.float32]:
+        """Return the light of each pixel relative to the axis, (row, column), for a scene of equal radiance."""
+        if not self.vignetting:
+            return np.ones(self.size_px[::-1], np.float32)
+        rays = self.rays()
+        return (1 / (1 + np.square(rays).sum(axis=-1)) ** 2).astype(np.float32)
+
+    def ideal(self) -> "SimulatedOptics":
+        """Return the same view through a pinhole: no distortion, no vignetting."""
+        return SimulatedOptics(self.size_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, (), vignetting=False)
+
+
+def distort(x: Points, y: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:
+    """Return where the lens images rays x, y, in units of the focal length (rational model of OpenCV)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*distortion, *[0.0] * (8 - len(distortion)))
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def _undistort(x_image: Points, y_image: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:
+    """Invert `distort` by Newton's method with a Jacobian from central differences."""
+    x, y = x_image.copy(), y_image.copy()
+    if not any(distortion):
+        return x, y
+    step = 1e-5
+    for _ in range(20):
+        x_now, y_now = distort(x, y, distortion)
+        error_x, error_y = x_now - x_image, y_now - y_image
+        if max(np.abs(error_x).max(), np.abs(error_y).max()) < 1e-10:
+            return x, y
+        dx_right, dy_right = distort(x + step, y, distortion)
+        dx_left, dy_left = distort(x - step, y, distortion)
+        dx_down, dy_down = distort(x, y + step, distortion)
+        dx_up, dy_up = distort(x, y - step, distortion)
+        xx, yx = (dx_right - dx_left) / (2 * step), (dy_right - dy_left) / (2 * step)
+        xy, yy = (dx_down - dx_up) / (2 * step), (dy_down - dy_up) / (2 * step)
+        determinant = xx * yy - xy * yx
+        x -= (yy * error_x - xy * error_y) / determinant
+        y -= (xx * error_y - yx * error_x) / determinant
+    raise ValueError(f"distortion {distortion} cannot be inverted over the whole detector; take smaller coefficients")

@@ -1,0 +1,169 @@
+"""The simulated scene: textured planes with cut-out shapes that occlude one another, rendered by casting rays."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simulation.optics import SimulatedOptics
+
+
+@dataclass(frozen=True)
+class TexturedPlane:
+    """A flat object: a picture with a cut-out, standing in space.
+
+    Parameters
+    ----------
+    name : str
+        What it shows.
+    reflectance : float array (row, column) or (row, column, 3)
+        0…1, grey or red, green, blue.
+    opacity : float array (row, column)
+        1 on the object, 0 beside it, between at its edge.
+    pitch_mm : float
+        Distance of neighbouring texture samples.
+    rt_ref_plane : (float, …) of six
+        Pose: Rodrigues rotation (rad) and translation (mm) from the plane's coordinates, whose origin is the centre of
+        the texture, to the reference camera's.
+    """
+
+    name: str
+    reflectance: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+    pitch_mm: float
+    rt_ref_plane: tuple[float, float, float, float, float, float]
+
+    @property
+    def depth_mm(self) -> float:
+        """Distance of the centre along the reference camera's axis."""
+        return self.rt_ref_plane[5]
+
+    def grey(self) -> "TexturedPlane":
+        """Return the plane as a sensor without colour filters sees it."""
+        if self.reflectance.ndim == 2:
+            return self
+        return TexturedPlane(self.name, self.reflectance.mean(axis=2), self.opacity, self.pitch_mm, self.rt_ref_plane)
+
+
+@dataclass(frozen=True)
+class View:
+    """One rendered view: per pixel the light of the scene and how each plane contributes.
+
+    Attributes
+    ----------
+    light : float array (row, column) or (row, column, 3)
+        Mean reflectance seen in each pixel, times the lens's relative illumination.
+    visible : dict of name to float array (row, column)
+        Share of each pixel in which that plane is seen, not hidden by nearer ones.
+    """
+
+    light: NDArray[np.float32]
+    visible: dict[str, NDArray[np.float32]]
+
+
+def render(
+    planes: Sequence[TexturedPlane],
+    optics: SimulatedOptics,
+    poses_rt_cam_ref: NDArray[np.float64],
+    *,
+    samples_per_px: int = 2,
+) -> Iterator[View]:
+    """Yield the view of each pose: every detector sample's ray is cast through the planes from near to far.
+
+    Parameters
+    ----------
+    planes : sequence of TexturedPlane
+        All grey or all in colour. They must not cut through one another: order is by distance of their centres.
+    optics : SimulatedOptics
+        The camera's.
+    poses_rt_cam_ref : array (view, 6)
+        Rodrigues rad and mm.
+    samples_per_px : int
+        Rays per pixel and axis; the pixel is their mean, which removes aliasing.
+    """
+    rays = optics.rays(samples_per_px)
+    illumination = optics.relative_illumination()
+    for pose in poses_rt_cam_ref:
+        yield _render_view(planes, rays, illumination, pose, samples_per_px)
+
+
+def _render_view(
+    planes: Sequence[TexturedPlane],
+    rays: NDArray[np.float32],
+    illumination: NDArray[np.float32],
+    rt_cam_ref: NDArray[np.float64],
+    samples_per_px: int,
+) -> View:
+    """Composite the planes front to back along every ray and average the rays of each pixel."""
+    colours = () if planes[0].reflectance.ndim == 2 else (3,)
+    light = np.zeros((*rays.shape[:2], *colours), np.float32)
+    unhidden = np.ones(rays.shape[:2], np.float32)
+    visible = {}
+    for plane in sorted(planes, key=lambda plane: _distance_mm(plane, rt_cam_ref)):
+        reflected, opacity = _look_up(plane, rays, rt_cam_ref)
+        light += reflected * (unhidden if not colours else unhidden[:, :, np.newaxis])
+        visible[plane.name] = _pixel_means(opacity * unhidden, samples_per_px)
+        unhidden *= 1 - opacity
+    light = _pixel_means(light, samples_per_px)
+    return View(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
+
+
+def _look_up(
+    plane: TexturedPlane, rays: NDArray[np.float32], rt_cam_ref: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the reflected light (reflectance times opacity) and the opacity that each ray meets on one plane."""
+    origin_mm, axis_x, axis_y = _plane_in_camera(plane, rt_cam_ref)
+    normal = np.cross(axis_x, axis_y)
+    # The ray s·(x, y, 1) meets the plane at s = n·origin / n·ray; the point minus the origin, along the plane's axes,
+    # is then a ratio of two linear functions of the ray
+    numerators = np.stack(
+        [axis @ (np.eye(3) * (normal @ origin_mm) - np.outer(origin_mm, normal)) for axis in (axis_x, axis_y)]
+    )
+    linear = np.vstack([numerators, normal]).astype(np.float32)
+    x, y, scale = (row[0] * rays[:, :, 0] + row[1] * rays[:, :, 1] + row[2] for row in linear)
+    in_front = scale * np.float32(normal @ origin_mm) > 0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        columns = np.where(in_front, x / scale / plane.pitch_mm + (plane.opacity.shape[1] - 1) / 2, -10)
+        rows = np.where(in_front, y / scale / plane.pitch_mm + (plane.opacity.shape[0] - 1) / 2, -10)
+    texture = np.dstack(
+        [
+            plane.reflectance * plane.opacity.reshape(plane.opacity.shape + (1,) * (plane.reflectance.ndim - 2)),
+            plane.opacity,
+        ]
+    )
+    seen = cv2.remap(
+        texture.astype(np.float32),
+        columns.astype(np.float32),
+        rows.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    reflected = seen[:, :, :-1]
+    return (reflected if plane.reflectance.ndim == 3 else reflected[:, :, 0]), seen[:, :, -1]
+
+
+def _plane_in_camera(
+    plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the plane's origin (mm) and its two axes in the camera's coordinates."""
+    r_cam_ref, _ = cv2.Rodrigues(np.asarray(rt_cam_ref[:3], np.float64))
+    r_ref_plane, _ = cv2.Rodrigues(np.asarray(plane.rt_ref_plane[:3], np.float64))
+    r_cam_plane = r_cam_ref @ r_ref_plane
+    origin_mm = r_cam_ref @ np.asarray(plane.rt_ref_plane[3:]) + rt_cam_ref[3:]
+    return origin_mm, r_cam_plane[:, 0], r_cam_plane[:, 1]
+
+
+def _distance_mm(plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]) -> float:
+    """Return how far in front of the camera the plane's centre stands."""
+    return float(_plane_in_camera(plane, rt_cam_ref)[0][2])
+
+
+def _pixel_means(samples: NDArray[np.float32], samples_per_px: int) -> NDArray[np.float32]:
+    """Average the samples of each pixel, (row, column, …)."""
+    if samples_per_px == 1:
+        return samples
+    size = (samples.shape[1] // samples_per_px, samples.shape[0] // samples_per_px)
+    return np.asarray(cv2.resize(samples, size, interpolation=cv2.INTER_AREA), np.float32)

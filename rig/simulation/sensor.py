@@ -1,0 +1,43 @@
+"""The simulated sensor: eq. (6) of the paper, then offset, gain, rounding and saturation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SimulatedSensor:
+    """What happens to light between the lens and the file; the defaults are the paper's camera.
+
+    Parameters
+    ----------
+    offset_dn, gain_dn_per_e : float
+        DN of a dark pixel, and DN per electron.
+    read_noise_e : float
+        Standard deviation; the paper's variance is 12 e⁻².
+    dark_current_e_per_s, quantum_efficiency : float
+        Electrons per pixel and second without light; electrons per photon.
+    saturation_dn : int
+        The converter's last value.
+    """
+
+    offset_dn: float = 100.0
+    gain_dn_per_e: float = 2.0
+    read_noise_e: float = 12.0**0.5
+    dark_current_e_per_s: float = 0.2
+    quantum_efficiency: float = 0.5
+    saturation_dn: int = 65535
+
+    def expose(
+        self, photons_per_px: NDArray[np.floating], exposure_s: float, generator: np.random.Generator
+    ) -> NDArray[np.uint16]:
+        """Return one frame (row, column) in DN of the expected photons that fall on each pixel during the exposure."""
+        expected_e = self.quantum_efficiency * photons_per_px + self.dark_current_e_per_s * exposure_s
+        electrons = generator.poisson(expected_e) + generator.normal(0.0, self.read_noise_e, expected_e.shape)
+        return self.digitise(electrons)
+
+    def digitise(self, electrons: NDArray[np.floating]) -> NDArray[np.uint16]:
+        """Return electrons as whole DN within the converter's range."""
+        dn = np.rint(electrons * self.gain_dn_per_e + self.offset_dn)
+        return np.clip(dn, 0, self.saturation_dn).astype(np.uint16)
