@@ -31,7 +31,12 @@ app = App(
 )
 
 
+app.command("pipelines.noise:noise")
 app.command("pipelines.simulate:simulate")
+
+import_app = App(name="import", help="Make a set of data that others recorded.")
+import_app.command("pipelines.import_emva1288:import_emva1288", name="emva1288")
+app.command(import_app)
 
 
 @app.meta.default

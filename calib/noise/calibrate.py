@@ -31,7 +31,7 @@ from calib.noise.statistics import Series
 _LEAST_PIXELS = 256
 
 # A model that the series contradict this improbably is wrong; by less than this fraction it does not matter.
-_CONTRADICTION, _NEGLIGIBLE = 1e-4, 0.02
+_CONTRADICTION, _CONTRADICTION_SIGMA, _NEGLIGIBLE = 1e-4, 6.0, 0.02
 
 
 @dataclass(frozen=True)
@@ -90,9 +90,17 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     usable = ~hot & ~noisy
     offset, signal, variances = _offsets(darks, fitted, hot)
     response = _response(flats, fitted, offset, signal, usable)
-    doubts = _contradictions(fitted)
+    points = _points(darks, flats, fitted)
+    bent_line, uneven_noise = _level_contradiction(fitted), _noise_contradiction(fitted, points)
     estimates, covariance = estimate_all(
-        fitted.fit, fitted.moments, darks, flats, bend=fitted.bend, response=response, contradicted=bool(doubts)
+        fitted.fit,
+        fitted.moments,
+        darks,
+        flats,
+        bend=fitted.bend,
+        response=response,
+        levels_hold=bent_line is None,
+        noise_holds=uneven_noise is None,
     )
     gain = estimates["gain_dn_per_e"].value
     read_noise_dn = np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * shrunk_variance_ratio(ratio, freedom, usable))
@@ -117,10 +125,10 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         noisy=noisy,
         dead=dead,
         variance_ratio=ratio.astype(np.float32),
-        points=_points(darks, flats, fitted),
+        points=points,
         histograms=_histograms(darks, fitted, usable),
         saturation_dn=saturation_dn,
-        warnings=tuple(_warnings(darks, fitted) + doubts),
+        warnings=(*_warnings(darks, fitted), *filter(None, (bent_line, uneven_noise))),
     )
 
 
@@ -239,14 +247,14 @@ def _response(
     return measure_response(signals, noise, usable)
 
 
-def _contradictions(fitted: _Fitted) -> list[str]:
+def _level_contradiction(fitted: _Fitted) -> str | None:
     """Return a warning where the dark levels do not lie on a straight line over exposure time."""
     moments, values = fitted.moments, fitted.fit.values
     darks = moments.darks
     within = float((darks.frames - 1).sum())
     free = np.unique(darks.exposure_s).size - 2
     if fitted.likelihood is Likelihood.CENSORED or free < 1 or within < 1:
-        return []
+        return None
     noise = np.array(fitted.dark_noise_dn2) / moments.pixels
     jitter = max(float(darks.level_scatter_dn2.sum()) / within - float(noise.mean()), 0.0)
     weight = darks.frames / (jitter + noise)
@@ -256,12 +264,30 @@ def _contradictions(fitted: _Fitted) -> list[str]:
     worst = int(np.abs(residual).argmax())
     span = abs(slope) * float(np.ptp(darks.exposure_s)) + np.sqrt(np.exp(values["log_read_dn2"]))
     if chance > _CONTRADICTION or abs(residual[worst]) < _NEGLIGIBLE * span:
-        return []
-    return [
+        return None
+    return (
         f"the dark level against exposure time is no straight line: that at {darks.exposure_s[worst]:g} s is "
         f"{residual[worst]:+.2f} DN off it (probability {chance:.1g}); the temperature or the black level drifted, or "
         "light leaked in: let the camera settle and record the exposures in turn"
-    ]
+    )
+
+
+def _noise_contradiction(fitted: _Fitted, points: Sequence[TransferPoint]) -> str | None:
+    """Return a warning where a series is noisier or quieter than eq. (1) allows."""
+    if fitted.likelihood is Likelihood.CENSORED:
+        return None
+    measured = [point for point in points if point.frames > 1]
+    excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point in measured]
+    worst = int(np.abs(excess).argmax())
+    point = measured[worst]
+    sigmas = abs(point.variance_dn2 - point.model_variance_dn2) / point.variance_se_dn2
+    if abs(excess[worst]) < _NEGLIGIBLE or sigmas < _CONTRADICTION_SIGMA:
+        return None
+    return (
+        f"the noise of the {point.kind}s of {point.exposure_s:g} s is {100 * excess[worst]:+.1f} % off the model's in "
+        f"variance ({sigmas:.0f} standard errors): the noise of the camera changed between series, or the light was "
+        "not steady; record them again in one go"
+    )
 
 
 def _warnings(darks: Sequence[Series], fitted: _Fitted) -> list[str]:

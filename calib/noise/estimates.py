@@ -32,7 +32,8 @@ def estimate_all(
     *,
     bend: Fit | None,
     response: Response | None,
-    contradicted: bool,
+    levels_hold: bool,
+    noise_holds: bool,
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return every quantity, and the covariance of offset, gain, read noise and dark current.
 
@@ -48,12 +49,12 @@ def estimate_all(
         The fit that allowed for a bent response.
     response : Response, optional
         What flats told.
-    contradicted : bool
-        The dark levels are no straight line over exposure time.
+    levels_hold, noise_holds : bool
+        Whether the dark levels lie on a straight line over exposure time, and the noise of all series on eq. (1).
     """
     quantile = _quantile(fit, moments)
-    why_no_gain = _why_no_gain(fit, bool(flats), contradicted)
-    why_no_current = _why_no_current(fit, moments, why_no_gain, contradicted)
+    why_no_gain = _why_no_gain(fit, from_darks=not flats, holds=levels_hold and noise_holds)
+    why_no_current = _why_no_current(fit, moments, why_no_gain, quantile, levels_hold=levels_hold)
     transforms = _transforms(fit)
     whys = {
         "offset_dn": None,
@@ -80,9 +81,9 @@ def estimate_all(
 
 def _quantile(fit: Fit, moments: Moments) -> float:
     """Return how many standard errors make 95 %: Student's where the jitter, known from few frames, matters."""
-    jitter = fit.values.get("jitter_dn2", 0.0)
+    pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
     freedom = float((moments.darks.frames - 1).sum())
-    if freedom >= 1 and jitter > 0 and jitter > 2 * fit.standard_error("jitter_dn2"):
+    if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
         return float(stats.t.ppf(0.975, freedom))
     return float(stats.norm.ppf(0.975))
 
@@ -110,13 +111,13 @@ def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
     }
 
 
-def _why_no_gain(fit: Fit, has_flats: bool, contradicted: bool) -> str | None:
+def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
     """Return why gain and read noise in electrons cannot be told, None if they can."""
     if "log_gain" not in fit.values:
         return f"{_ONE_EXPOSURE}, or flats"
     relative = fit.standard_error("log_gain")
-    if contradicted and not has_flats:
-        return f"the gain rests on the dark levels, which are no straight line over exposure time; {_FLATS_REMEDY}"
+    if from_darks and not holds:
+        return f"without flats it rests on the darks, which contradict the model (see the warnings); {_FLATS_REMEDY}"
     if not relative <= MOST_RELATIVE_SE:
         error = f"{relative:.0%}" if relative < 10 else "larger than itself"
         return (
@@ -126,18 +127,25 @@ def _why_no_gain(fit: Fit, has_flats: bool, contradicted: bool) -> str | None:
     return None
 
 
-def _why_no_current(fit: Fit, moments: Moments, why_no_gain: str | None, contradicted: bool) -> str | None:
+def _why_no_current(
+    fit: Fit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
+) -> str | None:
     """Return why the dark current cannot be told, None if it can."""
     if "dark_signal_dn_per_s" not in fit.values:
         return _ONE_EXPOSURE
     if why_no_gain is not None:
         return f"dark current in electrons needs the gain: {why_no_gain}"
-    if contradicted:
+    if not levels_hold:
         return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
     signal, se = fit.values["dark_signal_dn_per_s"], fit.standard_error("dark_signal_dn_per_s")
     gain = float(np.exp(fit.values["log_gain"]))
     noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
     longest = float(moments.darks.exposure_s.max())
+    if signal + quantile * se < 0:
+        return (
+            f"the dark level falls with exposure time ({signal:.2g} DN/s), which dark current cannot do: the black "
+            "level drifted; record the exposures in turn, the camera settled"
+        )
     if se > MOST_RELATIVE_SE * abs(signal) and se * longest / gain > MOST_RELATIVE_SE * noise_e2:
         return (
             f"its standard error would be {se / gain:.2g} e-/s, which over {longest:g} s is more than a tenth of the "

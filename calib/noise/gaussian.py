@@ -27,8 +27,6 @@ ROUNDING_DN2 = 1.0 / 12.0
 # All three are needed for silence; the solver tries points where a variance is negative, and backs off by itself.
 SILENT: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
-_VARIANCES = ("dsnu_dn2", "dcnu_dn2_per_s2", "jitter_dn2")
-
 
 @dataclass(frozen=True)
 class Fit:
@@ -40,7 +38,7 @@ class Fit:
         `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, where the design has them,
         `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, `nonlinearity_per_dn` κ.
     covariance : array (parameter, parameter)
-        In the order of `values`; zero for a variance that came out as zero.
+        In the order of `values`; zero for a jitter that came out as zero.
     log_likelihood : float
         At the maximum.
     """
@@ -76,7 +74,9 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
     parameters = {name: x[i] * scale[name] for i, name in enumerate(names)}
     objective = _negative_log_likelihood(parameters, moments)
     solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, SILENT | {"ipopt.acceptable_iter": 0})
-    lower = [0.0 if name in _VARIANCES else -np.inf for name in names]
+    # The spreads over pixels may come out negative, as unbiased differences of variances do: a bound at zero would
+    # push what contradicts it (a pickup whose phase turns from frame to frame, say) into the read noise.
+    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in names]
     found = solver(x0=[start[name] / scale[name] for name in names], lbx=lower)
     if not solver.stats()["success"]:
         raise PoorFit(
@@ -85,7 +85,7 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
         )
     at = np.array(found["x"]).ravel()
     hessian = np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
-    free = np.array([name not in _VARIANCES or at[i] > 1e-6 for i, name in enumerate(names)])
+    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(names)])
     units = np.array([scale[name] for name in names])
     return Fit(
         values={name: float(at[i] * scale[name]) for i, name in enumerate(names)},
@@ -105,9 +105,12 @@ def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.flo
 
 
 def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64]) -> list[Any]:
-    """Return the pixel noise of each dark series, eq. (1), from numbers or casadi expressions alike."""
+    """Return the pixel noise of each dark series, eq. (1), from numbers or casadi expressions alike.
+
+    A dark signal that falls, because the black level drifts, has no shot noise to take away.
+    """
     gain = _exp(values["log_gain"]) if "log_gain" in values else 0.0
-    slope = values.get("dark_signal_dn_per_s", 0.0)
+    slope = ca.fmax(values.get("dark_signal_dn_per_s", 0.0), 0.0)
     return [_exp(values["log_read_dn2"]) + gain * slope * t + ROUNDING_DN2 for t in exposure_s]
 
 
@@ -179,21 +182,23 @@ def _chi_squared(freedom: float, squares: Any, variance: Any) -> Any:
 def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
     """Return −ln of the Wishart likelihood of the scatter of pixel means, covariance A + s² 11ᵀ + q² ttᵀ.
 
-    A is diagonal with v_j/n_j. Woodbury's identity leaves 2 × 2 matrices, whatever the number of series.
+    A is diagonal with v_j/n_j. Woodbury's identity leaves 2 × 2 matrices, whatever the number of series. A series of
+    one frame has no part: it cannot tell its noise from its pattern, so nothing would check what it claims.
     """
-    darks = moments.darks
-    weight = [n / v for n, v in zip(darks.frames, dark_v, strict=True)]
-    t = darks.exposure_s
+    several = moments.darks.frames > 1
+    scatter = moments.darks.scatter_dn2[np.ix_(several, several)]
+    weight = [n / v for n, v in zip(moments.darks.frames, dark_v, strict=True) if n > 1]
+    t = moments.darks.exposure_s[several]
     s2, q2 = values["dsnu_dn2"], values.get("dcnu_dn2_per_s2", 0.0)
     basis = (np.ones_like(t), t)
     p = [[sum(w * a[j] * b[j] for j, w in enumerate(weight)) for b in basis] for a in basis]
-    k = [[_quadratic(weight, a, b, darks.scatter_dn2) for b in basis] for a in basis]
+    k = [[_quadratic(weight, a, b, scatter) for b in basis] for a in basis]
     # M = I + K P with K = diag(s², q²); ln det(A + U K Uᵀ) = ln det A + ln det M, and (M⁻¹ K) mends the trace.
     m00, m01, m10, m11 = 1 + s2 * p[0][0], s2 * p[0][1], q2 * p[1][0], 1 + q2 * p[1][1]
     determinant = m00 * m11 - m01 * m10
     mended = (m11 * s2 * k[0][0] - m01 * q2 * k[1][0] - m10 * s2 * k[0][1] + m00 * q2 * k[1][1]) / determinant
     log_det = ca.log(determinant) - sum(ca.log(w) for w in weight)
-    trace = sum(w * darks.scatter_dn2[j, j] for j, w in enumerate(weight)) - mended
+    trace = sum(w * scatter[j, j] for j, w in enumerate(weight)) - mended
     return 0.5 * (moments.freedom * log_det + trace)
 
 
@@ -208,11 +213,9 @@ def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[st
     """Return a start from simple moments, and the scale of each parameter; the keys are what the design can hold."""
     darks, flats = moments.darks, moments.flats
     measured = darks.frames > 1
-    variance = np.where(measured, darks.within_dn2 / np.maximum((darks.frames - 1) * moments.freedom, 1), np.inf)
+    variance = darks.within_dn2[measured] / ((darks.frames[measured] - 1) * moments.freedom)
     read = max(float(variance.min()) - ROUNDING_DN2, 1e-3)
-    if not np.isfinite(read):
-        read = 1.0
-    exposures = np.unique(darks.exposure_s)
+    exposures, repeated = np.unique(darks.exposure_s), np.unique(darks.exposure_s[measured])
     line = np.polyfit(darks.exposure_s, darks.mean_dn, 1) if exposures.size > 1 else (0.0, darks.mean_dn.mean())
     # No less than the levels could show; from far off the search for a small jitter would be long.
     jitter = float(darks.level_scatter_dn2.sum() / max((darks.frames - 1).sum(), 1)) + read / moments.pixels
@@ -220,9 +223,10 @@ def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[st
     scale = {"offset_dn": 1.0, "log_read_dn2": 1.0, "dsnu_dn2": read, "jitter_dn2": jitter}
     if exposures.size > 1:
         longest = float(exposures[-1])
-        start |= {"dark_signal_dn_per_s": float(line[0]), "dcnu_dn2_per_s2": 0.01 * read / longest**2}
-        scale |= {"dark_signal_dn_per_s": 1 / longest, "dcnu_dn2_per_s2": read / longest**2}
-    if flats.frames.size or exposures.size > 1:
+        start["dark_signal_dn_per_s"], scale["dark_signal_dn_per_s"] = float(line[0]), 1 / longest
+    if repeated.size > 1:
+        start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
+    if flats.frames.size or repeated.size > 1:
         start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
     if nonlinear:
         start["nonlinearity_per_dn"], scale["nonlinearity_per_dn"] = 0.0, 1e-6
