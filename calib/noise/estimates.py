@@ -52,9 +52,9 @@ def estimate_all(
     levels_hold, noise_holds : bool
         Whether the dark levels lie on a straight line over exposure time, and the noise of all series on eq. (1).
     """
-    quantile = _quantile(fit, moments)
+    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, moments)
     why_no_gain = _why_no_gain(fit, from_darks=not flats, holds=levels_hold and noise_holds)
-    why_no_current = _why_no_current(fit, moments, why_no_gain, quantile, levels_hold=levels_hold)
+    why_no_current = _why_no_current(fit, moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     transforms = _transforms(fit)
     whys = {
         "offset_dn": None,
@@ -72,15 +72,23 @@ def estimate_all(
             continue
         se = float(np.sqrt(covariance[known.index(name), known.index(name)]))
         positive = name in ("gain_dn_per_e", "read_noise_e")
-        estimates[name] = _interval(transforms[name][0], se, quantile, positive=positive)
-    estimates |= _in_dn(fit, quantile) | _spreads(fit, estimates["gain_dn_per_e"], why_no_gain, quantile)
-    estimates |= _shared_noise(fit, darks, quantile)
+        by_levels = not (positive and flats)
+        estimates[name] = _interval(
+            transforms[name][0], se, levels_quantile if by_levels else quantile, positive=positive
+        )
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(
+        fit, estimates["gain_dn_per_e"], why_no_gain, quantile
+    )
+    estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
     estimates |= _from_flats(fit, flats, moments, estimates["gain_dn_per_e"], bend, response, quantile)
     return estimates, (known, covariance)
 
 
-def _quantile(fit: Fit, moments: Moments) -> float:
-    """Return how many standard errors make 95 %: Student's where the jitter, known from few frames, matters."""
+def _levels_quantile(fit: Fit, moments: Moments) -> float:
+    """Return how many standard errors make 95 % of what rests on the levels of the darks.
+
+    Student's where the jitter of the levels, known from few frames, matters.
+    """
     pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
     freedom = float((moments.darks.frames - 1).sum())
     if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
@@ -168,14 +176,14 @@ def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Es
     return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
 
 
-def _in_dn(fit: Fit, quantile: float) -> dict[str, Estimate]:
+def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
     """Return what needs no gain."""
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
     read = _interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), quantile, positive=True)
     signal = Estimate(None, why=_ONE_EXPOSURE)
     if "dark_signal_dn_per_s" in fit.values:
         se = fit.standard_error("dark_signal_dn_per_s")
-        signal = _interval(fit.values["dark_signal_dn_per_s"], se, quantile)
+        signal = _interval(fit.values["dark_signal_dn_per_s"], se, levels_quantile)
     return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
 
 
@@ -211,6 +219,22 @@ def _shared_noise(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[st
         "frame_jitter_dn": _root(fit.values["jitter_dn2"], fit.standard_error("jitter_dn2"), quantile),
         "row_noise_dn": shared([one.row_noise_dn2 for one in darks], columns, rows),
         "column_noise_dn": shared([one.column_noise_dn2 for one in darks], rows, columns),
+    }
+
+
+def _profiles(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+    """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, here in DN."""
+    dark = max(darks, key=lambda one: one.frames)
+    rows, columns = dark.pattern_dn.shape
+    noise = dark_variances_dn2(fit.values, np.array([dark.conditions.exposure_s]))[0]
+
+    def pattern(profile: NDArray[np.float64], along: int, shared_dn2: float) -> Estimate:
+        chance = (max(float(noise) / along, shared_dn2) / dark.frames) + fit.values["dsnu_dn2"] / along
+        return _root(float(profile.var()) - chance, float(profile.var()) * np.sqrt(2 / profile.size), quantile)
+
+    return {
+        "dsnu_row_dn": pattern(dark.row_dn, columns, dark.row_noise_dn2),
+        "dsnu_column_dn": pattern(dark.column_dn, rows, dark.column_noise_dn2),
     }
 
 

@@ -84,8 +84,8 @@ class NoiseCalibration:
     ----------
     estimates : dict of Estimate
         `offset_dn, gain_dn_per_e, read_noise_e, read_noise_dn, dark_current_e_per_s, dark_signal_dn_per_s, dsnu_e,
-        dsnu_dn, dcnu_e_per_s, frame_jitter_dn, row_noise_dn, column_noise_dn, prnu, quantum_efficiency,
-        nonlinearity_per_dn`.
+        dsnu_dn, dsnu_row_dn, dsnu_column_dn, dcnu_e_per_s, frame_jitter_dn, row_noise_dn, column_noise_dn, prnu,
+        quantum_efficiency, nonlinearity_per_dn`.
     covariance : tuple (names, array)
         Of offset, gain, read noise and dark current; of those that have values.
     likelihood : str
