@@ -61,6 +61,10 @@ class ChannelLayout:
     plane_of_colour: int | None
     lattices: tuple[Lattice, ...]
 
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the part of a frame (row, column[, colour]) that can hold this colour, (row, column)."""
+        return pixels if self.plane_of_colour is None else pixels[:, :, self.plane_of_colour]
+
 
 def channel_layouts(loaded: LoadedSet) -> list[ChannelLayout]:
     """Return the colours that a set's frames hold, judged by its first frame."""
@@ -97,16 +101,16 @@ def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
     saturated: dict[int, NDArray[np.bool_]] = {}
     for view, path in enumerate(loaded.image_paths):
         frame = checked_frame(loaded, path, layout)
-        pixels = frame.pixels_dn if layout.plane_of_colour is None else frame.pixels_dn[:, :, layout.plane_of_colour]
+        pixels = layout.of(frame.pixels_dn)
         for phase, lattice in enumerate(layout.lattices):
-            noise = _noise_of_lattice(loaded, lattice, frame)
+            noise = lattice_noise(loaded, lattice, frame)
             stack_index = view * phases + phase
             pixels_dn = lattice.of(pixels)
             electrons[stack_index] = noise.electrons(pixels_dn)
             over = noise.saturated(pixels_dn)
             if over.any():
                 saturated[stack_index] = over
-    noises = [_noise_of_lattice(loaded, lattice, None) for lattice in layout.lattices]
+    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
     exposure_s = loaded.settings.exposure_s
     return ElementalImages(
         electrons,
@@ -143,6 +147,19 @@ def checked_frame(loaded: LoadedSet, path: Path, layout: ChannelLayout) -> Frame
     return frame
 
 
+def lattice_noise(loaded: LoadedSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
+    """Return the noise model of a lattice; a raw frame brings its own black level and saturation if none is stated."""
+    noise = noise_of_phase(loaded.noise, lattice.first, lattice.step, lattice.shape)
+    if frame is None:
+        return noise
+    if loaded.offset_from_files and frame.black_dn is not None:
+        black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
+        noise = replace(noise, offset_dn=float(black_dn))
+    if not np.isfinite(noise.saturation_dn) and frame.saturation_dn is not None:
+        noise = replace(noise, saturation_dn=frame.saturation_dn)
+    return noise
+
+
 def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
     """Return the samples of the plane at a depth: by default those that overlay the reference view pixel for pixel.
 
@@ -154,7 +171,7 @@ def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None
     if not (np.isfinite(depth_mm) and depth_mm > 0):
         raise GeometryMismatch(f"a plane at {depth_mm} mm is behind the camera; depth_mm must be positive")
     camera = loaded.settings.camera
-    cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view]
+    cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
     return PlaneGrid.covering(
@@ -190,19 +207,6 @@ class OperatorFactory:
             valid=self._images.valid,
             lattice_of_view=self._images.lattice_of_view,
         )
-
-
-def _noise_of_lattice(loaded: LoadedSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
-    """Return the noise model of a lattice; a raw frame brings its own black level and saturation if none is stated."""
-    noise = noise_of_phase(loaded.noise, lattice.first, lattice.step, lattice.shape)
-    if frame is None:
-        return noise
-    if loaded.offset_from_files and frame.black_dn is not None:
-        black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
-        noise = replace(noise, offset_dn=float(black_dn))
-    if not np.isfinite(noise.saturation_dn) and frame.saturation_dn is not None:
-        noise = replace(noise, saturation_dn=frame.saturation_dn)
-    return noise
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:

@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from calib.errors import CalibrationError
 from pipelines.console import console, say
-from pipelines.errors import InputError
+from pipelines.errors import InputError, WrongUsage
 from recon.errors import ReconstructionError
 from rig.errors import RigError
 
@@ -31,12 +31,18 @@ app = App(
 )
 
 
-app.command("pipelines.noise:noise")
-app.command("pipelines.simulate:simulate")
-
-import_app = App(name="import", help="Make a set of data that others recorded.")
-import_app.command("pipelines.import_emva1288:import_emva1288", name="emva1288")
-app.command(import_app)
+for _command in (
+    "simulate:simulate",
+    "darken:darken",
+    "noise:noise",
+    "reconstruct:reconstruct",
+    "report:report",
+    "demo:demo",
+):
+    app.command(f"pipelines.{_command}")
+app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
+app["import"].command("pipelines.import_grid:import_grid", name="grid")
+app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
 
 
 @app.meta.default
@@ -54,6 +60,8 @@ def _launch(
     result: Any = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
+    elif isinstance(result, dict) and "report" in result:
+        sys.stdout.write(f"{result['report']}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -66,6 +74,9 @@ def run(arguments: Sequence[str]) -> int:
     try:
         app.meta(arguments, exit_on_error=False, print_error=True)
     except CycloptsError:
+        return WRONG_USAGE
+    except WrongUsage as failure:
+        say(f"faintfield: wrong usage: {failure}")
         return WRONG_USAGE
     except NAMED_FAILURES as failure:
         say(f"faintfield: {type(failure).__name__}: {failure}")

@@ -124,6 +124,39 @@ class LoadedSet:
             ]
         )
 
+    def depth_of_disparity(self, disparity_px: float) -> float:
+        """Return the depth at which a point moves by `disparity_px` from one node to the next, right or down.
+
+        A camera moved by B along its row images a point at depth z moved by −fx B / z, plus what rectification moved
+        the principal point; with nodes and poses known this is one equation for 1/z, solved over all views.
+
+        Raises
+        ------
+        BadValue
+            The views have no nodes, or no plane in front of the cameras has this disparity.
+        """
+        camera = self.settings.camera
+        views = self.settings.view
+        nodes = np.array([view.node or (np.nan, np.nan) for view in views], float)
+        if np.isnan(nodes).any():
+            raise BadValue(f"{self.folder}: disparities need the node of every view; give --depth-mm instead")
+        steps = (nodes - nodes[self.reference_view])[:, ::-1]
+        centres = self.principal_points_px()
+        shift_px = centres - centres[self.reference_view]
+        moved_px = self.poses_rt_cam_ref[:, 3:5] * [camera.fx_px, camera.fy_px]
+        inverse_depth = np.sum((disparity_px * steps - shift_px) * moved_px) / max(float(np.sum(moved_px**2)), 1e-30)
+        if not inverse_depth > 0:
+            raise BadValue(
+                f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
+                f"the plane at infinity has {self._disparity_at_infinity_px(steps, shift_px):.3g} px: give less"
+            )
+        return float(1 / inverse_depth)
+
+    @staticmethod
+    def _disparity_at_infinity_px(steps: NDArray[np.float64], shift_px: NDArray[np.float64]) -> float:
+        """Return by how much infinitely far points move between neighbouring nodes."""
+        return float(np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30))
+
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
         for name in [FILE_NAME, *_named_files(self.settings)]:

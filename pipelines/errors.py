@@ -11,6 +11,8 @@ InputError
 └── CannotWrite
     └── DiskFull
 
+WrongUsage
+
 Every message says what is wrong, the value found, the limit it broke, and what to do.
 """
 
@@ -53,3 +55,7 @@ class CannotWrite(InputError):
 
 class DiskFull(CannotWrite):
     """The disk has no room for the result; nothing half-written is left behind."""
+
+
+class WrongUsage(Exception):
+    """The options of a command do not make sense together; exit code 2, unlike an InputError."""

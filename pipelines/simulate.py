@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
-from cyclopts import Parameter
 from numpy.typing import NDArray
 
+from pipelines.arguments import Count, NotNegative, Positive
+from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
 from pipelines.files import building_folder, write_json
@@ -20,19 +21,9 @@ from rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from rig.simulation.scene import TexturedPlane, render
 
 NOISE_FREE = "noise_free"
-NOISE_REFERENCE = "noise_reference.tiff"
 
 # The noise-free set spans this much of its 16 bits, so that rounding is below a ten-thousandth of its peak.
 _NOISE_FREE_PEAK_DN = 60000.0
-
-type Count = Annotated[int, Parameter(validator=lambda _, value: _at_least(value, 1))]
-type Positive = Annotated[float, Parameter(validator=lambda _, value: _at_least(value, 1e-12))]
-type NotNegative = Annotated[float, Parameter(validator=lambda _, value: _at_least(value, 0))]
-
-
-def _at_least(value: float | None, limit: float) -> None:
-    if value is not None and not value >= limit:
-        raise ValueError(f"must be at least {limit:g}, got {value:g}")
 
 
 @dataclass(frozen=True)
@@ -232,7 +223,7 @@ def _write_truth(
         write_plane(folder / names[0], texture, plane.depth_mm / experiment.optics.fx_px)
         write_png(folder / names[1], mask_picture(all_visible[plane.name] > 0.5))
         planes.append(TruePlane(plane.name, plane.depth_mm, names[0], names[1]))
-    write_png(folder / "truth/object_region.png", mask_picture(rendered.object_region))
+    write_png(folder / OBJECT_REGION, mask_picture(rendered.object_region))
     signal_e = rendered.views[experiment.reference_view][rendered.object_region] * scale_e
     dark_e = sensor.dark_current_e_per_s * experiment.exposure_s
     known = {"quantum_efficiency": sensor.quantum_efficiency, "read_noise_e": sensor.read_noise_e}
@@ -241,8 +232,6 @@ def _write_truth(
         photons_linear=photons_from_linear_snr(snr, **known),
         photons_from_moments=photons_from_moments(snr, dark_e=dark_e, **known),
         photons_on_object=float(signal_e.mean()) / sensor.quantum_efficiency,
-        object_region="truth/object_region.png",
-        noise_reference=NOISE_REFERENCE,
         noise_free=NOISE_FREE,
         poses=poses,
         true_rt_cam_ref=[tuple(pose) for pose in rendered.poses_rt_cam_ref.tolist()],

@@ -32,8 +32,6 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     photons_linear: float
     photons_from_moments: float
     photons_on_object: float
-    object_region: str
-    noise_reference: str
     noise_free: str
     poses: str
     true_rt_cam_ref: list[tuple[float, float, float, float, float, float]]

@@ -20,6 +20,10 @@ from numpy.typing import NDArray
 BLOCK_PX = 32
 TILE_ROWS = 8
 
+# A pixel this far outside the samples (in samples) still meets their edge: rounding must not decide whether the border
+# of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
+EDGE_TOLERANCE = 1e-3
+
 FORWARD, ADJOINT, RATIO = 0, 1, 2
 _SCATTERED, _CONTIGUOUS, _OUTSIDE = 0, 1, 2
 
@@ -59,11 +63,14 @@ def _locate(homography, ray_x, ray_y, response, shape, place, weights):
 
     `place` (2, block) receives the plane row and column of the upper left of the four samples around each point,
     `weights` (3, block) the fractions along row and column, and the pixel's response (zero: it does not count).
-    A pixel counts only when all four samples exist, so that no plane edge dims the model.
+    A pixel counts only when all four samples exist, so that no plane edge dims the model; `EDGE_TOLERANCE` outside
+    them is on their edge.
     """
     count = ray_x.size
     number = weights.dtype.type  # plain ints would promote float32 to float64
     zero, last_row, last_column = number(0), number(shape[0] - 1), number(shape[1] - 1)
+    margin = number(EDGE_TOLERANCE)
+    least, most_row, most_column = -margin, last_row + margin, last_column + margin
     # Held in registers: stores to `place` and `weights` would make the compiler load them again for every pixel
     a, b, c = homography[0, 0], homography[0, 1], homography[0, 2]
     d, e, f = homography[1, 0], homography[1, 1], homography[1, 2]
@@ -73,9 +80,9 @@ def _locate(homography, ray_x, ray_y, response, shape, place, weights):
         column = (a * ray_x[k] + b * ray_y[k] + c) / scale
         row = (d * ray_x[k] + e * ray_y[k] + f) / scale
         # scale > 0 also says that the plane is met in front of the camera
-        inside = (scale > zero) & (column >= zero) & (column <= last_column) & (row >= zero) & (row <= last_row)
-        column = column if inside else zero
-        row = row if inside else zero
+        inside = (scale > zero) & (column >= least) & (column <= most_column) & (row >= least) & (row <= most_row)
+        column = min(max(column, zero), last_column) if inside else zero
+        row = min(max(row, zero), last_row) if inside else zero
         upper = min(np.floor(row), last_row - number(1))
         left = min(np.floor(column), last_column - number(1))
         place[0, k] = np.int32(upper)
@@ -122,14 +129,17 @@ def _gather_block(plane, how, place, weights, values):
 
 @_inlined
 def _scatter_block(plane, how, place, weights, values):
-    """Add the block's pixels to the plane with the weights that `_gather_block` reads it with."""
+    """Add the block's pixels to the plane with the weights that `_gather_block` reads it with.
+
+    A pixel that does not count may hold anything, a NaN as well.
+    """
     count = values.size
-    one = plane.dtype.type(1)
+    zero, one = plane.dtype.type(0), plane.dtype.type(1)
     if how == _CONTIGUOUS:
         upper = plane[place[0, 0], place[1, 0] : place[1, 0] + count + 1]
         lower = plane[place[0, 0] + 1, place[1, 0] : place[1, 0] + count + 1]
         for k in range(count):
-            values[k] *= weights[2, k]
+            values[k] = values[k] * weights[2, k] if weights[2, k] != zero else zero
         # A loop per sample: each adds at its own places, so each is a vector add
         for k in range(count):
             upper[k] += values[k] * (one - weights[0, k]) * (one - weights[1, k])
@@ -141,8 +151,8 @@ def _scatter_block(plane, how, place, weights, values):
             lower[k + 1] += values[k] * weights[0, k] * weights[1, k]
         return
     for k in range(count):
-        value = values[k] * weights[2, k]
-        if value != 0:
+        if weights[2, k] != zero:
+            value = values[k] * weights[2, k]
             row, column = np.uintp(place[0, k]), np.uintp(place[1, k])
             down, right = weights[0, k], weights[1, k]
             plane[row, column] += value * (one - down) * (one - right)

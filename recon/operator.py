@@ -87,9 +87,7 @@ class PlaneOperator:
 
     def adjoint(self, images: Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
         """Return Hᵀ g (row, column) of images (view, row, column), summed over `views` (all by default)."""
-        if images.shape != self.images_shape:
-            raise GeometryMismatch(f"images have shape {images.shape}, the operator {self.images_shape}")
-        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images)
+        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=self._images(images))
 
     def adjoint_of_map(self, value: float | Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
         """Return Hᵀ applied to images that all equal one map, broadcastable to (lattice, row, column)."""
@@ -113,7 +111,7 @@ class PlaneOperator:
             self._views(views),
             self.all_views,
             plane=self._plane(plane),
-            images=images.electrons,
+            images=self._images(images.electrons),
             background=self._map(images.background_e),
             variance=self._map(images.read_variance_e2),
         )
@@ -132,7 +130,7 @@ class PlaneOperator:
     ) -> Image:
         """Run one kernel on all workers and return the sum of their accumulators."""
         nothing = np.empty((1, 1, 1), self.dtype)
-        images = nothing if images is None else np.ascontiguousarray(images, self.dtype)
+        images = nothing if images is None else images
         sums = np.zeros((self._workers, *self.grid.shape) if seen is None else (self._workers, 1, 1), self.dtype)
 
         def work(worker: int) -> None:
@@ -159,11 +157,30 @@ class PlaneOperator:
             raise GeometryMismatch(f"plane has shape {plane.shape}, the operator {self.grid.shape}")
         return np.ascontiguousarray(plane, self.dtype)
 
+    def _images(self, images: Image) -> Image:
+        if images.shape != self.images_shape:
+            raise GeometryMismatch(f"images have shape {images.shape}, the operator {self.images_shape}")
+        return np.ascontiguousarray(images, self.dtype)
+
     def _map(self, value: float | Image) -> Image:
-        return np.array(np.broadcast_to(value, self._geometry.ray_x.shape), self.dtype)
+        shape = self._geometry.ray_x.shape
+        try:
+            return np.array(np.broadcast_to(value, shape), self.dtype)
+        except ValueError:
+            raise GeometryMismatch(f"a map has shape {np.shape(value)}, the operator's lattices {shape}") from None
 
     def _views(self, views: Sequence[int] | NDArray[np.intp] | None) -> NDArray[np.intp]:
-        return self.all_views if views is None else np.asarray(views, np.intp)
+        """Return the views to go over, each at most once: the kernels trust them."""
+        if views is None:
+            return self.all_views
+        chosen = np.asarray(views)
+        if chosen.size == 0:
+            return chosen.astype(np.intp)
+        if chosen.dtype.kind not in "iu" or np.unique(chosen).size < chosen.size:
+            raise ValueError(f"views must be whole numbers, none of them twice, got {views}")
+        if chosen.min() < 0 or chosen.max() >= len(self.all_views):
+            raise ValueError(f"views must lie within 0 and {len(self.all_views) - 1}, got {views}")
+        return chosen.astype(np.intp)
 
 
 def _checked_geometry(
@@ -178,7 +195,7 @@ def _checked_geometry(
     """Bring the pieces into the form that the kernels read, refusing what does not fit."""
     rays = rays[np.newaxis] if rays.ndim == 3 else rays
     views, lattices, detector = len(plane_from_ray), len(rays), rays.shape[1:3]
-    flat = np.ones(detector) if flat is None else flat
+    flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.asarray(lattice_of_view, np.intp)
     valid = np.zeros((0, 0, 0), bool) if valid is None or valid.all() else np.ascontiguousarray(valid)
     if plane_from_ray.shape != (views, 3, 3) or rays.shape != (lattices, *detector, 2) or views == 0:
@@ -187,8 +204,10 @@ def _checked_geometry(
         )
     if valid.size and valid.shape != (views, *detector):
         raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}")
-    if flat.shape[-2:] != detector or lattice_of_view.shape != (views,) or lattice_of_view.max() >= lattices:
-        raise GeometryMismatch(f"flat {flat.shape} or lattices {lattice_of_view.shape} do not fit rays {rays.shape}")
+    if flat.shape not in ((1, *detector), (lattices, *detector)):
+        raise GeometryMismatch(f"flat {flat.shape} does not fit rays {rays.shape}")
+    if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
+        raise GeometryMismatch(f"lattice_of_view does not give each of the {views} views one of {lattices} lattices")
     if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):
         raise GeometryMismatch("a pose, ray or flat field is not a finite number; check the calibration they came from")
     return kernels.Geometry(

@@ -1,0 +1,92 @@
+"""How dark a set is: its SNR and photons per pixel, by the paper's formulas and by counting."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.channels import channel_layouts, checked_frame, lattice_noise
+from pipelines.elemental_set import LoadedSet
+from pipelines.frames import read_frame
+from recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
+
+# Beside a set's images, where they are known: an exposure of nothing, and the object region of the reference view.
+NOISE_REFERENCE = "noise_reference.tiff"
+OBJECT_REGION = "object_region.png"
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """The SNR and photon figures of a set's reference view.
+
+    Attributes
+    ----------
+    region : str
+        "object region" where the set brings one, else "whole view".
+    noise_from : str
+        "noise reference" image where the set brings one, else "noise model".
+    snr : float
+        Eq. (4), a ratio of powers.
+    photons_linear : float, optional
+        Photons per pixel that eq. (7) reads from it, the paper's figure; None without read noise or signal.
+    photons_from_moments : float, optional
+        Photons per pixel of a uniform object that has this SNR.
+    mean_signal_e : float
+        Mean electrons per pixel above the dark level.
+    """
+
+    region: str
+    noise_from: str
+    snr: float
+    photons_linear: float | None
+    photons_from_moments: float | None
+    mean_signal_e: float
+
+
+def brightness(loaded: LoadedSet) -> Brightness:
+    """Measure the reference view of a set, in all its colours together."""
+    path = loaded.image_paths[loaded.reference_view]
+    region_path, reference_path = loaded.folder / OBJECT_REGION, loaded.folder / NOISE_REFERENCE
+    region = read_frame(region_path).pixels_dn > 127 if region_path.is_file() else None
+    signal, reference = [], []
+    for layout in channel_layouts(loaded):
+        frame = checked_frame(loaded, path, layout)
+        for lattice in layout.lattices:
+            noise = lattice_noise(loaded, lattice, frame)
+            where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
+            dark_e = noise.background_e(loaded.settings.exposure_s)
+            signal.append((noise.electrons(lattice.of(layout.of(frame.pixels_dn))))[where])
+            if reference_path.is_file():
+                nothing = read_frame(reference_path).pixels_dn
+                reference.append(noise.electrons(lattice.of(layout.of(nothing))).ravel())
+            else:
+                power = np.broadcast_to(noise.read_variance_e2() + dark_e + np.square(dark_e), lattice.shape)
+                reference.append(np.sqrt(power).ravel())
+    return _figures(
+        loaded, np.concatenate(signal), np.concatenate(reference), region is not None, reference_path.is_file()
+    )
+
+
+def _figures(
+    loaded: LoadedSet,
+    signal_e: NDArray[np.floating],
+    reference_e: NDArray[np.floating],
+    has_region: bool,
+    has_reference: bool,
+) -> Brightness:
+    """Apply the formulas."""
+    noise = loaded.noise
+    power = float(np.mean(np.square(reference_e, dtype=np.float64)))
+    snr = snr_from_powers(signal_e, reference_e) if power > 0 else float("inf")
+    read_noise_e = float(np.sqrt(np.mean(noise.read_variance_e2())))
+    dark_e = float(np.mean(noise.background_e(loaded.settings.exposure_s)))
+    known = {"quantum_efficiency": noise.quantum_efficiency, "read_noise_e": read_noise_e}
+    countable = np.isfinite(snr) and snr > 0
+    return Brightness(
+        region="object region" if has_region else "whole view",
+        noise_from="noise reference" if has_reference else "noise model",
+        snr=snr,
+        photons_linear=photons_from_linear_snr(snr, **known) if countable else None,
+        photons_from_moments=photons_from_moments(snr, dark_e=dark_e, **known) if countable else None,
+        mean_signal_e=float(np.mean(signal_e, dtype=np.float64)) - dark_e,
+    )

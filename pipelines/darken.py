@@ -1,0 +1,156 @@
+"""`faintfield darken`: a photon-starved set from a bright one."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+from cyclopts import Parameter
+from numpy.typing import NDArray
+
+from pipelines.arguments import NotNegative, Positive
+from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION, brightness
+from pipelines.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
+from pipelines.console import progress, say
+from pipelines.elemental_set import LoadedSet, Noise, load_set, write_set
+from pipelines.errors import BadValue
+from pipelines.files import building_folder, write_json
+from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
+from pipelines.provenance import provenance
+from recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
+from rig.simulation.sensor import SimulatedSensor
+
+_PAPER = SimulatedSensor()
+
+
+def darken(
+    elemental_set: Annotated[Path, Parameter(name="SET")],
+    out: Path,
+    /,
+    *,
+    snr: Positive = 0.16,
+    seed: int = 1,
+    exposure_s: Positive = 0.1,
+    read_noise_e: NotNegative = _PAPER.read_noise_e,
+    dark_current_e_per_s: NotNegative = _PAPER.dark_current_e_per_s,
+    quantum_efficiency: Positive = _PAPER.quantum_efficiency,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Make a dark set from a bright one: the same views with a few photons per pixel.
+
+    Each view is taken for its expected light, scaled so that eq. (4) gives the SNR asked for over the object region of
+    the reference view (its brighter part, by Otsu's threshold), and exposed anew: photon, dark and read noise are
+    drawn for the camera of the paper, or the one given. An exposure of nothing is written as the noise reference.
+
+    Parameters
+    ----------
+    elemental_set
+        Folder with elemental.toml of the bright set.
+    out
+        Folder to write.
+    snr
+        Of eq. (4).
+    seed
+        Of all chance.
+    exposure_s
+        Of each dark view.
+    read_noise_e
+        Standard deviation of the dark camera's read noise.
+    dark_current_e_per_s
+        Its dark electrons per pixel and second.
+    quantum_efficiency
+        Its electrons per photon.
+    overwrite
+        Replace an earlier set in OUT.
+    """
+    options = {name: value for name, value in locals().items() if name not in ("elemental_set", "out", "overwrite")}
+    loaded = load_set(elemental_set)
+    layouts = channel_layouts(loaded)
+    sensor = SimulatedSensor(
+        read_noise_e=read_noise_e, dark_current_e_per_s=dark_current_e_per_s, quantum_efficiency=quantum_efficiency
+    )
+    reference_light = _light(loaded, loaded.image_paths[loaded.reference_view], layouts)
+    region = object_region(reference_light)
+    dark_e = dark_current_e_per_s * exposure_s
+    try:
+        scale = signal_scale_for_snr(reference_light[region], snr, dark_e, read_noise_e)
+    except ValueError as failure:
+        raise BadValue(f"{elemental_set}: cannot be darkened: {failure}; is it the bright set?") from failure
+    generator = np.random.default_rng(seed)
+    with building_folder(out, replace_if="elemental.toml" if overwrite else None) as folder:
+        _write_dark_views(loaded, layouts, folder, sensor, exposure_s, scale, generator)
+        write_png(folder / OBJECT_REGION, mask_picture(region))
+        photons = float(reference_light[region].mean()) * scale / quantum_efficiency
+        record = provenance("darken", options, dict(loaded.input_hashes()))
+        write_json(folder / "provenance.json", record | {"scale_e": scale, "photons_on_object": photons})
+    figures = brightness(load_set(out))
+    known = {"quantum_efficiency": quantum_efficiency, "read_noise_e": read_noise_e}
+    result = {
+        "out": str(out),
+        "views": len(loaded.image_paths),
+        "snr": snr,
+        "snr_measured": figures.snr,
+        "photons_on_object": photons,
+        "photons_linear": photons_from_linear_snr(snr, **known),
+        "photons_from_moments": photons_from_moments(snr, dark_e=dark_e, **known),
+        "scale_e": scale,
+    }
+    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
+    return result
+
+
+def object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return the brighter part (row, column) of a view, separated from the darker by Otsu's threshold."""
+    grey = light if light.ndim == 2 else light.mean(axis=2)
+    top = float(np.quantile(grey, 0.999))
+    levels = np.clip(grey * (255 / top) if top > 0 else grey, 0, 255).astype(np.uint8)
+    threshold, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return np.asarray(levels > threshold)
+
+
+def _light(loaded: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
+    """Return what a bright view says of the light: electrons above the dark level, never negative."""
+    frame = checked_frame(loaded, path, layouts[0])
+    light = np.zeros(frame.pixels_dn.shape, np.float32)
+    for layout in layouts:
+        for lattice in layout.lattices:
+            noise = lattice_noise(loaded, lattice, frame)
+            above = noise.electrons(lattice.of(layout.of(frame.pixels_dn))) - noise.background_e(
+                loaded.settings.exposure_s
+            )
+            lattice.of(layout.of(light))[:] = np.maximum(above, 0)
+    return light
+
+
+def _write_dark_views(
+    loaded: LoadedSet,
+    layouts: list[ChannelLayout],
+    folder: Path,
+    sensor: SimulatedSensor,
+    exposure_s: float,
+    scale_e: float,
+    generator: np.random.Generator,
+) -> None:
+    """Expose every view anew and write the set; a mosaic stays one."""
+    views = []
+    for view, path in zip(progress(loaded.settings.view, "exposing views"), loaded.image_paths, strict=True):
+        photons = _light(loaded, path, layouts) * (scale_e / sensor.quantum_efficiency)
+        name = f"{Path(view.image).stem}.tiff"
+        write_frame(folder / name, sensor.expose(photons, exposure_s, generator))
+        views.append(msgspec.structs.replace(view, image=name))
+    write_frame(folder / NOISE_REFERENCE, sensor.expose(np.zeros(photons.shape), exposure_s, generator))
+    camera = loaded.settings.camera
+    if loaded.flat is not None:
+        write_plane(folder / "flat.tiff", loaded.flat, pitch_mm=1.0)
+        camera = msgspec.structs.replace(camera, flat="flat.tiff")
+    noise = Noise(
+        gain_dn_per_e=sensor.gain_dn_per_e,
+        read_noise_e=sensor.read_noise_e,
+        offset_dn=sensor.offset_dn,
+        dark_current_e_per_s=sensor.dark_current_e_per_s,
+        quantum_efficiency=sensor.quantum_efficiency,
+        saturation_dn=float(sensor.saturation_dn),
+    )
+    settings = msgspec.structs.replace(loaded.settings, exposure_s=exposure_s, camera=camera, noise=noise, view=views)
+    write_set(folder, settings)

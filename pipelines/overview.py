@@ -1,0 +1,63 @@
+"""A set at a glance, kept beside its reconstruction: all views small, one view large, and how dark it is."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.brightness import NOISE_REFERENCE, brightness
+from pipelines.elemental_set import LoadedSet
+from pipelines.files import write_json
+from pipelines.frames import read_frame
+from pipelines.image_files import Picture, contact_sheet, grey_levels, shrunk, write_png
+
+OVERVIEW_FILE = "overview.json"
+INTEGRAL_IMAGE = "integral_image.png"
+REFERENCE_VIEW = "reference_view.png"
+REFERENCE_OF_NOISE = "noise_reference.png"
+
+_SHEET_WIDTH_PX = 1260
+
+
+def write_overview(loaded: LoadedSet, out: Path) -> None:
+    """Write the pictures of a set and `overview.json` into `out`; all views share one grey scale."""
+    camera = loaded.settings.camera
+    reference = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
+    black, white = (float(level) for level in np.quantile(reference, (0.001, 0.999)))
+    columns = _columns(loaded)
+    small_px = max(_SHEET_WIDTH_PX // columns, 24)
+    small = [shrunk(_as_seen(read_frame(path).pixels_dn, white, black), small_px) for path in loaded.image_paths]
+    write_png(out / INTEGRAL_IMAGE, contact_sheet(small, columns))
+    write_png(out / REFERENCE_VIEW, _as_seen(reference, white, black))
+    has_noise_reference = (loaded.folder / NOISE_REFERENCE).is_file()
+    if has_noise_reference:
+        nothing = read_frame(loaded.folder / NOISE_REFERENCE).pixels_dn
+        write_png(out / REFERENCE_OF_NOISE, _as_seen(nothing, white, black))
+    write_json(
+        out / OVERVIEW_FILE,
+        {
+            "set": loaded.folder.resolve().name,
+            "views": len(loaded.settings.view),
+            "size_px": camera.size_px,
+            "exposure_s": loaded.settings.exposure_s,
+            "read_noise_e": float(np.sqrt(np.mean(np.square(loaded.noise.read_noise_e)))),
+            "has_noise_reference": has_noise_reference,
+            "brightness": asdict(brightness(loaded)),
+        },
+    )
+
+
+def _as_seen(pixels_dn: NDArray[Any], white: float, black: float) -> Picture:
+    """Return a frame as 8-bit levels."""
+    return grey_levels(pixels_dn, white=max(white, black + 1), black=black)
+
+
+def _columns(loaded: LoadedSet) -> int:
+    """Return how many views stand in a row of the sheet: the grid's columns where nodes are stated."""
+    nodes = [view.node for view in loaded.settings.view]
+    stated = [node[1] for node in nodes if node is not None]
+    if len(stated) == len(nodes):
+        return max(stated) - min(stated) + 1
+    return int(np.ceil(np.sqrt(len(nodes))))

@@ -1,0 +1,219 @@
+"""`faintfield reconstruct`: planes of an elemental set at chosen depths."""
+
+import re
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+from numpy.typing import NDArray
+
+from pipelines.arguments import Count, NotNegative, Positive
+from pipelines.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel, plane_grid
+from pipelines.console import progress, say
+from pipelines.elemental_set import LoadedSet, load_set
+from pipelines.errors import WrongUsage
+from pipelines.files import write_json
+from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.metrics import METRICS_FILE, assess
+from pipelines.overview import write_overview
+from pipelines.planes import Method, Settings, solve
+from pipelines.provenance import provenance
+from pipelines.report import RECONSTRUCTION_FILE, write_report
+from recon.errors import GeometryMismatch
+from recon.focus import focus_measure, sharp_depths_mm
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+
+
+def reconstruct(
+    elemental_set: Annotated[Path, Parameter(name="SET")],
+    /,
+    *,
+    out: Path,
+    depth_mm: list[float] | None = None,
+    sweep_mm: str | None = None,
+    disparity_px: list[float] | None = None,
+    method: list[Method] | None = None,
+    penalty_weight: NotNegative | None = None,
+    passes: Count | None = None,
+    pitch_mm: Positive | None = None,
+) -> dict[str, Any]:
+    """Reconstruct planes of the scene at chosen depths.
+
+    Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
+    entry in reconstruction.json; report.html shows them all. With several methods each has a folder of its own in OUT.
+
+    Parameters
+    ----------
+    elemental_set
+        Folder with elemental.toml.
+    out
+        Folder for the results; planes of the same depth are replaced.
+    depth_mm
+        Depth of a plane; give it once per plane.
+    sweep_mm
+        FIRST:LAST:COUNT, that many planes in equal steps, with a curve of focus against depth.
+    disparity_px
+        Instead of a depth: by how many pixels a point of the plane moves from one node to the next.
+    method
+        backprojection, mlem or pmlem-osl (the default); give it once per method.
+    penalty_weight
+        The paper's β, in the unit of the number of views; chosen from the noise level by default.
+    passes
+        At most this many passes over the data.
+    pitch_mm
+        Distance of the plane's samples; one detector pixel by default.
+    """
+    started = time.monotonic()
+    methods: list[Method] = list(dict.fromkeys(method or ["pmlem-osl"]))
+    swept = _swept_depths(sweep_mm) if sweep_mm else []
+    if not (depth_mm or swept or disparity_px):
+        raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
+    loaded = load_set(elemental_set)
+    depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
+    folders = {name: out if len(methods) == 1 else out / name for name in methods}
+    run = _Run(loaded, {depth: plane_grid(loaded, depth, pitch_mm) for depth in depths}, folders)
+    run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
+    write_overview(loaded, out)
+    metrics = assess(loaded, run.written)
+    if metrics:
+        write_json(out / METRICS_FILE, metrics)
+    inputs = dict(loaded.input_hashes())
+    options = {"depth_mm": depths, "penalty_weight": penalty_weight, "passes": passes, "pitch_mm": pitch_mm}
+    for name, folder in folders.items():
+        result = {
+            "format": 1,
+            "planes": [record for record in run.records if record["method"] == name],
+            "focus": run.focus(),
+            "wall_time_s": time.monotonic() - started,
+            **provenance("reconstruct", {"method": name, **options}, inputs),
+        }
+        write_json(folder / RECONSTRUCTION_FILE, result)
+    report = write_report(out)
+    _say_what_oscillates(run.records)
+    say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    return {"out": str(out), "report": str(report), "planes": run.records, "focus": run.focus(), "metrics": metrics}
+
+
+def plane_name(depth_mm: float) -> str:
+    """Return the file name, without suffix, of the plane at a depth."""
+    return f"plane_{depth_mm:07.1f}"
+
+
+class _Run:
+    """The planes of one call: every channel, depth and method, written as soon as all colours of a plane are there."""
+
+    def __init__(self, loaded: LoadedSet, grids: dict[float, PlaneGrid], folders: dict[Method, Path]) -> None:
+        self._loaded = loaded
+        self._grids = grids
+        self._folders = folders
+        self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
+        self._focus_e2 = dict.fromkeys(grids, 0.0)
+        self._with_focus = False
+        self.records: list[dict[str, Any]] = []
+        self.written: dict[tuple[Method, float], Path] = {}
+
+    def reconstruct(self, settings: Settings, *, with_focus: bool) -> None:
+        """Go through the channels, one in memory at a time."""
+        self._with_focus = with_focus
+        layouts = channel_layouts(self._loaded)
+        tasks = [(layout, depth) for layout in layouts for depth in self._grids]
+        factory_of: ChannelLayout | None = None
+        for layout, depth in progress(tasks, "reconstructing planes"):
+            if layout is not factory_of:
+                images = factory = None  # the channel before goes before the next is read
+                images = load_channel(self._loaded, layout)
+                factory = OperatorFactory(self._loaded, layout, images)
+                factory_of = layout
+            assert images is not None
+            assert factory is not None
+            operator = self._operator(factory, depth)
+            if with_focus:
+                self._focus_e2[depth] += focus_measure(operator, images, _halves(self._loaded, len(layout.lattices)))
+            for method in self._folders:
+                solution = solve(operator, images, method, settings)
+                self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
+                colours = self._colours.setdefault((method, depth), [])
+                colours.append(solution.plane)
+                if len(colours) == len(layouts):
+                    self._write(method, depth)
+
+    def focus(self) -> dict[str, Any] | None:
+        """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
+        if not self._with_focus:
+            return None
+        depths, measures = list(self._focus_e2), list(self._focus_e2.values())
+        return {"depth_mm": depths, "measure_e2": measures, "sharp_mm": sharp_depths_mm(depths, measures)}
+
+    def _operator(self, factory: OperatorFactory, depth_mm: float) -> PlaneOperator:
+        try:
+            return factory.at_depth(depth_mm, self._grids[depth_mm])
+        except GeometryMismatch as failure:
+            raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
+
+    def _record(
+        self, depth: float, method: Method, layout: ChannelLayout, record: dict[str, Any], plane: NDArray[np.floating]
+    ) -> dict[str, Any]:
+        """Return the entry of one plane and channel in reconstruction.json."""
+        grid = self._grids[depth]
+        samples_per_px = (grid.pitch_mm * self._loaded.settings.camera.fx_px / depth) ** 2
+        return {
+            "depth_mm": depth,
+            "method": method,
+            "channel": layout.name,
+            "file": f"{plane_name(depth)}.tiff",
+            **asdict(grid),
+            **record,
+            "flux_e": float(plane.sum(dtype=np.float64)) * samples_per_px,
+        }
+
+    def _write(self, method: Method, depth: float) -> None:
+        """Write a plane whose colours are complete, and its preview."""
+        colours = self._colours.pop((method, depth))
+        plane = colours[0] if len(colours) == 1 else np.dstack(colours)
+        path = self._folders[method] / f"{plane_name(depth)}.tiff"
+        write_plane(path, plane, self._grids[depth].pitch_mm)
+        write_png(path.with_suffix(".png"), grey_levels(plane, white_level([plane])))
+        self.written[method, depth] = path
+
+
+def _distinct(depths: list[float]) -> list[float]:
+    """Return each depth once; two that would share a file name but differ are refused."""
+    by_name: dict[str, float] = {}
+    for depth in depths:
+        other = by_name.setdefault(plane_name(depth), depth)
+        if other != depth:
+            raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
+    return list(by_name.values())
+
+
+def _swept_depths(sweep_mm: str) -> list[float]:
+    """Return the depths of FIRST:LAST:COUNT."""
+    parts = re.fullmatch(r"(\d+(?:\.\d*)?):(\d+(?:\.\d*)?):(\d+)", sweep_mm)
+    if parts is None:
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: give FIRST:LAST:COUNT, such as 400:900:64")
+    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
+    if min(first, last) <= 0 or first == last or count < 2:
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: two different positive depths and at least 2 planes are needed")
+    return [round(float(depth), 6) for depth in np.linspace(first, last, count)]
+
+
+def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
+    views = loaded.settings.view
+    odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
+    odd = np.repeat(odd, phases)
+    return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
+
+
+def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
+    """Tell of planes on which the iteration swings to and fro."""
+    for record in records:
+        if record["certificate"] and record["certificate"]["oscillates"]:
+            say(
+                f"{record['file']} ({record['channel']}): the one-step-late iteration does not settle; it swings by "
+                f"{record['certificate']['relative_change']:.1%} per pass. A smaller --penalty-weight calms it."
+            )

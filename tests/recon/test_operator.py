@@ -1,0 +1,413 @@
+"""H against the contract, against a matrix built another way, against analytic scenes; and what it refuses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from calib.lens import Lens
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages, Image
+from recon.kernels import EDGE_TOLERANCE
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+from rig.simulation.optics import SimulatedOptics
+
+type LinearOperatorCheck = Callable[[PlaneOperator], Image]
+
+DISTORTIONS: list[tuple[float, ...]] = [
+    (),
+    (-0.15, 0.04, 1e-3, -5e-4, 0.01),
+    (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3, -0.05, 0.01),
+]
+MOSAIC_PHASES = [(0, 0), (0, 1), (1, 0), (1, 1)]
+FACING_AT_500_MM = fronto_parallel_rt_ref_plane(500.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A camera at several poses before a plane, in terms of the world."""
+
+    rays: NDArray[np.float64]  # (lattice, row, column, 2)
+    rt_cam_ref: NDArray[np.float64]
+    rt_ref_plane: NDArray[np.float64]
+    grid: PlaneGrid
+    flat: NDArray[np.float64]  # (lattice, row, column)
+    valid: NDArray[np.bool_]
+    lattice_of_view: NDArray[np.intp]
+    workers: int
+
+    def operator(self) -> PlaneOperator:
+        return PlaneOperator(
+            plane_from_ray(self.rt_cam_ref, self.rt_ref_plane),
+            self.rays,
+            self.grid,
+            flat=self.flat,
+            valid=self.valid,
+            lattice_of_view=self.lattice_of_view,
+            dtype=np.float64,
+            workers=self.workers,
+        )
+
+
+@st.composite
+def cases(draw: st.DrawFn, most_rows: int = 19, most_columns: int = 71) -> Case:
+    """Odd sizes, near and far planes, turned and displaced cameras that see some of the plane, mosaics, masks."""
+    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed"))
+    rows, columns = draw(st.tuples(st.integers(2, most_rows), st.integers(2, most_columns)), label="detector")
+    views = draw(st.integers(1, 4), label="views")
+    depth_mm = draw(st.sampled_from([120.0, 500.0, 20_000.0]), label="depth_mm")
+    turn_rad = draw(st.sampled_from([0.0, 0.02, 0.4]), label="turn_rad")
+    tilt_rad = draw(st.sampled_from([0.0, 0.5]), label="tilt_rad")
+    mosaic = draw(st.booleans(), label="mosaic")
+    axis = (
+        2 * (rows // 4),
+        2 * (columns // 4),
+    )  # the pixel, on the mosaic's first phase, that looks at the plane's centre
+    lens = Lens((columns, rows), 90.0, 92.0, axis[1], axis[0], draw(st.sampled_from(DISTORTIONS)))
+    rays = mosaic_rays(lens) if mosaic else lens.rays()[np.newaxis]
+    shape = draw(st.tuples(st.integers(2, 11), st.integers(2, 45)), label="plane")
+    pitch_mm = depth_mm / 90.0 * draw(st.sampled_from([0.6, 1.0, 2.3]), label="scale") * (2 if mosaic else 1)
+    poses = generator.uniform(-1, 1, (views, 6)) * np.repeat([turn_rad, 4 * pitch_mm], 3)
+    flat, masked = draw(st.booleans(), label="flat"), draw(st.booleans(), label="masked")
+    lattice_of_view = generator.integers(0, len(rays), views)
+    valid = generator.random((views, *rays.shape[1:3])) >= (0.1 if masked else 0.0)
+    poses[0], lattice_of_view[0], valid[0] = 0, 0, True  # so that something is seen for certain
+    return Case(
+        rays,
+        poses,
+        np.array([*generator.uniform(-tilt_rad, tilt_rad, 3), 0, 0, depth_mm]),
+        PlaneGrid(shape, pitch_mm, (-pitch_mm * (shape[1] - 1) / 2, -pitch_mm * (shape[0] - 1) / 2)),
+        flat=generator.uniform(0.3, 1.0, rays.shape[:3]) if flat else np.ones(rays.shape[:3]),
+        valid=valid,
+        lattice_of_view=lattice_of_view,
+        workers=draw(st.integers(1, 3), label="workers"),
+    )
+
+
+def mosaic_rays(lens: Lens) -> NDArray[np.float64]:
+    """The rays (lattice, row, column, 2) of the four phases of a mosaic, cut to a common size."""
+    rows, columns = lens.size_px[1] // 2, lens.size_px[0] // 2
+    return np.stack([lens.rays(first, (2, 2))[:rows, :columns] for first in MOSAIC_PHASES])
+
+
+def ray_hits(
+    rays: NDArray[Any], rt_cam_ref: NDArray[Any], rt_ref_plane: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Where rays (…, 2) from the camera's centre cut the plane: its coordinates in mm (…, 2), and whether in front."""
+    r_ref_cam = Rotation.from_rotvec(rt_cam_ref[:3]).as_matrix().T
+    r_ref_plane = Rotation.from_rotvec(rt_ref_plane[:3]).as_matrix()
+    centre, origin, normal = -r_ref_cam @ rt_cam_ref[3:], rt_ref_plane[3:], r_ref_plane[:, 2]
+    directions = np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], axis=-1) @ r_ref_cam.T
+    path = (normal @ (origin - centre)) / (directions @ normal)
+    return ((centre + path[..., np.newaxis] * directions - origin) @ r_ref_plane)[..., :2], path > 0
+
+
+def matrix_by_ray_casting(case: Case) -> Image:
+    """H (pixel of any view, sample), a pixel at a time: its ray is cut with the plane, tents weigh the samples."""
+    matrix = []
+    (rows, columns), (detector_rows, detector_columns) = case.grid.shape, case.rays.shape[1:3]
+    for view, lattice in enumerate(case.lattice_of_view):
+        hits_mm, in_front = ray_hits(case.rays[lattice], case.rt_cam_ref[view], case.rt_ref_plane)
+        for i in range(detector_rows):
+            for j in range(detector_columns):
+                column, row = (hits_mm[i, j] - case.grid.origin_mm) / case.grid.pitch_mm
+                at = min(max(row, 0.0), rows - 1.0), min(max(column, 0.0), columns - 1.0)
+                weights = np.outer(tent(at[0], rows), tent(at[1], columns)).ravel()
+                beside = max(abs(at[0] - row), abs(at[1] - column)) > EDGE_TOLERANCE
+                counts = in_front[i, j] and case.valid[view, i, j] and not beside
+                matrix.append(weights * case.flat[lattice, i, j] if counts else 0 * weights)
+    return np.stack(matrix)
+
+
+def tent(at: float, samples: int) -> NDArray[np.float64]:
+    """Bilinear weights along one axis: each sample's falls linearly to zero at its neighbours."""
+    return np.maximum(0.0, 1.0 - np.abs(np.arange(samples) - at))
+
+
+def looking_at(columns: ArrayLike, rows: ArrayLike, **options: Any) -> PlaneOperator:
+    """One view whose pixels look at the given columns and rows, counted in samples, of a plane of 4 x 50."""
+    rays = np.stack(np.meshgrid(np.asarray(columns, float), np.asarray(rows, float)), axis=-1)
+    grid = PlaneGrid((4, 50), 1.0, (0.0, 0.0))
+    return PlaneOperator(np.eye(3)[np.newaxis], rays, grid, **{"dtype": np.float64, **options})
+
+
+@given(case=cases())
+def test_every_case_keeps_the_contract_of_a_linear_operator(
+    case: Case, check_linear_operator: LinearOperatorCheck
+) -> None:
+    check_linear_operator(case.operator())
+
+
+@pytest.mark.parametrize("turn_rad", [0.0, 0.01], ids=["contiguous blocks", "scattered blocks"])
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_wide_views_at_scale_one_keep_the_contract(
+    turn_rad: float, workers: int, check_linear_operator: LinearOperatorCheck
+) -> None:
+    rays = Lens((77, 11), 100.0, 100.0, 38.2, 5.1).rays()
+    poses = np.array([[0.0, 0, 0, 0, 0, 0], [0, turn_rad, 0.5 * turn_rad, -31.0, 2.0, 0]])
+    grid = PlaneGrid((5, 81), 5.0, (-205.0, -13.0))
+    homographies = plane_from_ray(poses, FACING_AT_500_MM)
+    check_linear_operator(PlaneOperator(homographies, rays, grid, dtype=np.float64, workers=workers))
+
+
+@given(case=cases(most_rows=7, most_columns=11))
+def test_h_is_the_matrix_found_by_casting_each_pixels_ray(
+    case: Case, check_linear_operator: LinearOperatorCheck
+) -> None:
+    np.testing.assert_allclose(check_linear_operator(case.operator()), matrix_by_ray_casting(case), atol=1e-10)
+
+
+@pytest.mark.parametrize("mirrored", [False, True], ids=["contiguous blocks", "scattered blocks"])
+def test_coordinates_on_the_last_sample_count_and_those_outside_do_not(mirrored: bool) -> None:
+    columns = np.arange(-3.0, 53.0)[:: -1 if mirrored else 1]
+    operator = looking_at(columns, [-1, 0, 1, 2, 3, 4])
+    plane = np.arange(200.0).reshape(4, 50) + 1
+    seen = np.pad(plane, ((1, 1), (3, 3)))[:, :: -1 if mirrored else 1]
+    np.testing.assert_array_equal(operator.forward(plane)[0], seen)
+    np.testing.assert_array_equal(operator.sensitivity(), np.ones((4, 50)))
+
+
+def test_between_samples_the_plane_is_weighed_bilinearly_up_to_both_edges() -> None:
+    plane = np.random.default_rng(5).uniform(1, 2, (4, 50))
+    operator = looking_at([0.25, 48.25, 49.0], [0.5, 2.5, 3.0])
+    below, right = np.vstack([plane[1:], plane[-1:]]), np.hstack([plane[:, 1:], plane[:, -1:]])
+    below_right = np.hstack([below[:, 1:], below[:, -1:]])
+    across = 0.5 * (0.75 * plane + 0.25 * right) + 0.5 * (0.75 * below + 0.25 * below_right)
+    seen = operator.forward(plane)[0]
+    np.testing.assert_allclose(seen[:2, :2], across[np.ix_([0, 2], [0, 48])], rtol=1e-14)
+    np.testing.assert_allclose(seen[2, :2], (0.75 * plane + 0.25 * right)[3, [0, 48]], rtol=1e-14)
+    np.testing.assert_allclose(seen[:2, 2], (0.5 * plane + 0.5 * below)[[0, 2], 49], rtol=1e-14)
+    assert seen[2, 2] == plane[3, 49]
+
+
+@pytest.mark.parametrize("overshoot", [-0.9, 0.9, -1.1, 1.1])
+def test_only_within_the_tolerance_does_a_pixel_beside_the_plane_see_its_edge(overshoot: float) -> None:
+    beyond = overshoot * EDGE_TOLERANCE
+    operator = looking_at([10.0, beyond if beyond < 0 else 49 + beyond], [1.0])
+    edge = operator.forward(np.ones((4, 50)))[0, 0, 1]
+    assert edge == (1.0 if abs(overshoot) < 1 else 0.0)
+
+
+@pytest.mark.parametrize("depth_mm", [500.0, 613.3, 700.0])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_plane_that_overlays_a_view_is_seen_up_to_its_border_whatever_the_rounding(
+    depth_mm: float, dtype: type[np.float32] | type[np.float64]
+) -> None:
+    lens = Lens((640, 480), 800.3, 800.3, 322.8, 237.8)
+    pitch_mm = depth_mm / lens.fx_px
+    grid = PlaneGrid((480, 640), pitch_mm, (-lens.cx_px * pitch_mm, -lens.cy_px * pitch_mm))
+    homographies = plane_from_ray(np.zeros((1, 6)), fronto_parallel_rt_ref_plane(depth_mm))
+    operator = PlaneOperator(homographies, lens.rays(), grid, dtype=dtype)
+    np.testing.assert_allclose(operator.forward(np.ones(grid.shape)), 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("distortion", DISTORTIONS)
+def test_opencv_images_the_point_that_a_pixel_sees_onto_that_pixel(distortion: tuple[float, ...]) -> None:
+    lens = Lens((45, 33), 60.0, 61.0, 21.0, 17.5, distortion)
+    poses = np.array([[0.0, 0, 0, 0, 0, 0], [0.05, -0.1, 0.3, 20, -15, 10], [-0.2, 0.15, -0.1, -50, 30, -25]])
+    rt_ref_plane = np.array([0.3, -0.2, 0.1, 5.0, -8.0, 400.0])
+    grid = PlaneGrid((101, 141), 6.0, (-420.0, -300.0))
+    operator = PlaneOperator(plane_from_ray(poses, rt_ref_plane), lens.rays(), grid, dtype=np.float64)
+    # Bilinear interpolation reproduces linear functions, so H of the coordinates is where each pixel looks
+    column, row = np.meshgrid(np.arange(141.0), np.arange(101.0))
+    x_mm, y_mm = operator.forward(grid.origin_mm[0] + 6.0 * column), operator.forward(grid.origin_mm[1] + 6.0 * row)
+    sees = operator.forward(np.ones(grid.shape)) > 0.5
+    v, u = np.indices(sees.shape[1:])
+    r_ref_plane = Rotation.from_rotvec(rt_ref_plane[:3]).as_matrix()
+    for view, rt in enumerate(poses):
+        on_plane = np.stack([x_mm[view], y_mm[view], 0 * x_mm[view]], axis=-1)[sees[view]]
+        in_ref = on_plane @ r_ref_plane.T + rt_ref_plane[3:]
+        pixels, _ = cv2.projectPoints(
+            in_ref, rt[:3], rt[3:], lens.camera_matrix(), np.array([*distortion, 0, 0, 0, 0][:8])
+        )
+        assert len(on_plane) > 400
+        np.testing.assert_allclose(pixels[:, 0], np.stack([u, v], axis=-1)[sees[view]], atol=1e-7)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("distortion", DISTORTIONS)
+def test_h_of_an_analytic_scene_is_what_rays_cast_at_it_meet(
+    distortion: tuple[float, ...], dtype: type[np.float32] | type[np.float64]
+) -> None:
+    def light(x_mm: Image, y_mm: Image) -> Image:
+        return np.asarray(3 + np.sin(x_mm / 50 + 0.3) * np.cos(y_mm / 40) + x_mm / 800)
+
+    optics = SimulatedOptics((96, 64), 120.0, 120.0, 50.0, 30.0, distortion)  # inverts the distortion its own way
+    lens = Lens((96, 64), 120.0, 120.0, 50.0, 30.0, distortion)
+    poses = np.array([[0.0, 0, 0, 0, 0, 0], [0.03, -0.05, 0.1, 50, -50, 5], [-0.04, 0.06, -0.02, -100, 50, -8]])
+    rt_ref_plane = np.array([0.2, 0.3, -0.1, 10.0, -5.0, 500.0])
+    grid = PlaneGrid((120, 200), 500.0 / 120.0, (-416.0, -250.0))
+    x_mm = grid.origin_mm[0] + grid.pitch_mm * np.arange(200)
+    y_mm = grid.origin_mm[1] + grid.pitch_mm * np.arange(120)[:, np.newaxis]
+    operator = PlaneOperator(plane_from_ray(poses, rt_ref_plane), lens.rays(), grid, dtype=dtype)
+    seen = operator.forward(light(x_mm, y_mm))
+    sees = operator.forward(np.ones(grid.shape)) > 0.5
+    for view, rt in enumerate(poses):
+        hits_mm, _ = ray_hits(optics.rays(), rt, rt_ref_plane)
+        relative = seen[view] / light(hits_mm[..., 0], hits_mm[..., 1]) - 1
+        assert sees[view].sum() > 4000
+        assert np.abs(relative[sees[view]]).max() <= 0.005
+
+
+rigid_motions = st.integers(0, 2**32 - 1).map(
+    lambda seed: np.random.default_rng(seed).uniform(-1, 1, 6) * np.repeat([0.8, 300.0], 3)
+)
+
+
+@given(case=cases(most_rows=7, most_columns=40), motion=rigid_motions)
+def test_moving_the_world_is_moving_all_cameras_back(case: Case, motion: NDArray[np.float64]) -> None:
+    world_moved = plane_from_ray(case.rt_cam_ref, composed(motion, case.rt_ref_plane))
+    moved_back = plane_from_ray(np.array([composed(rt, motion) for rt in case.rt_cam_ref]), case.rt_ref_plane)
+    for one, other in zip(world_moved, moved_back, strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * np.abs(one).max())
+
+
+@given(case=cases(most_rows=7, most_columns=40), motion=rigid_motions)
+def test_moving_the_world_and_all_cameras_changes_nothing(case: Case, motion: NDArray[np.float64]) -> None:
+    back = np.concatenate([-motion[:3], -Rotation.from_rotvec(motion[:3]).inv().apply(motion[3:])])
+    moved = replace(
+        case,
+        rt_cam_ref=np.array([composed(rt, back) for rt in case.rt_cam_ref]),
+        rt_ref_plane=composed(motion, case.rt_ref_plane),
+    )
+    plane = np.random.default_rng(3).normal(size=case.grid.shape)
+    np.testing.assert_allclose(moved.operator().forward(plane), case.operator().forward(plane), atol=1e-9)
+
+
+def composed(rt_c_b: NDArray[np.float64], rt_b_a: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The pose rt_c_a."""
+    r_c_b, r_b_a = Rotation.from_rotvec(rt_c_b[:3]), Rotation.from_rotvec(rt_b_a[:3])
+    return np.concatenate([(r_c_b * r_b_a).as_rotvec(), r_c_b.apply(rt_b_a[3:]) + rt_c_b[3:]])
+
+
+def test_the_scale_of_a_homography_is_nothing_and_its_sign_is_behind_the_camera() -> None:
+    lens, grid = Lens((30, 20), 40.0, 40.0, 14.2, 9.1), PlaneGrid((20, 30), 12.5, (-180.0, -110.0))
+    homographies = plane_from_ray(np.array([[0.0] * 6, [0.02, 0.1, 0, 30, 5, 9]]), FACING_AT_500_MM)
+    plane = np.random.default_rng(3).normal(size=grid.shape)
+    one, other = (
+        PlaneOperator(scale * homographies, lens.rays(), grid, dtype=np.float64).forward(plane) for scale in (1, 8)
+    )
+    np.testing.assert_array_equal(one, other)
+    with pytest.raises(GeometryMismatch, match="no pixel of any of the 2 views"):
+        PlaneOperator(-homographies, lens.rays(), grid)
+
+
+def test_float32_differs_from_float64_by_rounding_only() -> None:
+    lens, grid = Lens((70, 40), 80.0, 80.0, 34.2, 20.1), PlaneGrid((40, 70), 6.25, (-214.0, -120.0))
+    homographies = plane_from_ray(np.array([[0.0] * 6, [0.02, 0.1, 0, 30, 5, 9]]), FACING_AT_500_MM)
+    plane = np.random.default_rng(3).uniform(size=grid.shape)
+    single, double = (PlaneOperator(homographies, lens.rays(), grid, dtype=dtype) for dtype in (np.float32, np.float64))
+    assert single.forward(plane).dtype == single.adjoint(single.forward(plane)).dtype == np.float32
+    np.testing.assert_allclose(single.forward(plane), double.forward(plane), atol=1e-4)
+    np.testing.assert_allclose(single.sensitivity(), double.sensitivity(), atol=1e-3)
+
+
+@pytest.mark.parametrize("mirrored", [False, True], ids=["contiguous blocks", "scattered blocks"])
+@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
+def test_what_a_pixel_that_does_not_count_holds_reaches_no_sample(mirrored: bool, nonsense: float) -> None:
+    valid = np.ones((1, 4, 50), bool)
+    valid[0, 2, 17] = False
+    operator = looking_at(np.arange(50.0)[:: -1 if mirrored else 1], np.arange(4.0), valid=valid)
+    electrons = np.where(valid, 2.0, nonsense)
+    for samples in (
+        operator.adjoint(electrons) / 2,
+        operator.adjoint_of_ratio(np.full((4, 50), 2.0), ElementalImages(electrons, valid=valid)),
+    ):
+        np.testing.assert_array_equal(samples, valid[0, :, :: -1 if mirrored else 1])
+
+
+def test_each_lattice_has_a_background_and_a_variance_of_its_own() -> None:
+    rays = mosaic_rays(Lens((24, 16), 30.0, 30.0, 11.0, 8.0))
+    poses = np.zeros((5, 6))
+    poses[:, 3] = np.arange(5) * 20.0
+    lattice_of_view, grid = np.array([2, 0, 3, 1, 2]), PlaneGrid((7, 11), 30.0, (-160.0, -100.0))
+    operator = PlaneOperator(
+        plane_from_ray(poses, FACING_AT_500_MM), rays, grid, lattice_of_view=lattice_of_view, dtype=np.float64
+    )
+    generator = np.random.default_rng(11)
+    plane, electrons = generator.uniform(1, 2, grid.shape), generator.normal(1, 3, operator.images_shape)
+    background, variance = generator.uniform(0, 2, (2, *rays.shape[:3]))
+    images = ElementalImages(electrons, background, variance, lattice_of_view=lattice_of_view)
+    b, v = background[lattice_of_view], variance[lattice_of_view]
+    expected = operator.adjoint(np.maximum(electrons + v, 0) / (operator.forward(plane) + b + v))
+    np.testing.assert_allclose(operator.adjoint_of_ratio(plane, images), expected, atol=1e-12)
+    np.testing.assert_allclose(operator.adjoint_of_map(background), operator.adjoint(b), atol=1e-12)
+
+
+def test_where_nothing_is_expected_and_nothing_known_the_ratio_is_zero() -> None:
+    operator = looking_at(np.arange(50.0), np.arange(4.0))
+    ratio = operator.adjoint_of_ratio(np.zeros((4, 50)), ElementalImages(np.ones((1, 4, 50))))
+    np.testing.assert_array_equal(ratio, 0.0)
+
+
+GOOD: dict[str, Any] = {
+    "plane_from_ray": np.stack([np.eye(3)] * 2),
+    "rays": np.zeros((2, 3, 4, 2)),
+    "grid": PlaneGrid((5, 5), 1.0, (-2.0, -2.0)),
+    "lattice_of_view": np.array([0, 1]),
+}
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"plane_from_ray": np.eye(3)}, "do not fit"),
+        ({"plane_from_ray": np.zeros((0, 3, 3)), "lattice_of_view": None}, "do not fit"),
+        ({"rays": np.zeros((3, 4))}, "do not fit"),
+        ({"rays": np.zeros((2, 3, 4, 3))}, "do not fit"),
+        ({"flat": np.ones((4, 3))}, "flat"),
+        ({"flat": np.ones((3, 3, 4))}, "flat"),
+        ({"valid": np.zeros((1, 3, 4), bool)}, "valid"),
+        ({"lattice_of_view": np.array([0, 2])}, "lattice_of_view"),
+        ({"lattice_of_view": np.array([0, -1])}, "lattice_of_view"),
+        ({"lattice_of_view": np.array([0, 1, 1])}, "lattice_of_view"),
+        ({"plane_from_ray": np.full((2, 3, 3), np.nan)}, "not a finite number"),
+        ({"rays": np.full((2, 3, 4, 2), np.inf)}, "not a finite number"),
+        ({"flat": np.full((3, 4), np.nan)}, "not a finite number"),
+        ({"grid": PlaneGrid((5, 5), 1.0, (50.0, 0.0))}, "no pixel of any of the 2 views"),
+        ({"valid": np.zeros((2, 3, 4), bool)}, "no pixel of any of the 2 views"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> None:
+    assert PlaneOperator(**GOOD).sensitivity().sum() == 24
+    with pytest.raises(GeometryMismatch, match=words):
+        PlaneOperator(**{**GOOD, **bad})
+
+
+@pytest.mark.parametrize("views", [[2], [-1], [0, 0], [0.0], [True, False]])
+def test_views_that_are_not_there_or_twice_are_refused(views: Any) -> None:
+    operator = PlaneOperator(**GOOD)
+    uses: list[Callable[[], Image]] = [
+        lambda: operator.forward(np.ones((5, 5)), views),
+        lambda: operator.adjoint(np.ones((2, 3, 4)), views),
+        lambda: operator.sensitivity(views),
+        lambda: operator.adjoint_of_ratio(np.ones((5, 5)), ElementalImages(np.ones((2, 3, 4))), views),
+    ]
+    for use in uses:
+        with pytest.raises(ValueError, match="views must"):
+            use()
+
+
+def test_planes_images_and_maps_of_another_shape_are_refused() -> None:
+    operator = PlaneOperator(**GOOD)
+    plane, images = np.ones((5, 5)), np.ones((2, 3, 4))
+    uses: list[Callable[[], Image]] = [
+        lambda: operator.forward(images[0]),
+        lambda: operator.adjoint(images[:1]),
+        lambda: operator.adjoint_of_map(plane),
+        lambda: operator.adjoint_of_ratio(images[0], ElementalImages(images)),
+        lambda: operator.adjoint_of_ratio(plane, ElementalImages(images[:1])),
+        lambda: operator.adjoint_of_ratio(plane, ElementalImages(images, background_e=plane)),
+    ]
+    for use in uses:
+        with pytest.raises(GeometryMismatch, match="shape"):
+            use()
