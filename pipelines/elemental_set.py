@@ -277,15 +277,17 @@ def read_noise_json(path: Path, size_px: tuple[int, int]) -> tuple[NoiseModel, N
         missing = [name for name in names if values[name] is None]
         hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int)
         extra = {
-            key: fitted[key]["value"] if isinstance(fitted[key], dict) else fitted[key]
+            key: value
             for key in ("quantum_efficiency", "saturation_dn")
-            if fitted.get(key) is not None
+            if (value := fitted[key]["value"] if isinstance(fitted.get(key), dict) else fitted.get(key)) is not None
         }
     except (ValueError, KeyError, TypeError) as failure:
         raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure!r}); run that again") from failure
     if missing:
         why = fitted[missing[0]].get("why", "no reason stated")
         raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
+    # An estimate near zero may fall below it; a dark current cannot.
+    values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
     unusable = np.zeros(size_px[::-1], bool)
     unusable[tuple(hot.reshape(-1, 2).T)] = True
     maps_path = path.with_name("noise_maps.npz")

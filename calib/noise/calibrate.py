@@ -174,8 +174,9 @@ def _fit(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bo
         if exact:
             counts = collect_counts(darks, usable & ~suspect)
         start = gaussian_start(fit) if exact else censored_start(counts)
-        spread = not exact or fit.values["dcnu_dn2_per_s2"] > 3 * fit.standard_error("dcnu_dn2_per_s2") > 0
-        fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, spread=spread)
+        # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
+        spread = not exact or fit.values["dcnu_dn2_per_s2"] > 3 * fit.standard_error("dcnu_dn2_per_s2")
+        fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
         bend = None
     return _Fitted(fit, likelihood, moments, bend)
 

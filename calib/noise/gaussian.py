@@ -94,6 +94,11 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
     )
 
 
+def log_likelihood(values: Mapping[str, float], moments: Moments) -> float:
+    """Return ln L at given parameters, up to a constant that depends on the frames alone."""
+    return -float(ca.DM(ca.evalf(ca.SX(_negative_log_likelihood(values, moments)))))
+
+
 def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.float64]:
     """Return the Hessian of the negative log-likelihood at given parameters.
 
@@ -119,6 +124,8 @@ def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) 
 
     The charge behind a signal s is (s/g)(1 + κs), so that one more electron raises s by g/(1 + 2κs).
     """
+    if not mean_dn.size:
+        return []
     gain, read = _exp(values["log_gain"]), _exp(values["log_read_dn2"])
     bend = values.get("nonlinearity_per_dn", 0.0)
     signals = [mean - values["offset_dn"] for mean in mean_dn]

@@ -25,8 +25,8 @@ _SUSPECT_SIGMA = 8.0
 # multiple, when the black level's own jitter would do so less often than the chance given.
 _LEAK_SURELY, _LEAK_FRACTION, _LEAK_CHANCE = 5.0, 0.25, 1e-7
 
-# A flat with a larger fraction of its pixels on one extreme value has reached the end of the range.
-_SATURATED_FRACTION = 1e-3
+# A flat with a larger fraction of its pixels (and more than so many) on its highest value has reached the end.
+_SATURATED_FRACTION, _SATURATED_PX = 1e-3, 10
 
 # The exact likelihoods and the histograms need the values themselves; so many pixels are kept, spread evenly.
 SAMPLE_PX = 16_384
@@ -251,11 +251,10 @@ def robust_sigma(values: NDArray[Any]) -> float:
 def _check_range(name: str, frame_dn: NDArray[Any], saturation_dn: float) -> None:
     """Refuse a flat that piles up at the end of the range, stated or not."""
     ceiling = min(float(frame_dn.max()), saturation_dn)
-    fraction = float((frame_dn >= ceiling).mean())
-    next_below = float((frame_dn == ceiling - 1).mean())
-    if fraction > max(_SATURATED_FRACTION, next_below):
+    at_end, next_below = int((frame_dn >= ceiling).sum()), int((frame_dn == ceiling - 1).sum())
+    if at_end > max(_SATURATED_FRACTION * frame_dn.size, _SATURATED_PX, next_below):
         raise SaturatedFlat(
-            f"{name}: {fraction:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range "
+            f"{name}: {at_end / frame_dn.size:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range "
             f"(at most {_SATURATED_FRACTION:.1%} may); shorten the exposure or dim the light"
         )
 
