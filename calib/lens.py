@@ -11,6 +11,9 @@ from calib.errors import LensNotInvertible
 # Undistorting and distorting again must return to the pixel within this.
 _ROUND_TRIP_PX = 1e-3
 
+# OpenCV returns a wide Jacobian with every projected point: a strip at a time keeps it small.
+_STRIP_ROWS = 32
+
 
 @dataclass(frozen=True)
 class Lens:
@@ -66,24 +69,31 @@ class Lens:
             Some pixel is the image of no ray, or of several.
         """
         width, height = self.size_px
-        columns, rows = np.meshgrid(
-            np.arange(first[1], width, step[1], dtype=float), np.arange(first[0], height, step[0], dtype=float)
-        )
+        columns = np.arange(first[1], width, step[1], dtype=float)
+        rows = np.arange(first[0], height, step[0], dtype=float)
+        rays = np.empty((len(rows), len(columns), 2))
+        for top in range(0, len(rows), _STRIP_ROWS):
+            strip = slice(top, top + _STRIP_ROWS)
+            rays[strip] = self._undistorted(np.stack(np.meshgrid(columns, rows[strip]), axis=-1))
+        return rays
+
+    def _undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the rays of pixels (row, column, 2), checked by imaging them again."""
         if not any(self.distortion):
-            return np.stack([(columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px], axis=-1)
-        pixels = np.stack([columns, rows], axis=-1).reshape(-1, 1, 2)
+            return (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
         matrix, distortion = self.camera_matrix(), self._coefficients()
-        rays = cv2.undistortPoints(pixels, matrix, distortion, criteria=criteria)
+        rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, criteria=criteria)
         homogeneous = cv2.convertPointsToHomogeneous(rays)
         again, _ = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), matrix, distortion)
-        miss_px = float(np.abs(again - pixels).max())
+        miss_px = float(np.abs(again.reshape(pixels.shape) - pixels).max())
         if not miss_px <= _ROUND_TRIP_PX:
             raise LensNotInvertible(
-                f"distortion {self.distortion} cannot be undone over the {width} x {height} px detector: off by "
-                f"{miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach the corners, or crop"
+                f"distortion {self.distortion} cannot be undone over the {self.size_px[0]} x {self.size_px[1]} px "
+                f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach the "
+                "corners, or crop"
             )
-        return np.asarray(rays.reshape(*rows.shape, 2), np.float64)
+        return np.asarray(rays.reshape(pixels.shape), np.float64)
 
     def _coefficients(self) -> NDArray[np.float64]:
         """Return the distortion in one of the lengths that OpenCV takes: 4, 5 or 8."""

@@ -34,7 +34,7 @@ class NoiseModel:
     Raises
     ------
     ValueError
-        A number is not finite, a gain is not positive, or a noise is negative.
+        A number is not finite (only `saturation_dn` may be infinite), a gain is not positive, or a noise is negative.
     """
 
     offset_dn: Map
@@ -50,6 +50,8 @@ class NoiseModel:
         _require("read_noise_e", self.read_noise_e, at_least=0.0)
         _require("dark_current_e_per_s", self.dark_current_e_per_s, at_least=0.0)
         _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
+        if not self.saturation_dn > 0:
+            raise ValueError(f"saturation_dn must be positive, got {self.saturation_dn}")
 
     def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
         """Return a frame (row, column) in electrons, negative where the read noise made it so."""

@@ -25,10 +25,10 @@ class Brightness:
         "object region" where the set brings one, else "whole view".
     noise_from : str
         "noise reference" image where the set brings one, else "noise model".
-    snr : float
-        Eq. (4), a ratio of powers.
+    snr : float, optional
+        Eq. (4), a ratio of powers; None where the noise model states no read noise to compare with.
     photons_linear : float, optional
-        Photons per pixel that eq. (7) reads from it, the paper's figure; None without read noise or signal.
+        Photons per pixel that eq. (7) reads from it, the paper's figure; None where the SNR is not positive.
     photons_from_moments : float, optional
         Photons per pixel of a uniform object that has this SNR.
     mean_signal_e : float
@@ -37,7 +37,7 @@ class Brightness:
 
     region: str
     noise_from: str
-    snr: float
+    snr: float | None
     photons_linear: float | None
     photons_from_moments: float | None
     mean_signal_e: float
@@ -76,17 +76,15 @@ def _figures(
 ) -> Brightness:
     """Apply the formulas."""
     noise = loaded.noise
-    power = float(np.mean(np.square(reference_e, dtype=np.float64)))
-    snr = snr_from_powers(signal_e, reference_e) if power > 0 else float("inf")
-    read_noise_e = float(np.sqrt(np.mean(noise.read_variance_e2())))
+    read_noise_e = float(np.sqrt(np.mean(np.square(noise.read_noise_e))))
+    snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
     dark_e = float(np.mean(noise.background_e(loaded.settings.exposure_s)))
     known = {"quantum_efficiency": noise.quantum_efficiency, "read_noise_e": read_noise_e}
-    countable = np.isfinite(snr) and snr > 0
     return Brightness(
         region="object region" if has_region else "whole view",
         noise_from="noise reference" if has_reference else "noise model",
         snr=snr,
-        photons_linear=photons_from_linear_snr(snr, **known) if countable else None,
-        photons_from_moments=photons_from_moments(snr, dark_e=dark_e, **known) if countable else None,
+        photons_linear=photons_from_linear_snr(snr, **known) if snr and snr > 0 else None,
+        photons_from_moments=photons_from_moments(snr, dark_e=dark_e, **known) if snr and snr > 0 else None,
         mean_signal_e=float(np.mean(signal_e, dtype=np.float64)) - dark_e,
     )

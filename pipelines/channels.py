@@ -160,16 +160,33 @@ def lattice_noise(loaded: LoadedSet, lattice: Lattice, frame: Frame | None) -> N
     return noise
 
 
+def require_in_front(depth_mm: float) -> None:
+    """Refuse a plane that is not in front of the reference camera (GeometryMismatch)."""
+    if not (np.isfinite(depth_mm) and depth_mm > 0):
+        raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
+
+
+def default_pitch_px(loaded: LoadedSet, layouts: list[ChannelLayout]) -> int:
+    """Return how many detector pixels apart a plane's samples are by default: one, where the views can fill that.
+
+    A view sees only some pixels in each colour of a mosaic; with fewer views than it takes to fill the gaps, the
+    samples are a period of the mosaic apart.
+    """
+    views = len(loaded.settings.view)
+    step = layouts[0].lattices[0].step
+    fewest_per_sample = min(views * len(layout.lattices) / (step[0] * step[1]) for layout in layouts)
+    return 1 if fewest_per_sample >= 1 else max(step)
+
+
 def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
-    """Return the samples of the plane at a depth: by default those that overlay the reference view pixel for pixel.
+    """Return the samples of the plane at a depth: by default they overlay the reference view pixel for pixel.
 
     Raises
     ------
     GeometryMismatch
         The plane is not in front of the camera.
     """
-    if not (np.isfinite(depth_mm) and depth_mm > 0):
-        raise GeometryMismatch(f"a plane at {depth_mm} mm is behind the camera; depth_mm must be positive")
+    require_in_front(depth_mm)
     camera = loaded.settings.camera
     cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
     width, height = camera.size_px

@@ -14,7 +14,8 @@ import msgspec
 
 from pipelines.errors import CannotWrite, DiskFull, OutputExists
 
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+# A short write of an array comes without a number: it, too, means that the disk is full.
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
 
 
 @contextmanager
@@ -99,6 +100,21 @@ def check_free(out: Path, *, replace_if: str | None = None) -> None:
         raise OutputExists(f"{out}: holds files already, and none are overwritten; name a new or empty folder")
 
 
+def require_room(path: Path, needed_bytes: int) -> None:
+    """Refuse to begin what would not fit on the disk of `path`.
+
+    Raises
+    ------
+    DiskFull
+        Fewer than `needed_bytes` are free.
+    """
+    free = _free_bytes(path)
+    if free < needed_bytes:
+        raise DiskFull(
+            f"{path}: {needed_bytes / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free; make room or use another"
+        )
+
+
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
@@ -113,12 +129,16 @@ def reported_as_cannot_write(path: Path) -> Iterator[None]:
     except OSError as failure:
         place = failure.filename or path
         if failure.errno in _NO_ROOM:
-            existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
-            free_mb = shutil.disk_usage(existing).free / 1e6
             raise DiskFull(
-                f"{path}: {failure.strerror}; {free_mb:.1f} MB are free; make room or name another disk"
+                f"{path}: no space left on the disk ({_free_bytes(path) / 1e6:.1f} MB free); make room or use another"
             ) from failure
         raise CannotWrite(f"{place}: {failure.strerror}; name a place that can be written") from failure
+
+
+def _free_bytes(path: Path) -> int:
+    """Return the room on the disk where `path` is or would be."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    return shutil.disk_usage(existing).free
 
 
 def _umask() -> int:

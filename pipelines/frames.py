@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import exifread
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
@@ -154,6 +153,8 @@ def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
 
 def exif_exposure_s(path: Path) -> float | None:
     """Return the exposure that EXIF states, None where it states none (rawpy would say 1 s)."""
+    import exifread  # only sessions with raw files pay for loading it
+
     with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
         tag = exifread.process_file(file, details=False, stop_tag="EXIF ExposureTime").get("EXIF ExposureTime")
         if tag is not None and tag.values and float(tag.values[0]) > 0:

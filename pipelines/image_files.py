@@ -58,9 +58,9 @@ def mask_picture(mask: NDArray[np.bool_]) -> Picture:
     return np.where(mask, np.uint8(255), np.uint8(0))
 
 
-def white_level(planes: list[NDArray[np.floating]]) -> float:
-    """Return the white of a scale on which planes can be compared: the greatest of their 99.8 % quantiles."""
-    return max(float(np.quantile(plane, 0.998)) for plane in planes)
+def white_level(plane: NDArray[np.floating]) -> float:
+    """Return the white of a scale that shows a plane well: its 99.8 % quantile."""
+    return float(np.quantile(plane, 0.998))
 
 
 def contact_sheet(views: list[Picture], columns: int) -> Picture:

@@ -1,6 +1,5 @@
 """One plane of one channel: run a method on it, watch it, and say how it went."""
 
-from collections import deque
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -12,7 +11,7 @@ from recon.likelihoods import negative_log_likelihood
 from recon.operator import PlaneOperator
 from recon.penalties import total_variation
 from recon.solvers import (
-    Iterate,
+    Step,
     back_projection,
     oscillates,
     pmlem_one_step_late,
@@ -32,8 +31,6 @@ _SETTLED = 1e-3
 
 # ε of eq. (3) relative to the square of the image's scale; the paper asks for less than 1 %.
 _EPSILON_OF_SCALE = 0.005
-
-_WATCHED_PASSES = 10
 
 
 @dataclass(frozen=True)
@@ -74,22 +71,22 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
     start = smooth_start(operator, images)
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
     weight, chosen = _penalty_weight(operator, images, start, method, settings)
-    watched: deque[Iterate] = deque(maxlen=_WATCHED_PASSES)
+    steps: list[Step] = []
     limit = settings.passes or _PASSES[method]
     for iterate in pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon):
-        watched.append(iterate)
-        if iterate.passes >= limit or settled([iterate], _SETTLED):
+        steps.append(iterate.step)
+        if len(steps) >= limit or settled(steps, _SETTLED):
             break
-    last = watched[-1]
-    objective = negative_log_likelihood(operator, last.plane, images) + weight * total_variation(last.plane, epsilon)
+    plane = iterate.plane
+    objective = negative_log_likelihood(operator, plane, images) + weight * total_variation(plane, epsilon)
     certificate = {
         "kind": "relative change of the last pass; one-step-late iterations prove no optimum",
-        "relative_change": last.relative_change,
-        "settled": settled(list(watched), _SETTLED),
-        "oscillates": oscillates(list(watched), _SETTLED),
+        "relative_change": steps[-1].relative_change,
+        "settled": settled(steps, _SETTLED),
+        "oscillates": oscillates(steps, _SETTLED),
         "kept_at_start": int(np.count_nonzero(~updated_samples(operator.sensitivity(), weight))),
     }
-    return Solution(last.plane, _record(last.plane, weight, chosen, last.passes, epsilon, objective, certificate))
+    return Solution(plane, _record(plane, weight, chosen, len(steps), epsilon, objective, certificate))
 
 
 def _penalty_weight(

@@ -11,11 +11,19 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive
-from pipelines.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel, plane_grid
+from pipelines.channels import (
+    ChannelLayout,
+    OperatorFactory,
+    channel_layouts,
+    default_pitch_px,
+    load_channel,
+    plane_grid,
+    require_in_front,
+)
 from pipelines.console import progress, say
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
-from pipelines.files import write_json
+from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
@@ -23,9 +31,8 @@ from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from recon.errors import GeometryMismatch
-from recon.focus import focus_measure, sharp_depths_mm
+from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
 
 
 def reconstruct(
@@ -65,7 +72,7 @@ def reconstruct(
     passes
         At most this many passes over the data.
     pitch_mm
-        Distance of the plane's samples; one detector pixel by default.
+        Distance of the plane's samples; by default one detector pixel of the reference view.
     """
     started = time.monotonic()
     methods: list[Method] = list(dict.fromkeys(method or ["pmlem-osl"]))
@@ -75,7 +82,8 @@ def reconstruct(
     loaded = load_set(elemental_set)
     depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
     folders = {name: out if len(methods) == 1 else out / name for name in methods}
-    run = _Run(loaded, {depth: plane_grid(loaded, depth, pitch_mm) for depth in depths}, folders)
+    run = _Run(loaded, depths, pitch_mm, folders)
+    require_room(out, run.needed_bytes())
     run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
     write_overview(loaded, out)
     metrics = assess(loaded, run.written)
@@ -106,21 +114,29 @@ def plane_name(depth_mm: float) -> str:
 class _Run:
     """The planes of one call: every channel, depth and method, written as soon as all colours of a plane are there."""
 
-    def __init__(self, loaded: LoadedSet, grids: dict[float, PlaneGrid], folders: dict[Method, Path]) -> None:
+    def __init__(
+        self, loaded: LoadedSet, depths: list[float], pitch_mm: float | None, folders: dict[Method, Path]
+    ) -> None:
         self._loaded = loaded
-        self._grids = grids
+        self._layouts = channel_layouts(loaded)
+        mm_per_depth = default_pitch_px(loaded, self._layouts) / loaded.settings.camera.fx_px
+        self._grids = {depth: plane_grid(loaded, depth, pitch_mm or depth * mm_per_depth) for depth in depths}
         self._folders = folders
         self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
-        self._focus_e2 = dict.fromkeys(grids, 0.0)
+        self._focus = dict.fromkeys(depths, Focus(0.0, 0.0))
         self._with_focus = False
         self.records: list[dict[str, Any]] = []
         self.written: dict[tuple[Method, float], Path] = {}
 
+    def needed_bytes(self) -> int:
+        """Return about how much disk the results take: planes, previews, and the report that shows them again."""
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self._folders)
+        return samples * len(self._layouts) * (np.dtype(np.float32).itemsize + 3)
+
     def reconstruct(self, settings: Settings, *, with_focus: bool) -> None:
         """Go through the channels, one in memory at a time."""
         self._with_focus = with_focus
-        layouts = channel_layouts(self._loaded)
-        tasks = [(layout, depth) for layout in layouts for depth in self._grids]
+        tasks = [(layout, depth) for layout in self._layouts for depth in self._grids]
         factory_of: ChannelLayout | None = None
         for layout, depth in progress(tasks, "reconstructing planes"):
             if layout is not factory_of:
@@ -132,21 +148,33 @@ class _Run:
             assert factory is not None
             operator = self._operator(factory, depth)
             if with_focus:
-                self._focus_e2[depth] += focus_measure(operator, images, _halves(self._loaded, len(layout.lattices)))
+                halves = _halves(self._loaded, len(layout.lattices))
+                self._add_focus(depth, focus_measure(operator, images, halves))
             for method in self._folders:
                 solution = solve(operator, images, method, settings)
                 self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
                 colours = self._colours.setdefault((method, depth), [])
                 colours.append(solution.plane)
-                if len(colours) == len(layouts):
+                if len(colours) == len(self._layouts):
                     self._write(method, depth)
 
     def focus(self) -> dict[str, Any] | None:
         """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
         if not self._with_focus:
             return None
-        depths, measures = list(self._focus_e2), list(self._focus_e2.values())
-        return {"depth_mm": depths, "measure_e2": measures, "sharp_mm": sharp_depths_mm(depths, measures)}
+        depths, curve = list(self._focus), list(self._focus.values())
+        return {
+            "depth_mm": depths,
+            "detail_e2": [point.detail_e2 for point in curve],
+            "sigma_e2": [point.sigma_e2 for point in curve],
+            "sharp_mm": sharp_depths_mm(depths, curve),
+        }
+
+    def _add_focus(self, depth: float, of_channel: Focus) -> None:
+        """Add what one more channel says of a depth."""
+        known = self._focus[depth]
+        sigma_e2 = float(np.hypot(known.sigma_e2, of_channel.sigma_e2))
+        self._focus[depth] = Focus(known.detail_e2 + of_channel.detail_e2, sigma_e2)
 
     def _operator(self, factory: OperatorFactory, depth_mm: float) -> PlaneOperator:
         try:
@@ -176,14 +204,15 @@ class _Run:
         plane = colours[0] if len(colours) == 1 else np.dstack(colours)
         path = self._folders[method] / f"{plane_name(depth)}.tiff"
         write_plane(path, plane, self._grids[depth].pitch_mm)
-        write_png(path.with_suffix(".png"), grey_levels(plane, white_level([plane])))
+        write_png(path.with_suffix(".png"), grey_levels(plane, white_level(plane)))
         self.written[method, depth] = path
 
 
 def _distinct(depths: list[float]) -> list[float]:
-    """Return each depth once; two that would share a file name but differ are refused."""
+    """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
     by_name: dict[str, float] = {}
     for depth in depths:
+        require_in_front(depth)
         other = by_name.setdefault(plane_name(depth), depth)
         if other != depth:
             raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
@@ -211,9 +240,10 @@ def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[n
 
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     """Tell of planes on which the iteration swings to and fro."""
-    for record in records:
-        if record["certificate"] and record["certificate"]["oscillates"]:
-            say(
-                f"{record['file']} ({record['channel']}): the one-step-late iteration does not settle; it swings by "
-                f"{record['certificate']['relative_change']:.1%} per pass. A smaller --penalty-weight calms it."
-            )
+    certificates = [record["certificate"] for record in records if record["certificate"]]
+    swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
+    if swings:
+        say(
+            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes; it swings "
+            f"by up to {max(swings):.1%} per pass (see reconstruction.json). A smaller --penalty-weight calms it."
+        )

@@ -5,11 +5,9 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from pipelines.console import say
@@ -19,6 +17,9 @@ from pipelines.frames import read_frame
 from pipelines.image_files import encoded, grey_levels, shrunk, white_level
 from pipelines.metrics import METRICS_FILE
 from pipelines.overview import INTEGRAL_IMAGE, OVERVIEW_FILE, REFERENCE_OF_NOISE, REFERENCE_VIEW
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
@@ -84,10 +85,11 @@ def write_report(directory: Path) -> Path:
             columns=[{"name": name, "title": _column_title(name)} for name in columns],
             rows=_rows(planes, columns, _shown_depths(depths, focus), white),
             slider=_slider(planes, columns, white) if len(depths) > 1 else None,
+            slider_column=_slider_column(columns),
             white=white,
             focus_curve=_focus_curve(focus) if focus else None,
             sharp_mm=focus["sharp_mm"] if focus else [],
-            metrics=[row for path in _below(directory, METRICS_FILE) for row in _read_json(path)["planes"]],
+            metrics=_metrics(directory),
             method_names=METHOD_NAMES,
             results=[
                 {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
@@ -113,6 +115,16 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict) or not isinstance(content.get("planes", []), list):
         raise BadValue(f"{path}: is not a result of this program; reconstruct again")
     return content
+
+
+def _metrics(directory: Path) -> list[dict[str, Any]]:
+    """Return the errors against the truth: the folder's own, or those of the folders within it."""
+    own = directory / METRICS_FILE
+    return [
+        row
+        for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))
+        for row in _read_json(path)["planes"]
+    ]
 
 
 def _planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[_Plane]:
@@ -160,7 +172,7 @@ def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
 
 def _shared_white(planes: list[_Plane], columns: list[str]) -> float:
     """Return the white of the one grey scale: that of the least noisy column, so that noise may clip but planes not."""
-    brightest = [white_level([plane.pixels() for plane in planes if plane.column == column]) for column in columns]
+    brightest = [max(white_level(plane.pixels()) for plane in planes if plane.column == column) for column in columns]
     positive = [level for level in brightest if level > 0]
     return min(positive) if positive else 1.0
 
@@ -202,6 +214,11 @@ def _slider(planes: list[_Plane], columns: list[str], white: float) -> list[dict
     ]
 
 
+def _slider_column(columns: list[str]) -> int:
+    """Return which column the slider shows first: one that was penalised, where there is one."""
+    return next((index for index, name in enumerate(columns) if "pmlem" in name), 0)
+
+
 def _set_section(folder: Path) -> dict[str, Any]:
     """Return what the page says of one set."""
     overview = _read_json(folder / OVERVIEW_FILE)
@@ -225,15 +242,15 @@ def _data_uri(content: bytes, suffix: str) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def _focus_curve(focus: dict[str, Any]) -> Markup:
+def _focus_curve(focus: dict[str, Any]) -> str:
     """Return the focus curve as SVG that takes its colour from the page."""
     from matplotlib.figure import Figure  # loading it costs most of a second, and most reports have no curve
 
     ink = "#010203"  # replaced below: the page's own colour, light or dark
     figure = Figure(figsize=(7.2, 2.8), layout="constrained")
     axes = figure.subplots()
-    axes.plot(focus["depth_mm"], focus["measure_e2"], "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
-    top = max(focus["measure_e2"])
+    axes.plot(focus["depth_mm"], focus["detail_e2"], "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
+    top = max(focus["detail_e2"])
     for depth in focus["sharp_mm"]:
         axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
         axes.annotate(
@@ -249,10 +266,12 @@ def _focus_curve(focus: dict[str, Any]) -> Markup:
     text = io.StringIO()
     figure.savefig(text, format="svg", transparent=True, metadata={"Date": None})
     svg = text.getvalue()
-    return Markup(svg[svg.index("<svg") :].replace(ink, "currentColor"))
+    return svg[svg.index("<svg") :].replace(ink, "currentColor")
 
 
-def _environment() -> Environment:
+def _environment() -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when all images are out of memory
+
     environment = Environment(loader=PackageLoader("pipelines"), autoescape=True, undefined=StrictUndefined)
     environment.filters["figure"] = lambda value, digits=3: "–" if value is None else f"{value:.{digits}g}"
     return environment

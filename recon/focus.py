@@ -1,26 +1,37 @@
 """Where something is sharp: a focus measure that noise does not bias."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
-from scipy.signal import find_peaks
 
-from recon.images import ElementalImages
+from recon.images import ElementalImages, Image
 from recon.operator import PlaneOperator
+from recon.smoothing import blurred
 from recon.solvers import back_projection
 
-# Details between these two scales count: finer ones are noise, coarser ones are blur.
-_FINE_PX, _COARSE_PX = 1.0, 4.0
+# Detail between standard deviations of 1 and 4 samples counts: finer is noise, coarser is blur.
+_FINE = (1, 1)
+_COARSE = (1, 1, 1, 1, 2, 2, 2, 4)
 
-_LEAST_PROMINENCE = 0.1
+_LEAST_PROMINENCE, _LEAST_SIGMAS = 0.1, 6.0
+
+# Over so many samples (2π times the fine scale squared) a product of two smoothed noises repeats itself.
+_CORRELATED_SAMPLES = 2 * np.pi
+
+
+class Focus(NamedTuple):
+    """The power of detail at one depth, and the standard deviation that noise gives it, both in e⁻²."""
+
+    detail_e2: float
+    sigma_e2: float
 
 
 def focus_measure(
     operator: PlaneOperator, images: ElementalImages, halves: tuple[NDArray[np.intp], NDArray[np.intp]]
-) -> float:
-    """Return the power of fine detail that two halves of the views agree on, in e⁻².
+) -> Focus:
+    """Return the power of fine detail that two halves of the views agree on.
 
     Each half is back-projected by itself and band-passed; noise is independent between the halves and averages out of
     the product, while detail of an object at this depth is the same in both. Detail of objects elsewhere is spread.
@@ -36,27 +47,41 @@ def focus_measure(
     """
     first, second = (_detail(back_projection(operator, images, half)) for half in halves)
     both = (operator.sensitivity(halves[0]) >= 1) & (operator.sensitivity(halves[1]) >= 1)
-    return float(np.mean(first[both] * second[both], dtype=np.float64)) if both.any() else 0.0
+    if not both.any():
+        return Focus(0.0, 0.0)
+    product = (first * second)[both].astype(np.float64)
+    return Focus(float(product.mean()), float(np.sqrt(np.mean(product**2) * _CORRELATED_SAMPLES / product.size)))
 
 
-def sharp_depths_mm(depths_mm: Sequence[float], measures: Sequence[float]) -> list[float]:
+def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[Focus]) -> list[float]:
     """Return the depths at which a focus curve peaks, each refined by a parabola through its neighbours.
 
-    A peak counts when it stands out by a tenth of the curve's range.
+    A peak counts when it stands out by a tenth of the curve's range and by six standard deviations of the noise.
     """
-    order = np.argsort(depths_mm)
-    depth, curve = np.asarray(depths_mm, float)[order], np.asarray(measures, float)[order]
-    span = float(np.ptp(curve)) if len(curve) else 0.0
-    if len(curve) < 3 or span == 0:
+    if len(curve) < 3:
         return []
-    padded = np.concatenate([[curve.min()], curve, [curve.min()]])
-    peaks, _ = find_peaks(padded, prominence=_LEAST_PROMINENCE * span)
-    return [_vertex(depth, curve, int(peak) - 1) for peak in peaks]
+    order = np.argsort(depths_mm)
+    depth = np.asarray(depths_mm, float)[order]
+    detail = np.array([point.detail_e2 for point in curve])[order]
+    least = max(_LEAST_PROMINENCE * float(np.ptp(detail)), _LEAST_SIGMAS * max(point.sigma_e2 for point in curve))
+    peaks = [index for index in range(len(detail)) if _prominence(detail, index) > least]
+    return [_vertex(depth, detail, peak) for peak in peaks]
 
 
-def _detail(plane: NDArray[np.floating]) -> NDArray[np.floating]:
+def _prominence(curve: NDArray[np.floating], peak: int) -> float:
+    """Return how far one must come down from a peak before going up higher; zero beside a higher neighbour."""
+    height = curve[peak]
+    lowest = []
+    for side in (curve[:peak][::-1], curve[peak + 1 :]):
+        higher = np.flatnonzero(side > height)
+        way = side[: higher[0]] if higher.size else side
+        lowest.append(way.min() if way.size else (height if higher.size else curve.min()))
+    return float(height - max(lowest))
+
+
+def _detail(plane: Image) -> Image:
     """Return the plane between the fine and the coarse scale."""
-    return np.asarray(gaussian_filter(plane, _FINE_PX) - gaussian_filter(plane, _COARSE_PX))
+    return blurred(plane, _FINE) - blurred(plane, _COARSE)
 
 
 def _vertex(depth: NDArray[np.floating], curve: NDArray[np.floating], peak: int) -> float:

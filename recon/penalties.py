@@ -36,5 +36,7 @@ def _differences(plane: Image) -> tuple[Image, Image]:
 
 def _gradient_magnitude(down: Image, right: Image, epsilon: float) -> Image:
     """Return u of eq. (3)."""
-    magnitude: Image = np.sqrt(down**2 + right**2 + down.dtype.type(epsilon))
-    return magnitude
+    magnitude: Image = np.square(down)
+    magnitude += np.square(right)
+    magnitude += magnitude.dtype.type(epsilon)
+    return np.sqrt(magnitude, out=magnitude)

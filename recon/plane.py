@@ -22,7 +22,8 @@ class PlaneGrid:
     Raises
     ------
     ValueError
-        Fewer than two samples along an axis (nothing to interpolate between), or a pitch that is not positive.
+        Fewer than two samples along an axis (nothing to interpolate between), a pitch that is not positive, or an
+        origin that is not finite.
     """
 
     shape: tuple[int, int]
@@ -34,6 +35,8 @@ class PlaneGrid:
             raise ValueError(f"a plane needs at least 2 x 2 samples, got {self.shape}; take a finer pitch_mm")
         if not (np.isfinite(self.pitch_mm) and self.pitch_mm > 0):
             raise ValueError(f"pitch_mm must be positive, got {self.pitch_mm}")
+        if not np.isfinite(self.origin_mm).all():
+            raise ValueError(f"origin_mm must be finite, got {self.origin_mm}")
 
     @classmethod
     def covering(cls, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, pitch_mm: float) -> "PlaneGrid":

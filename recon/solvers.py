@@ -9,20 +9,40 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from recon.errors import NotConverged
 from recon.images import ElementalImages, Image
 from recon.operator import PlaneOperator
 from recon.penalties import total_variation_gradient
+from recon.smoothing import blurred
 
 # |P| of eq. (3) is at most 1 + 1 + √2: two differences that cannot exceed their own magnitude, and the sum of two.
 _LARGEST_PENALTY_GRADIENT = 2 + 2**0.5
 
-_START_BLUR_PX = 2.0
+# A standard deviation of 2 samples.
+_START_BLUR = (1, 1, 1, 1, 2)
 
 # Where the mean of the views is not positive there is no light to speak of.
 _LEAST_LEVEL_E = 1e-6
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far one pass over the data moved the plane.
+
+    Attributes
+    ----------
+    passes : int
+        Passes over all views so far.
+    relative_change : float
+        ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
+    alternation : float
+        Cosine between this step and the one before: −1 when the iteration swings to and fro, 0 at the first pass.
+    """
+
+    passes: int
+    relative_change: float
+    alternation: float
 
 
 @dataclass(frozen=True)
@@ -31,20 +51,14 @@ class Iterate:
 
     Attributes
     ----------
-    passes : int
-        Passes over all views so far.
     plane : float array (row, column)
         Expected electrons per detector pixel.
-    relative_change : float
-        ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
-    alternation : float
-        Cosine between this step and the one before: −1 when the iteration swings to and fro, 0 at the first pass.
+    step : Step
+        How it differs from the iterate before; worth keeping when the plane is not.
     """
 
-    passes: int
     plane: Image
-    relative_change: float
-    alternation: float
+    step: Step
 
 
 def back_projection(
@@ -66,12 +80,13 @@ def smooth_start(operator: PlaneOperator, images: ElementalImages) -> Image:
     A multiplicative iteration can neither leave zero nor start below it. The blur weighs by coverage, so that samples
     that no view sees take the level of their neighbours.
     """
-    coverage = gaussian_filter(operator.coverage(), _START_BLUR_PX)
+    coverage = operator.coverage()
     light = operator.adjoint(images.electrons) - operator.adjoint_of_map(images.background_e)
-    light = gaussian_filter(light, _START_BLUR_PX)
     level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), _LEAST_LEVEL_E)
-    start = np.divide(light, coverage, out=np.full_like(light, level), where=coverage > 1e-3 * coverage.max())
-    return np.maximum(start, 0.01 * level)
+    coverage = blurred(coverage, _START_BLUR)
+    start = np.full_like(light, level)
+    np.divide(blurred(light, _START_BLUR), coverage, out=start, where=coverage > 1e-3 * coverage.max())
+    return np.asarray(np.maximum(start, 0.01 * level, out=start))
 
 
 def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
@@ -115,8 +130,9 @@ def pmlem_one_step_late(
         raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
     sensitivity = operator.sensitivity()
     updated = updated_samples(sensitivity, penalty_weight)
-    if 2 * np.count_nonzero(updated) < np.count_nonzero(sensitivity):
-        limit = float(np.median(sensitivity[sensitivity > 0])) / _LARGEST_PENALTY_GRADIENT
+    seen = well_seen_samples(sensitivity)
+    if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
+        limit = float(np.median(sensitivity[seen])) / _LARGEST_PENALTY_GRADIENT
         raise NotConverged(
             f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
             f"must stay below {limit:.3g}: give a smaller one"
@@ -140,10 +156,13 @@ def _one_step_late(
     while True:
         denominator = sensitivity
         if penalty_weight > 0:
-            denominator = sensitivity + plane.dtype.type(penalty_weight) * total_variation_gradient(plane, epsilon)
-        ratio = operator.adjoint_of_ratio(plane, images)
-        next_plane = plane.copy()
-        np.divide(plane * ratio, denominator, out=next_plane, where=updated)
+            denominator = total_variation_gradient(plane, epsilon)
+            denominator *= plane.dtype.type(penalty_weight)
+            denominator += sensitivity
+        next_plane = operator.adjoint_of_ratio(plane, images)
+        next_plane *= plane
+        np.divide(next_plane, denominator, out=next_plane, where=updated)
+        np.copyto(next_plane, plane, where=~updated)
         if not np.isfinite(next_plane).all():
             raise NotConverged(f"pass {passes + 1} left the finite numbers; give a smaller penalty weight")
         passes += 1
@@ -152,7 +171,12 @@ def _one_step_late(
         alternation = float(np.vdot(step, last_step)) / norms if norms > 0 else 0.0
         change = float(np.linalg.norm(step) / np.linalg.norm(plane))
         plane = next_plane
-        yield Iterate(passes, plane, change, alternation)
+        yield Iterate(plane, Step(passes, change, alternation))
+
+
+def well_seen_samples(sensitivity: Image) -> NDArray[np.bool_]:
+    """Return which samples count for a plane as a whole: those seen at least a hundredth as much as the best seen."""
+    return np.asarray(sensitivity > 0.01 * sensitivity.max())
 
 
 def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.bool_]:
@@ -160,23 +184,23 @@ def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.boo
     return np.asarray(sensitivity > _LARGEST_PENALTY_GRADIENT * penalty_weight)
 
 
-def settled(iterates: Sequence[Iterate], tolerance: float) -> bool:
+def settled(steps: Sequence[Step], tolerance: float) -> bool:
     """Return whether the last pass changed the plane by less than `tolerance`, relatively."""
-    return bool(iterates) and iterates[-1].relative_change < tolerance
+    return bool(steps) and steps[-1].relative_change < tolerance
 
 
-def oscillates(iterates: Sequence[Iterate], tolerance: float, window: int = 10) -> bool:
+def oscillates(steps: Sequence[Step], tolerance: float, window: int = 10) -> bool:
     """Return whether the iteration swings to and fro instead of settling.
 
     True when over the last `window` passes successive steps oppose each other on the whole (mean cosine below −0.5),
     are larger than `tolerance`, and do not shrink (the window's second half moves at least 0.8 times as far).
     """
-    if len(iterates) < window:
+    if len(steps) < window:
         return False
-    last = iterates[-window:]
-    changes = [iterate.relative_change for iterate in last]
+    last = steps[-window:]
+    changes = [step.relative_change for step in last]
     early, late = np.mean(changes[: window // 2]), np.mean(changes[window // 2 :])
-    alternation = np.mean([iterate.alternation for iterate in last])
+    alternation = np.mean([step.alternation for step in last])
     return bool(alternation < -0.5 and late > tolerance and late >= 0.8 * early)
 
 
@@ -188,6 +212,6 @@ def universal_penalty_weight(operator: PlaneOperator, images: ElementalImages, p
     tuning, not the best weight for a scene.
     """
     sensitivity = operator.sensitivity()
-    seen = sensitivity > 0
+    seen = well_seen_samples(sensitivity)
     per_view_e = plane[seen].mean() + np.mean(images.background_e) + np.mean(images.read_variance_e2)
     return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))

@@ -92,7 +92,7 @@ def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
 
 
 def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
-    """Return a toy airplane of 260 mm, seen from above, at x, y and a depth."""
+    """Return a toy airplane of 265 mm, seen from above, at x, y and a depth."""
     canvas = _Canvas(280, 250)
     for side in (-1, 1):
         canvas.polygon([(28, 10 * side), (-22, 116 * side), (-48, 116 * side), (-28, 10 * side)], _BLUE)

@@ -72,6 +72,7 @@ def distort(x: Points, y: Points, distortion: tuple[float, ...]) -> tuple[Points
     )
 
 
+@np.errstate(all="ignore")  # where the lens folds, points run off and never converge
 def _undistort(x_image: Points, y_image: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:
     """Invert `distort` by Newton's method with a Jacobian from central differences."""
     x, y = x_image.copy(), y_image.copy()

@@ -1,0 +1,78 @@
+"""Homographies against points of the plane carried through space."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+
+poses = st.integers(0, 2**32 - 1).map(
+    lambda seed: np.random.default_rng(seed).uniform(-1, 1, (3, 6)) * np.repeat([0.5, 200.0], 3)
+)
+planes = st.tuples(st.integers(0, 2**32 - 1), st.sampled_from([60.0, 500.0, 50_000.0])).map(
+    lambda drawn: np.append(np.random.default_rng(drawn[0]).uniform(-1, 1, 5) * [0.9, 0.9, 3.1, 50, 50], drawn[1])
+)
+POINTS_MM = np.random.default_rng(1).uniform(-80, 80, (40, 2))
+
+
+def in_camera(rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Carry the points from the plane to the reference and on to the camera, (point, 3)."""
+    in_ref = Rotation.from_rotvec(rt_ref_plane[:3]).apply(np.pad(POINTS_MM, ((0, 0), (0, 1)))) + rt_ref_plane[3:]
+    return Rotation.from_rotvec(rt_cam_ref[:3]).apply(in_ref) + rt_cam_ref[3:]
+
+
+@given(rt_cam_ref=poses, rt_ref_plane=planes)
+def test_the_ray_to_a_point_is_mapped_to_that_point_with_the_sign_of_its_depth(
+    rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.float64]
+) -> None:
+    for homography, rt in zip(plane_from_ray(rt_cam_ref, rt_ref_plane), rt_cam_ref, strict=True):
+        points = in_camera(rt, rt_ref_plane)
+        depths_mm = points[:, 2]
+        mapped = (points / points[:, 2:]) @ homography.T
+        np.testing.assert_allclose(mapped[:, 2], 1 / depths_mm, rtol=1e-7)
+        np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], POINTS_MM, rtol=1e-7, atol=1e-6)
+
+
+def test_a_plane_behind_the_camera_has_negative_scale() -> None:
+    behind = plane_from_ray(np.array([[0.0, 0, 0, 0, 0, -900]]), fronto_parallel_rt_ref_plane(500.0))
+    turned_away = plane_from_ray(np.array([[0.0, np.pi, 0, 0, 0, 0]]), fronto_parallel_rt_ref_plane(500.0))
+    for homography in (*behind, *turned_away):
+        assert (homography @ [0.0, 0.0, 1.0])[2] < 0
+
+
+def test_a_plane_seen_from_its_back_keeps_positive_scale() -> None:
+    from_behind = np.array([0.0, np.pi, 0.0, 0.0, 0.0, 500.0])
+    column, row, scale = plane_from_ray(np.zeros((1, 6)), from_behind)[0] @ [0.1, 0.2, 1.0]
+    assert scale > 0
+    assert (column / scale, row / scale) == pytest.approx((-50.0, 100.0))
+
+
+@pytest.mark.parametrize("plane", [[0, 0, 0, 0, 0, 0.0], [0, np.pi / 2, 0, 0, 0, 500.0]], ids=["through", "edge on"])
+def test_a_camera_within_the_plane_sees_nothing_of_it(plane: list[float]) -> None:
+    np.testing.assert_array_equal(plane_from_ray(np.zeros((1, 6)), np.array(plane)), np.zeros((1, 3, 3)))
+
+
+def test_the_plane_across_the_axis_is_the_textbook_inverse() -> None:
+    rt = np.array([0.1, -0.2, 0.3, 40.0, -30.0, 20.0])
+    rotation = Rotation.from_rotvec(rt[:3]).as_matrix()
+    direct = np.column_stack([rotation[:, 0], rotation[:, 1], 700.0 * rotation[:, 2] + rt[3:]])
+    homography = plane_from_ray(rt[np.newaxis], fronto_parallel_rt_ref_plane(700.0))[0]
+    np.testing.assert_allclose(homography @ direct, np.eye(3), atol=1e-12)
+
+
+@given(rt_cam_ref=poses)
+def test_a_view_with_a_principal_point_of_its_own_sees_what_the_camera_matrix_says(
+    rt_cam_ref: NDArray[np.float64],
+) -> None:
+    f_px, centre, centres = 800.0, np.array([319.5, 239.5]), np.array([[330.0, 250.0], [319.5, 239.5], [100.0, -20.0]])
+    rt_ref_plane = fronto_parallel_rt_ref_plane(500.0)
+    homographies = plane_from_ray(rt_cam_ref, rt_ref_plane, (centre - centres) / f_px)
+    for homography, rt, own_centre in zip(homographies, rt_cam_ref, centres, strict=True):
+        points = in_camera(rt, rt_ref_plane)
+        pixels = f_px * points[:, :2] / points[:, 2:] + own_centre
+        rays = np.column_stack([(pixels - centre) / f_px, np.ones(len(pixels))])  # as the shared ray map has them
+        mapped = rays @ homography.T
+        np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], POINTS_MM, rtol=1e-8, atol=1e-8)

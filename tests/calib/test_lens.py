@@ -1,0 +1,106 @@
+"""Rays against OpenCV's projection, and against the simulated world's own inversion."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.errors import LensNotInvertible
+from calib.lens import Lens
+from rig.simulation.optics import SimulatedOptics
+
+DISTORTIONS: list[tuple[float, ...]] = [
+    (),
+    (-0.2,),
+    (0.15, -0.05),
+    (-0.2, 0.05, 1e-3, -2e-3),
+    (-0.2, 0.05, 1e-3, -2e-3, 0.01),
+    (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3),
+    (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3, -0.05, 0.01),
+]
+
+
+def lens_of(distortion: tuple[float, ...]) -> Lens:
+    return Lens((61, 43), 70.0, 72.5, 28.4, 22.1, distortion)
+
+
+@pytest.mark.parametrize("distortion", DISTORTIONS)
+def test_opencv_projects_every_pixels_ray_onto_that_pixel(distortion: tuple[float, ...]) -> None:
+    rays = lens_of(distortion).rays().reshape(-1, 2)
+    matrix = np.array([[70.0, 0, 28.4], [0, 72.5, 22.1], [0, 0, 1]])
+    padded = np.array([*distortion, *[0.0] * (8 - len(distortion))])
+    points = np.column_stack([7 * rays, np.full(len(rays), 7.0)])
+    pixels, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, padded)
+    rows, columns = np.divmod(np.arange(61 * 43), 61)
+    np.testing.assert_allclose(pixels[:, 0], np.column_stack([columns, rows]), atol=1e-8)
+
+
+@pytest.mark.parametrize("distortion", DISTORTIONS)
+def test_rays_are_those_of_the_simulated_optics(distortion: tuple[float, ...]) -> None:
+    simulated = SimulatedOptics((61, 43), 70.0, 72.5, 28.4, 22.1, distortion).rays()
+    np.testing.assert_allclose(lens_of(distortion).rays(), simulated, atol=1e-7)
+
+
+def test_without_distortion_a_ray_is_the_pixel_from_the_principal_point_in_focal_lengths() -> None:
+    rays = lens_of((0.0, 0.0)).rays()
+    np.testing.assert_allclose(rays[10, 40], [(40 - 28.4) / 70.0, (10 - 22.1) / 72.5], rtol=1e-14)
+
+
+@given(
+    distortion=st.sampled_from(DISTORTIONS),
+    first=st.tuples(st.integers(0, 5), st.integers(0, 5)),
+    step=st.tuples(st.integers(1, 4), st.integers(1, 4)),
+)
+def test_a_lattice_is_a_slice_of_the_full_map(
+    distortion: tuple[float, ...], first: tuple[int, int], step: tuple[int, int]
+) -> None:
+    lens = lens_of(distortion)
+    full = lens.rays()[first[0] :: step[0], first[1] :: step[1]]
+    np.testing.assert_allclose(lens.rays(first, step), full, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        (-0.9,),  # radius 1 − 0.9 r² turns back at r = 0.61, before the corners
+        (-0.3, 0, 0.8, 0.0),
+        (0.0, 0.0, 0.0, 0.0, 0.0, 3.0),  # 1 / (1 + 3 r²) has a largest image radius
+        (0.1, 0.0, 0.0, 0.0, -9.0),
+    ],
+)
+def test_a_lens_that_folds_within_the_detector_is_refused(distortion: tuple[float, ...]) -> None:
+    with pytest.raises(LensNotInvertible, match=r"cannot be undone over the 61 x 43 px detector"):
+        lens_of(distortion).rays()
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_a_lens_is_either_refused_or_keeps_neighbours_in_order(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    distortion = tuple(generator.normal(size=8) * [0.5, 0.5, 0.05, 0.05, 0.5, 0.5, 0.5, 0.5])
+    try:
+        rays = lens_of(distortion).rays()
+    except LensNotInvertible:
+        return
+    right, down = np.diff(rays, axis=1)[:-1], np.diff(rays, axis=0)[:, :-1]
+    assert (right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0] > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"fx_px": 0.0}, "focal lengths"),
+        ({"fy_px": -70.0}, "focal lengths"),
+        ({"cx_px": np.nan}, "finite"),
+        ({"distortion": (np.inf,)}, "finite"),
+        ({"distortion": (0.0,) * 9}, "at most 8"),
+        ({"size_px": (0, 43)}, "size_px"),
+    ],
+)
+def test_numbers_of_no_lens_are_refused(changed: dict[str, Any], words: str) -> None:
+    good: dict[str, Any] = {"size_px": (61, 43), "fx_px": 70.0, "fy_px": 70.0, "cx_px": 30.0, "cy_px": 21.0}
+    Lens(**good)
+    with pytest.raises(ValueError, match=words):
+        Lens(**{**good, **changed})

@@ -1,0 +1,64 @@
+"""What describes a plane and the images of a scene, and what it refuses."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recon.images import ElementalImages
+from recon.plane import PlaneGrid
+
+
+def test_sample_indices_count_pitches_from_the_first_samples_centre() -> None:
+    grid = PlaneGrid((3, 5), 0.5, (-1.0, 2.0))
+    column, row, one = grid.index_from_plane() @ [0.0, 3.0, 1.0]
+    assert (column, row, one) == (2.0, 2.0, 1.0)
+
+
+def test_a_grid_covering_a_rectangle_tiles_it_with_squares() -> None:
+    grid = PlaneGrid.covering(-10.0, -4.0, 10.0, 4.0, 0.5)
+    assert grid == PlaneGrid((16, 40), 0.5, (-9.75, -3.75))
+
+
+@pytest.mark.parametrize(
+    ("shape", "pitch_mm", "words"),
+    [
+        ((1, 5), 1.0, "at least 2 x 2"),
+        ((5, 0), 1.0, "at least 2 x 2"),
+        ((5, 5), 0.0, "pitch_mm"),
+        ((5, 5), -1.0, "pitch_mm"),
+        ((5, 5), float("nan"), "pitch_mm"),
+        ((5, 5), float("inf"), "pitch_mm"),
+    ],
+)
+def test_grids_without_area_are_refused(shape: tuple[int, int], pitch_mm: float, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        PlaneGrid(shape, pitch_mm, (0.0, 0.0))
+
+
+@pytest.mark.parametrize("origin_mm", [(float("nan"), 0.0), (0.0, float("inf"))])
+def test_grids_that_lie_nowhere_are_refused(origin_mm: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="origin_mm"):
+        PlaneGrid((5, 5), 1.0, origin_mm)
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"electrons": np.zeros((3, 4))}, "view, row, column"),
+        ({"valid": np.ones((2, 4, 3), bool)}, "valid has shape"),
+        ({"lattice_of_view": np.zeros(3, int)}, "not one entry per view"),
+        ({"electrons": np.where(np.arange(24) == 17, np.nan, 0.0).reshape(2, 3, 4)}, "view 1 has 1 pixels"),
+        ({"electrons": np.full((2, 3, 4), np.inf)}, "view 0 has 12 pixels"),
+    ],
+)
+def test_images_that_do_not_fit_or_are_not_numbers_are_refused(parts: dict[str, Any], words: str) -> None:
+    ElementalImages(np.zeros((2, 3, 4)))
+    with pytest.raises(ValueError, match=words):
+        ElementalImages(**{"electrons": np.zeros((2, 3, 4)), **parts})
+
+
+def test_pixels_that_do_not_count_may_hold_anything() -> None:
+    electrons, valid = np.zeros((2, 3, 4)), np.ones((2, 3, 4), bool)
+    electrons[1, 2, 0], valid[1, 2, 0] = np.nan, False
+    assert np.isnan(ElementalImages(electrons, valid=valid).electrons[1, 2, 0])
