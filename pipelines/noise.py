@@ -11,11 +11,14 @@ from calib.noise import NoiseCalibration, calibrate
 from pipelines.console import say
 from pipelines.errors import MissingFile
 from pipelines.files import sha256, write_json, write_whole
-from pipelines.noise_frames import read_series
+from pipelines.noise_frames import Plane, read_series
 from pipelines.noise_page import draw_page
 from pipelines.noise_result import MAPS_FILE, RESULT_FILE, STANDARD, maps_of, result_of, write_maps
 from pipelines.noise_set import FILE_NAME, load_noise_set, temperature_notes
 from pipelines.provenance import provenance
+
+# By so much the masked pixels' mean may differ from the others' in a sound camera.
+_BLACK_TOLERANCE_DN = 2.0
 
 _SHOWN = (
     ("gain_dn_per_e", "K, system gain", "DN/e-"),
@@ -46,7 +49,7 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     folder, settings = load_noise_set(folder)
     out = out or folder
     readout = read_series(folder, settings)
-    calibrations = [_calibrate_plane(plane.name, plane.series, readout.saturation_dn) for plane in readout.planes]
+    calibrations = [_calibrate_plane(plane, readout.saturation_dn) for plane in readout.planes]
     temperature_c, doubts = temperature_notes(settings)
     doubts += [warning for calibration in calibrations for warning in calibration.warnings]
     inputs = {name: sha256(folder / name) for name in [FILE_NAME, *(frame.file for frame in settings.frame)]}
@@ -67,14 +70,29 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     return result
 
 
-def _calibrate_plane(name: str, series: list[Any], saturation_dn: float) -> NoiseCalibration:
+def _calibrate_plane(plane: Plane, saturation_dn: float) -> NoiseCalibration:
     """Calibrate one colour phase, whose name goes into what is said about it."""
+    prefix = f"plane {plane.name}: " if plane.name else ""
     try:
-        calibration = calibrate(series, saturation_dn)
+        calibration = calibrate(plane.series, saturation_dn)
     except CalibrationError as failure:
-        raise type(failure)(f"plane {name}: {failure}" if name else str(failure)) from failure
-    prefix = f"plane {name}: " if name else ""
-    return replace(calibration, warnings=tuple(prefix + warning for warning in calibration.warnings))
+        raise type(failure)(f"{prefix}{failure}") from failure
+    doubts = [*calibration.warnings, *_black_level_doubts(plane, calibration)]
+    return replace(calibration, warnings=tuple(prefix + doubt for doubt in doubts))
+
+
+def _black_level_doubts(plane: Plane, calibration: NoiseCalibration) -> list[str]:
+    """Return a warning where masked pixels and covered ones disagree on what is black."""
+    offset = calibration.estimates["offset_dn"]
+    if not plane.black_dn or offset.value is None:
+        return []
+    black_dn = sum(plane.black_dn) / len(plane.black_dn)
+    if abs(offset.value - black_dn) <= _BLACK_TOLERANCE_DN + 3 * (offset.se or 0.0):
+        return []
+    return [
+        f"the darks' offset is {offset.value:.1f} DN, the black level that the files bring {black_dn:.1f} DN (at most "
+        f"{_BLACK_TOLERANCE_DN:g} DN apart is usual); the lens was not quite covered, or the amplifier glows"
+    ]
 
 
 def _tell(out: Path, result: dict[str, Any]) -> None:

@@ -26,12 +26,15 @@ class Plane:
         Letter of its filter, "" without filters.
     series : list of Series
         Statistics of its pixels.
+    black_dn : list of float
+        Black level that each dark's file brings, from the sensor's masked pixels where it has any.
     """
 
     phase: tuple[int, int]
     period: tuple[int, int]
     colour: str
     series: list[Series] = field(default_factory=list)
+    black_dn: list[float] = field(default_factory=list)
 
     @property
     def name(self) -> str:
@@ -84,9 +87,12 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
     for index, (conditions, path) in enumerate(progress(frames, "reading frames")):
         if index == 0 or conditions != frames[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.planes]
-        pixels = _checked(read_frame(path), path, readout)[readout.rows, readout.columns]
+        frame = read_frame(path)
+        pixels = _checked(frame, path, readout)[readout.rows, readout.columns]
         for plane, plane_sums in zip(readout.planes, sums, strict=True):
             plane_sums.add(str(path), plane.of(pixels))
+            if conditions.kind == "dark" and frame.black_dn is not None:
+                plane.black_dn.append(float(frame.black_dn[plane.phase]))
         if index + 1 == len(frames) or conditions != frames[index + 1][0]:
             for plane, plane_sums in zip(readout.planes, sums, strict=True):
                 plane.series.append(plane_sums.series())

@@ -47,7 +47,12 @@ def result_of(readout: Readout, calibrations: Sequence[NoiseCalibration]) -> dic
     if readout.mosaic is not None:
         result["mosaic"] = list(readout.mosaic)
         result["planes"] = [
-            {"phase": list(plane.phase), "colour": plane.colour, "likelihood": str(c.likelihood)}
+            {
+                "phase": list(plane.phase),
+                "colour": plane.colour,
+                "likelihood": str(c.likelihood),
+                "masked_black_dn": float(np.mean(plane.black_dn)) if plane.black_dn else None,
+            }
             | {name: _as_json(estimate) for name, estimate in c.estimates.items()}
             for plane, c in zip(readout.planes, calibrations, strict=True)
         ]

@@ -12,7 +12,7 @@ import tifffile
 from pipelines.cli import run
 from pipelines.elemental_set import read_noise_json
 from pipelines.errors import BadValue
-from pipelines.frames import exif_exposure_s
+from pipelines.frames import Frame, exif_exposure_s
 from pipelines.noise import noise
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import take_set, write_frames
@@ -239,14 +239,34 @@ def test_a_real_ccd_comes_out_as_published(tmp_path: Path) -> None:
 
 
 @needs_data
-def test_a_raw_frame_brings_its_exposure_and_its_mosaic(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_raw_file_brings_its_mosaic_but_not_always_its_exposure(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """This one's EXIF states no exposure; the decoder would make it 1 s."""
     raw = Path(str(DATA)) / "raw" / "colorchart.dng"
-    exposure_s = exif_exposure_s(raw)
+    assert exif_exposure_s(raw) is None
     (tmp_path / "one.dng").write_bytes(raw.read_bytes())
-    (tmp_path / "noise.toml").write_text('format = 1\n[[frame]]\nfile = "one.dng"\nkind = "dark"\n')
-    line = fails(tmp_path, capfd)
-    if exposure_s is None:
-        assert "one.dng: its exposure is neither stated nor in its EXIF" in line
-    else:
-        assert "TooFewFrames: plane" in line
-        assert f"the darks of {exposure_s:g} s" in line
+    entry = 'format = 1\n[[frame]]\nfile = "one.dng"\nkind = "dark"\n'
+    (tmp_path / "noise.toml").write_text(entry)
+    assert "one.dng: its exposure is neither stated nor in its EXIF" in fails(tmp_path, capfd)
+    (tmp_path / "noise.toml").write_text(entry + "exposure_s = 0.5\n")
+    assert "TooFewFrames: plane R_r0c0" in (line := fails(tmp_path, capfd))
+    assert "one.dng: the only one of the darks of 0.5 s" in line
+
+
+def raw_like(path: Path) -> Frame:
+    """Return a TIFF as if it were a raw file with masked pixels and EXIF."""
+    level = np.array([[100.0, 100.0], [100.0, 140.0]])
+    return Frame(tifffile.imread(path), ("RG", "GB"), level, 4095.0, 1.0)
+
+
+def test_masked_pixels_that_disagree_with_the_darks_raise_a_doubt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.noise_frames.read_frame", raw_like)
+    result = noise(write_frames(tmp_path, take_set(*specimen(16, shape=(96, 96)))))
+    assert [plane["masked_black_dn"] for plane in result["planes"]] == [100, 100, 100, 140]
+    assert result["saturation_dn"] == 4095
+    doubts = [warning for warning in result["warnings"] if "black level that the files bring" in warning]
+    assert len(doubts) == 1
+    assert doubts[0].startswith("plane B_r1c1: the darks' offset is ")
