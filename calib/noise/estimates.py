@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from calib.noise.fitting import Fitted
 from calib.noise.gaussian import Fit, dark_variances_dn2
 from calib.noise.moments import Moments
 from calib.noise.response import Response, quantum_efficiency
@@ -25,62 +26,49 @@ _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of satur
 
 
 def estimate_all(
-    fit: Fit,
-    moments: Moments,
-    darks: Sequence[Series],
-    flats: Sequence[Series],
-    *,
-    bend: Fit | None,
-    response: Response | None,
-    levels_hold: bool,
-    noise_holds: bool,
+    fitted: Fitted, response: Response | None, *, levels_hold: bool, noise_holds: bool
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return every quantity, and the covariance of offset, gain, read noise and dark current.
 
     Parameters
     ----------
-    fit : Fit
-        The parameters.
-    moments : Moments
-        What they were fitted to.
-    darks, flats : sequence of Series
-        What the moments were gathered from.
-    bend : Fit, optional
-        The fit that allowed for a bent response.
+    fitted : Fitted
+        The fit and what it rests on.
     response : Response, optional
         What flats told.
     levels_hold, noise_holds : bool
         Whether the dark levels lie on a straight line over exposure time, and the noise of all series on eq. (1).
     """
-    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, moments)
-    why_no_gain = _why_no_gain(fit, from_darks=not flats, holds=levels_hold and noise_holds)
-    why_no_current = _why_no_current(fit, moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
-    transforms = _transforms(fit)
+    fit, darks = fitted.fit, fitted.darks
+    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
+    why_no_gain = _why_no_gain(fit, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+    why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
         "offset_dn": None,
         "gain_dn_per_e": why_no_gain,
         "read_noise_e": why_no_gain,
         "dark_current_e_per_s": why_no_current,
     }
-    estimates: dict[str, Estimate] = {}
+    estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
+    gain = estimates["gain_dn_per_e"]
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fit, gain, why_no_gain, quantile)
+    estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
+    return estimates | _from_flats(fitted, gain, response, quantile), covariance
+
+
+def _in_electrons(
+    fit: Fit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
+) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return the four main quantities, those with a reason why not left out of the covariance."""
+    transforms = _transforms(fit)
     known = tuple(name for name, why in whys.items() if why is None)
     jacobian = np.array([transforms[name][1] for name in known])
     covariance = jacobian @ fit.covariance @ jacobian.T
-    for name, why in whys.items():
-        if why is not None:
-            estimates[name] = Estimate(None, why=why)
-            continue
-        se = float(np.sqrt(covariance[known.index(name), known.index(name)]))
-        positive = name in ("gain_dn_per_e", "read_noise_e")
-        by_levels = not (positive and flats)
-        estimates[name] = _interval(
-            transforms[name][0], se, levels_quantile if by_levels else quantile, positive=positive
-        )
-    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(
-        fit, estimates["gain_dn_per_e"], why_no_gain, quantile
-    )
-    estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
-    estimates |= _from_flats(fit, flats, moments, estimates["gain_dn_per_e"], bend, response, quantile)
+    estimates = {name: Estimate(None, why=why) for name, why in whys.items()}
+    for index, name in enumerate(known):
+        se, positive = float(np.sqrt(covariance[index, index])), name in ("gain_dn_per_e", "read_noise_e")
+        quantile = gain_quantile if positive else levels_quantile
+        estimates[name] = _interval(transforms[name][0], se, quantile, positive=positive)
     return estimates, (known, covariance)
 
 
@@ -238,30 +226,23 @@ def _profiles(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, E
     }
 
 
-def _from_flats(
-    fit: Fit,
-    flats: Sequence[Series],
-    moments: Moments,
-    gain: Estimate,
-    bend: Fit | None,
-    response: Response | None,
-    quantile: float,
-) -> dict[str, Estimate]:
+def _from_flats(fitted: Fitted, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
     """Return what only flats tell."""
     prnu = Estimate(None, why=_NO_FLATS)
     if response is not None:
         prnu = _interval(response.prnu, response.prnu_se, quantile)
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
-    if bend is not None:
+    if (bend := fitted.bend) is not None:
         se = bend.standard_error("nonlinearity_per_dn")
         nonlinearity = _interval(bend.values["nonlinearity_per_dn"], se, quantile)
     efficiency = Estimate(None, why="no flat states its photons per pixel (`photons` in noise.toml)")
     if gain.value is not None:
-        charges = [_light_e(fit, one, mean) for one, mean in zip(flats, moments.flats.mean_dn, strict=True)]
-        found = quantum_efficiency(flats, charges, fit.standard_error("log_gain"))
+        means_dn = fitted.moments.flats.mean_dn
+        charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]
+        found = quantum_efficiency(fitted.flats, charges, fitted.fit.standard_error("log_gain"))
         if found is not None:
             efficiency = _interval(*found, quantile, positive=True)
-    elif flats:
+    elif fitted.flats:
         efficiency = Estimate(None, why=gain.why)
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
 

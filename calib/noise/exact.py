@@ -31,7 +31,7 @@ _CHUNK_PX = 2048
 _MOST_STEPS = 80
 
 # Spreads of the dark current to try, relative, and by how much one must raise ln L to be believed.
-_TRIED_DCNU, _CONVINCING = (0.05, 0.15, 0.4), 4.0
+_TRIED_DCNU, _CONVINCING = (0.08, 0.3), 4.0
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ _LEAK_SURELY, _LEAK_FRACTION, _LEAK_CHANCE = 5.0, 0.25, 1e-7
 _SATURATED_FRACTION, _SATURATED_PX = 1e-3, 10
 
 # The exact likelihoods and the histograms need the values themselves; so many pixels are kept, spread evenly.
-SAMPLE_PX = 16_384
+SAMPLE_PX = 65_536
 
 
 @dataclass(frozen=True)
