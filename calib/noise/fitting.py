@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from calib.noise.exact import fit_exact
 from calib.noise.gaussian import Fit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
 from calib.noise.moments import Moments, gather_moments
-from calib.noise.selection import Likelihood, censored_start, choose_likelihood, collect_counts, gaussian_start
+from calib.noise.selection import (
+    Likelihood,
+    censored_start,
+    choose_likelihood,
+    collect_counts,
+    gaussian_start,
+    shared_noise_dn2,
+)
 from calib.noise.statistics import Series
 
 
@@ -75,7 +82,7 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
     fit, bend = _fit_gaussian(moments)
     # Among values cut off at the floor the highest look suspect, and leaving them out would bias the rest.
     counts = collect_counts(darks, usable)
-    likelihood = choose_likelihood(counts, fit)
+    likelihood = choose_likelihood(counts, fit, shared_noise_dn2(darks, fit))
     if likelihood is not Likelihood.GAUSSIAN:
         exact = likelihood is Likelihood.EXACT
         if exact:

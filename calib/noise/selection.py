@@ -13,11 +13,14 @@ from scipy.special import ndtri
 
 from calib.errors import NotIdentifiable
 from calib.noise.exact import Counts
-from calib.noise.gaussian import Fit
+from calib.noise.gaussian import Fit, dark_variances_dn2
 from calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.
 _SUBTLE_READ_E, _SUBTLE_READ_DN = 1.0, 0.5
+
+# Noise that pixels share, as a fraction of the read noise variance, from which single electrons are not to be seen.
+_MOST_SHARED = 0.03
 
 # So many of the values, on the lowest one and more than on the next, are values cut off there.
 _CUT_OFF_FRACTION = 2e-3
@@ -45,8 +48,31 @@ def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
     return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
 
 
-def choose_likelihood(counts: Counts, gaussian: Fit) -> Likelihood:
-    """Return the simplest likelihood that the frames allow."""
+def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
+    """Return the variance that frames, rows and columns add to all their pixels at once."""
+    several = [one for one in darks if one.frames > 1]
+    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in several]))
+    rows, columns = darks[0].pattern_dn.shape
+    banding = [
+        one.row_noise_dn2 + one.column_noise_dn2 - float(v) * (1 / columns + 1 / rows)
+        for one, v in zip(several, noise, strict=True)
+    ]
+    return gaussian.values["jitter_dn2"] + max(float(np.mean(banding)), 0.0)
+
+
+def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likelihood:
+    """Return the simplest likelihood that the frames allow.
+
+    Parameters
+    ----------
+    counts : Counts
+        The values, with their floor where they are cut off.
+    gaussian : Fit
+        What the Gaussian likelihood makes of them.
+    shared_dn2 : float
+        Noise that pixels share. It blurs single electrons and has no part in the exact likelihood, so that with more
+        than a little of it the Gaussian is the better one.
+    """
     widest = max(int(np.ptp(values)) for values in counts.values_dn)
     exposures = len(set(counts.exposure_s))
     if widest > MOST_VALUES_DN or exposures < 2:
@@ -56,6 +82,8 @@ def choose_likelihood(counts: Counts, gaussian: Fit) -> Likelihood:
     telling = gaussian.standard_error("log_gain") < 0.5 and gaussian.values["dark_signal_dn_per_s"] > 0
     if counts.floor_dn is not None:
         return Likelihood.CENSORED
+    if shared_dn2 > _MOST_SHARED * read_dn**2:
+        return Likelihood.GAUSSIAN
     if read_dn < _SUBTLE_READ_DN or (telling and read_e < _SUBTLE_READ_E):
         return Likelihood.EXACT
     return Likelihood.GAUSSIAN
