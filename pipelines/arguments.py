@@ -4,17 +4,25 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+# Nothing that is measured here is larger, and numbers up to it overflow nowhere.
+_MOST = 1e9
 
-def _at_least(limit: float) -> Parameter:
-    """Return the check that a number is not below a limit."""
 
-    def check(_: Any, value: float | None) -> None:
-        if value is not None and not value >= limit:
-            raise ValueError(f"Must be at least {limit:g}, got {value:g}.")
+def _within(least: float, most: float = _MOST) -> Parameter:
+    """Return the check that a number, or each of a tuple, lies within limits."""
+
+    def check(_: Any, value: float | tuple[float, ...] | None) -> None:
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not least <= number <= most:
+                limits = f"at least {least:g}" if number < least else f"a number of at most {most:g}"
+                raise ValueError(f"Must be {limits}, got {number:g}.")
 
     return Parameter(validator=check)
 
 
-type Count = Annotated[int, _at_least(1)]
-type Positive = Annotated[float, _at_least(1e-9)]
-type NotNegative = Annotated[float, _at_least(0)]
+type Count = Annotated[int, _within(1)]
+type Seed = Annotated[int, _within(0)]
+type Positive = Annotated[float, _within(1e-9)]
+type NotNegative = Annotated[float, _within(0)]
+type Fraction = Annotated[float, _within(1e-9, 1)]
+type SizePx = Annotated[tuple[int, int], _within(2)]

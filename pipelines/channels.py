@@ -117,7 +117,6 @@ def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
         background_e=_stacked([noise.background_e(exposure_s) for noise in noises], shape),
         read_variance_e2=_stacked([noise.read_variance_e2() for noise in noises], shape),
         valid=_valid(electrons.shape, saturated),
-        lattice_of_view=np.tile(np.arange(phases), views),
     )
 
 
@@ -184,20 +183,23 @@ def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None
     Raises
     ------
     GeometryMismatch
-        The plane is not in front of the camera.
+        The plane is not in front of the camera, or a pitch leaves it without samples.
     """
     require_in_front(depth_mm)
     camera = loaded.settings.camera
     cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
-    return PlaneGrid.covering(
-        left_mm=(-0.5 - cx_px) * mm_per_px_x,
-        top_mm=(-0.5 - cy_px) * mm_per_px_y,
-        right_mm=(width - 0.5 - cx_px) * mm_per_px_x,
-        bottom_mm=(height - 0.5 - cy_px) * mm_per_px_y,
-        pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
-    )
+    try:
+        return PlaneGrid.covering(
+            left_mm=(-0.5 - cx_px) * mm_per_px_x,
+            top_mm=(-0.5 - cy_px) * mm_per_px_y,
+            right_mm=(width - 0.5 - cx_px) * mm_per_px_x,
+            bottom_mm=(height - 0.5 - cy_px) * mm_per_px_y,
+            pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
+        )
+    except ValueError as failure:
+        raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
 
 
 class OperatorFactory:
@@ -222,7 +224,7 @@ class OperatorFactory:
             grid,
             flat=self._response,
             valid=self._images.valid,
-            lattice_of_view=self._images.lattice_of_view,
+            lattice_of_view=np.tile(np.arange(self._phases), len(homographies)),
         )
 
 

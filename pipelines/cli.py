@@ -29,6 +29,8 @@ app = App(
     default_parameter=Parameter(negative=()),
     result_action="return_value",
 )
+# `run` says in one line what an interrupt leaves behind.
+app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 
 
 for _command in (

@@ -9,7 +9,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from pipelines.arguments import NotNegative, Positive
+from pipelines.arguments import Fraction, NotNegative, Positive, Seed
 from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION, brightness
 from pipelines.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from pipelines.console import progress, say
@@ -30,11 +30,11 @@ def darken(
     /,
     *,
     snr: Positive = 0.16,
-    seed: int = 1,
+    seed: Seed = 1,
     exposure_s: Positive = 0.1,
     read_noise_e: NotNegative = _PAPER.read_noise_e,
     dark_current_e_per_s: NotNegative = _PAPER.dark_current_e_per_s,
-    quantum_efficiency: Positive = _PAPER.quantum_efficiency,
+    quantum_efficiency: Fraction = _PAPER.quantum_efficiency,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Make a dark set from a bright one: the same views with a few photons per pixel.

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from pipelines.arguments import Positive, Seed
 from pipelines.console import say
 from pipelines.elemental_set import FILE_NAME
 from pipelines.files import check_free, write_json
@@ -15,7 +16,7 @@ _DEPTHS_MM = [500.0, 700.0]
 _DARK_SCENE = "dark-scene"
 
 
-def demo(out: Path = Path("demo"), /, *, snr: float = 0.16, seed: int = 1) -> dict[str, Any]:
+def demo(out: Path = Path("demo"), /, *, snr: Positive = 0.16, seed: Seed = 1) -> dict[str, Any]:
     """Run the paper's experiment: simulate it in the dark, reconstruct both objects, and draw the report.
 
     Parameters

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from pipelines.arguments import NotNegative, Positive
+from pipelines.arguments import Count, Fraction, NotNegative, Positive
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
 from pipelines.errors import BadValue, InputError, MissingFile, WrongSize
@@ -39,15 +39,15 @@ def import_grid(
     *,
     pitch_mm: Positive | None = None,
     fx_px: Positive | None = None,
-    disparity_px: float = 0.0,
-    rows: int | None = None,
-    columns: int | None = None,
+    disparity_px: NotNegative = 0.0,
+    rows: Count | None = None,
+    columns: Count | None = None,
     exposure_s: Positive | None = None,
     offset_dn: float | None = None,
     gain_dn_per_e: Positive = 1.0,
     read_noise_e: NotNegative = 0.0,
     dark_current_e_per_s: NotNegative = 0.0,
-    quantum_efficiency: Positive = 1.0,
+    quantum_efficiency: Fraction = 1.0,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Make an elemental set from pictures taken on a regular grid.

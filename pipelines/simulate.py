@@ -7,10 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.arguments import Count, NotNegative, Positive
+from pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
 from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
+from pipelines.errors import BadValue
 from pipelines.files import building_folder, write_json
 from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
 from pipelines.provenance import provenance
@@ -40,11 +41,11 @@ def simulate(
     /,
     *,
     snr: Positive = 0.16,
-    seed: int = 1,
+    seed: Seed = 1,
     rows: Count = 7,
     columns: Count = 7,
     pitch_mm: Positive = 50.0,
-    size_px: tuple[int, int] = (640, 480),
+    size_px: SizePx = (640, 480),
     exposure_s: Positive = 0.1,
     position_error_mm: NotNegative = 0.3,
     rotation_error_mrad: NotNegative = 3.5,
@@ -95,6 +96,8 @@ def simulate(
         rendered = _render(experiment, experiment.poses_rt_cam_ref(*errors, generator), mosaic)
         sensor = experiment.sensor
         dark_e = sensor.dark_current_e_per_s * exposure_s
+        if not rendered.object_region.any():
+            raise BadValue(f"--size-px {size_px[0]} {size_px[1]}: the objects cover no pixel; give more pixels")
         scale = signal_scale_for_snr(
             rendered.views[experiment.reference_view][rendered.object_region], snr, dark_e, sensor.read_noise_e
         )

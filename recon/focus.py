@@ -15,7 +15,7 @@ from recon.solvers import back_projection
 _FINE = (1, 1)
 _COARSE = (1, 1, 1, 1, 2, 2, 2, 4)
 
-_LEAST_PROMINENCE, _LEAST_SIGMAS = 0.1, 6.0
+_LEAST_PROMINENCE, _LEAST_SIGMAS = 0.1, 5.0
 
 # Over so many samples (2π times the fine scale squared) a product of two smoothed noises repeats itself.
 _CORRELATED_SAMPLES = 2 * np.pi
@@ -56,14 +56,16 @@ def focus_measure(
 def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[Focus]) -> list[float]:
     """Return the depths at which a focus curve peaks, each refined by a parabola through its neighbours.
 
-    A peak counts when it stands out by a tenth of the curve's range and by six standard deviations of the noise.
+    A peak counts when it stands out by a tenth of the curve's range and by five standard deviations of the noise, the
+    median of what the depths say of it (where something is sharp, that itself adds to the spread).
     """
     if len(curve) < 3:
         return []
     order = np.argsort(depths_mm)
     depth = np.asarray(depths_mm, float)[order]
     detail = np.array([point.detail_e2 for point in curve])[order]
-    least = max(_LEAST_PROMINENCE * float(np.ptp(detail)), _LEAST_SIGMAS * max(point.sigma_e2 for point in curve))
+    noise_e2 = float(np.median([point.sigma_e2 for point in curve]))
+    least = max(_LEAST_PROMINENCE * float(np.ptp(detail)), _LEAST_SIGMAS * noise_e2)
     peaks = [index for index in range(len(detail)) if _prominence(detail, index) > least]
     return [_vertex(depth, detail, peak) for peak in peaks]
 

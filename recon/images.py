@@ -13,7 +13,8 @@ class ElementalImages:
     """All views of one scene, `g` of eq. (1), with the known part of their statistics.
 
     A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of a colour of a mosaic lie on *lattices* of every
-    second pixel, say; each view then appears once per lattice, and maps are given per lattice.
+    second pixel, say; each view then appears once per lattice, and maps are given per lattice. Which view lies on which
+    lattice, and where that looks, the operator knows.
 
     Parameters
     ----------
@@ -24,9 +25,7 @@ class ElementalImages:
     read_variance_e2 : float or array broadcastable to (lattice, row, column)
         σ²: variance that is there without any electron.
     valid : bool array (view, row, column), optional
-        False where a pixel carries no number (saturated, say).
-    lattice_of_view : int array (view,), optional
-        Which lattice each view lies on; all on the first by default.
+        False where a pixel carries no number (saturated, say); the operator must have been made with the same.
 
     Raises
     ------
@@ -38,15 +37,12 @@ class ElementalImages:
     background_e: float | Image = 0.0
     read_variance_e2: float | Image = 0.0
     valid: NDArray[np.bool_] | None = None
-    lattice_of_view: NDArray[np.intp] | None = None
 
     def __post_init__(self) -> None:
         if self.electrons.ndim != 3:
             raise ValueError(f"electrons must be (view, row, column), got shape {self.electrons.shape}")
         if self.valid is not None and self.valid.shape != self.electrons.shape:
             raise ValueError(f"valid has shape {self.valid.shape}, electrons {self.electrons.shape}")
-        if self.lattice_of_view is not None and self.lattice_of_view.shape != self.electrons.shape[:1]:
-            raise ValueError(f"lattice_of_view has shape {self.lattice_of_view.shape}, not one entry per view")
         for view, image in enumerate(self.electrons):
             finite = np.isfinite(image) if self.valid is None else np.isfinite(image[self.valid[view]])
             if not finite.all():

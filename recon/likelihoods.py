@@ -28,17 +28,9 @@ def _of_view(operator: PlaneOperator, plane: Image, images: ElementalImages, vie
     """Return the negative log-likelihood of one view."""
     sees_plane = operator.forward(np.ones_like(plane), [view])[0] != 0
     variance, background = (
-        _of_lattice(value, images, view, sees_plane.shape)[sees_plane]
-        for value in (images.read_variance_e2, images.background_e)
+        operator.map_of_view(value, view)[sees_plane] for value in (images.read_variance_e2, images.background_e)
     )
     mean = operator.forward(plane, [view])[0][sees_plane] + background + variance
     observed = np.maximum(images.electrons[view][sees_plane] + variance, 0)
     logarithm = np.log(mean, out=np.zeros_like(mean), where=observed > 0)
     return float(np.sum(mean - observed * logarithm, dtype=np.float64))
-
-
-def _of_lattice(value: float | Image, images: ElementalImages, view: int, shape: tuple[int, ...]) -> Image:
-    """Return the part of a number or of a map (lattice, row, column) that belongs to a view, (row, column)."""
-    lattice = 0 if images.lattice_of_view is None else images.lattice_of_view[view]
-    maps = np.asarray(value)
-    return np.broadcast_to(maps[lattice if len(maps) > 1 else 0] if maps.ndim == 3 else maps, shape)

@@ -102,10 +102,16 @@ class PlaneOperator:
         """Return Hᵀ H 1 (row, column), by which a back-projection is divided to keep a constant plane constant."""
         return self.adjoint_of_map(self._geometry.response, views)
 
+    def map_of_view(self, value: float | Image, view: int) -> Image:
+        """Return the part of a map, broadcastable to (lattice, row, column), that belongs to a view: (row, column)."""
+        return np.asarray(np.broadcast_to(value, self._geometry.ray_x.shape)[self._geometry.lattice_of_view[view]])
+
     def adjoint_of_ratio(
         self, plane: Image, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
     ) -> Image:
         """Return Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ] (row, column) in one sweep; with σ = 0 the ratio of eq. (2)."""
+        if images.valid is not None and not self._geometry.valid.size:
+            raise GeometryMismatch("the images have pixels that do not count; make the operator with their `valid`")
         return self._sweep(
             kernels.RATIO,
             self._views(views),
@@ -197,7 +203,7 @@ def _checked_geometry(
     views, lattices, detector = len(plane_from_ray), len(rays), rays.shape[1:3]
     flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.asarray(lattice_of_view, np.intp)
-    valid = np.zeros((0, 0, 0), bool) if valid is None or valid.all() else np.ascontiguousarray(valid)
+    valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     if plane_from_ray.shape != (views, 3, 3) or rays.shape != (lattices, *detector, 2) or views == 0:
         raise GeometryMismatch(
             f"homographies {plane_from_ray.shape} and rays {rays.shape} do not fit: (view, 3, 3) wanted"
@@ -208,6 +214,8 @@ def _checked_geometry(
         raise GeometryMismatch(f"flat {flat.shape} does not fit rays {rays.shape}")
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(f"lattice_of_view does not give each of the {views} views one of {lattices} lattices")
+    if (flat < 0).any():
+        raise GeometryMismatch(f"the flat field is negative somewhere, {flat.min():.3g} at least; measure it again")
     if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):
         raise GeometryMismatch("a pose, ray or flat field is not a finite number; check the calibration they came from")
     return kernels.Geometry(

@@ -29,6 +29,10 @@ class SimulatedSensor:
     quantum_efficiency: float = 0.5
     saturation_dn: int = 65535
 
+    def __post_init__(self) -> None:
+        if not 0 < self.saturation_dn <= 65535:
+            raise ValueError(f"saturation_dn must lie within 1…65535 for a 16-bit file, got {self.saturation_dn}")
+
     def expose(
         self, photons_per_px: NDArray[np.floating], exposure_s: float, generator: np.random.Generator
     ) -> NDArray[np.uint16]:

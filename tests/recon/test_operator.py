@@ -336,7 +336,7 @@ def test_each_lattice_has_a_background_and_a_variance_of_its_own() -> None:
     generator = np.random.default_rng(11)
     plane, electrons = generator.uniform(1, 2, grid.shape), generator.normal(1, 3, operator.images_shape)
     background, variance = generator.uniform(0, 2, (2, *rays.shape[:3]))
-    images = ElementalImages(electrons, background, variance, lattice_of_view=lattice_of_view)
+    images = ElementalImages(electrons, background, variance)
     b, v = background[lattice_of_view], variance[lattice_of_view]
     expected = operator.adjoint(np.maximum(electrons + v, 0) / (operator.forward(plane) + b + v))
     np.testing.assert_allclose(operator.adjoint_of_ratio(plane, images), expected, atol=1e-12)

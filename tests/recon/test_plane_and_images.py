@@ -47,7 +47,6 @@ def test_grids_that_lie_nowhere_are_refused(origin_mm: tuple[float, float]) -> N
     [
         ({"electrons": np.zeros((3, 4))}, "view, row, column"),
         ({"valid": np.ones((2, 4, 3), bool)}, "valid has shape"),
-        ({"lattice_of_view": np.zeros(3, int)}, "not one entry per view"),
         ({"electrons": np.where(np.arange(24) == 17, np.nan, 0.0).reshape(2, 3, 4)}, "view 1 has 1 pixels"),
         ({"electrons": np.full((2, 3, 4), np.inf)}, "view 0 has 12 pixels"),
     ],
