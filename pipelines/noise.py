@@ -53,15 +53,16 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     temperature_c, doubts = temperature_notes(settings)
     doubts += [warning for calibration in calibrations for warning in calibration.warnings]
     inputs = {name: sha256(folder / name) for name in [FILE_NAME, *(frame.file for frame in settings.frame)]}
+    # The numbers come last: where noise.json stands, everything that it names stands too.
+    write_maps(out / MAPS_FILE, maps_of(readout, calibrations))
     result = result_of(readout, calibrations) | {
         "temperature_c": temperature_c,
         "frames": msgspec.to_builtins(settings.frame),
         "warnings": list(dict.fromkeys(doubts)),
         "maps": MAPS_FILE,
+        "maps_sha256": sha256(out / MAPS_FILE),
         "provenance": provenance("noise", {}, inputs),
     }
-    # The numbers come last: where noise.json stands, everything that it names stands too.
-    write_maps(out / MAPS_FILE, maps_of(readout, calibrations))
     for plane, calibration in zip(readout.planes, calibrations, strict=True):
         suffix = f"_{plane.name}" if plane.name else ""
         write_whole(out / f"noise_page{suffix}.png", draw_page(calibration, f"{folder.resolve().name} {plane.name}"))

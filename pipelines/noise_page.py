@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from calib.noise import Estimate, NoiseCalibration, TransferPoint
+from pipelines.noise_result import STANDARD
 
 _INK, _MODEL, _SECOND = "#1b1b1b", "#c23b22", "#2b6ca3"
 
@@ -47,10 +48,8 @@ def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
     )
     for axes, panel in zip(grid.flat, panels, strict=True):
         panel(axes, calibration)
-    likelihood = calibration.likelihood
-    figure.suptitle(
-        f"Noise calibration: {title.strip()}    (EMVA 1288 release 4.0; likelihood: {likelihood})", fontsize=13
-    )
+    how = f"{STANDARD}; likelihood: {calibration.likelihood}"
+    figure.suptitle(f"Noise calibration: {title.strip()}    ({how})", fontsize=13)
     page = io.BytesIO()
     figure.savefig(page, format="png", dpi=110)
     return page.getvalue()

@@ -1,17 +1,15 @@
 """The noise set: a folder of dark and flat frames with `noise.toml`, when they were not taken by `capture`."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
-import tomli_w
 
 from calib.noise import Conditions
 from pipelines.errors import BadValue, MissingFile
-from pipelines.files import write_whole
 from pipelines.frames import RAW_SUFFIXES, exif_exposure_s
-from pipelines.toml_files import inside, read_toml
+from pipelines.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "noise.toml"
 
@@ -74,7 +72,7 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
 
 def write_noise_set(folder: Path, settings: NoiseSet) -> None:
     """Write `noise.toml`; the images come first, so that a folder with this file is whole."""
-    write_whole(folder / FILE_NAME, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
+    write_toml(folder / FILE_NAME, settings)
 
 
 def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path]]:
@@ -130,10 +128,3 @@ def _check_numbers(path: Path, frame: NoiseFrame) -> None:
             raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must be finite and not negative")
     if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
         raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")
-
-
-def _without_none(value: Any) -> Any:
-    """Drop the keys that say nothing: TOML has no null."""
-    if isinstance(value, dict):
-        return {key: _without_none(part) for key, part in value.items() if part is not None}
-    return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value

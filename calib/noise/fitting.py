@@ -42,7 +42,6 @@ class Fitted:
     flats: Sequence[Series]
     moments: Moments
     likelihood: Likelihood
-
     fit: Fit
     bend: Fit | None
 
@@ -89,7 +88,7 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
             counts = collect_counts(darks, usable & ~suspect)
         start = gaussian_start(fit) if exact else censored_start(counts)
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
-        spread = not exact or fit.values["dcnu_dn2_per_s2"] > 3 * fit.standard_error("dcnu_dn2_per_s2")
+        spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
         bend = None
     return Fitted(darks, flats, moments, likelihood, fit, bend)

@@ -48,7 +48,9 @@ class Fit:
     log_likelihood: float
 
     def standard_error(self, name: str) -> float:
-        """Return the standard error of one parameter."""
+        """Return the standard error of one parameter, infinite for one that the design does not hold."""
+        if name not in self.values:
+            return float("inf")
         index = list(self.values).index(name)
         return float(np.sqrt(self.covariance[index, index]))
 

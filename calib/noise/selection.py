@@ -74,8 +74,7 @@ def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likel
         than a little of it the Gaussian is the better one.
     """
     widest = max(int(np.ptp(values)) for values in counts.values_dn)
-    exposures = len(set(counts.exposure_s))
-    if widest > MOST_VALUES_DN or exposures < 2:
+    if widest > MOST_VALUES_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
         return Likelihood.GAUSSIAN
     read_dn = np.exp(0.5 * gaussian.values["log_read_dn2"])
     read_e = read_dn / np.exp(gaussian.values["log_gain"])
@@ -97,7 +96,7 @@ def gaussian_start(gaussian: Fit) -> dict[str, float]:
         "log_gain": values["log_gain"],
         "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
         "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
-        "dcnu": float(np.sqrt(max(values["dcnu_dn2_per_s2"], 0.0)) / signal),
+        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
         "offset_dn": values["offset_dn"],
         "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
     }

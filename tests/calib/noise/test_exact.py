@@ -150,3 +150,11 @@ def test_banding_that_blurs_single_electrons_keeps_the_gaussian() -> None:
     assert result.likelihood is Likelihood.GAUSSIAN
     for name, truth in (("gain_dn_per_e", 2.0), ("read_noise_e", 0.3)):
         assert result.estimates[name].value == pytest.approx(truth, rel=0.05)
+
+
+def test_subtle_read_noise_at_a_single_repeated_exposure_still_gives_an_answer() -> None:
+    chip, rng = specimen(6, read_noise_e=0.2)
+    series = [measure_series(darks(chip, [t], n, rng)[t], Conditions("dark", t)) for t, n in ((1.0, 10), (60.0, 1))]
+    result = calibrate(series)
+    assert result.estimates["gain_dn_per_e"].value is None
+    assert result.estimates["offset_dn"].value == pytest.approx(100, abs=0.5)
