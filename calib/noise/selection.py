@@ -49,15 +49,15 @@ def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
 
 
 def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
-    """Return the variance that frames, rows and columns add to all their pixels at once."""
-    several = [one for one in darks if one.frames > 1]
-    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in several]))
-    rows, columns = darks[0].pattern_dn.shape
-    banding = [
-        one.row_noise_dn2 + one.column_noise_dn2 - float(v) * (1 / columns + 1 / rows)
-        for one, v in zip(several, noise, strict=True)
-    ]
-    return gaussian.values["jitter_dn2"] + max(float(np.mean(banding)), 0.0)
+    """Return the variance that frames, rows and columns add to all their pixels at once, in the quietest series."""
+    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
+    variance, quietest = min(
+        (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
+    )
+    dark = darks[quietest]
+    rows, columns = dark.pattern_dn.shape
+    banding = dark.row_noise_dn2 + dark.column_noise_dn2 - variance * (1 / columns + 1 / rows)
+    return gaussian.values["jitter_dn2"] + max(banding, 0.0)
 
 
 def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likelihood:
