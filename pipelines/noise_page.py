@@ -64,6 +64,8 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
     flats = any(point.kind == "flat" for point in measured)
     for kind, colour in (("dark", _SECOND), ("flat", _INK)):
         points = [point for point in measured if point.kind == kind]
+        if not points:
+            continue
         mean = np.array([point.mean_dn - offset for point in points])
         variance, error = _column(points, "variance_dn2"), _column(points, "variance_se_dn2")
         axes.errorbar(mean, variance, 2 * error, fmt="o", ms=4, color=colour, capsize=2, label=f"{kind}s, ±2 s.e.")

@@ -44,8 +44,10 @@ def noisy_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArra
     variance_ratio : array (row, column)
         Each pixel's variance over the frames, over that of the model.
     freedom : float
-        Degrees of freedom behind each.
+        Degrees of freedom behind each, if its noise is normal.
     """
+    # Single electrons, or pixels that differ, scatter variances further than normal noise does.
+    freedom = min(freedom, 2 / max(robust_sigma(variance_ratio) ** 2, 1e-12))
     chance = _NOISY_CHANCE / variance_ratio.size
     return np.asarray(variance_ratio * freedom > stats.chi2.isf(chance, freedom))
 

@@ -57,7 +57,7 @@ def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
     dark = darks[quietest]
     rows, columns = dark.pattern_dn.shape
     banding = dark.row_noise_dn2 + dark.column_noise_dn2 - variance * (1 / columns + 1 / rows)
-    return gaussian.values["jitter_dn2"] + max(banding, 0.0)
+    return gaussian.values["jitter_dn2"] + max(float(banding), 0.0)
 
 
 def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likelihood:
