@@ -42,4 +42,6 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	@echo "Installing the locked packages into $(VENV) ..."
 	$(PIP) install --no-deps --require-hashes -r requirements.lock
 	$(PIP) install --no-deps --no-build-isolation -e .
+	@echo "Compiling the kernels ..."
+	$(BIN)/python -c 'from recon.operator import compile_kernels; compile_kernels()'
 	@touch $@

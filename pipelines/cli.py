@@ -13,7 +13,7 @@ import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
 from calib.errors import CalibrationError
-from pipelines.console import console, say
+from pipelines.console import framed_console, say
 from pipelines.errors import InputError, WrongUsage
 from recon.errors import ReconstructionError
 from rig.errors import RigError
@@ -25,7 +25,7 @@ app = App(
     name="faintfield",
     help="See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.",
     version=version("faintfield"),
-    error_console=console,
+    error_console=framed_console,
     default_parameter=Parameter(negative=()),
     result_action="return_value",
 )

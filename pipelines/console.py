@@ -14,6 +14,9 @@ from rich.progress import (
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
+# A message in a frame needs its lines broken, or the frame cuts them off.
+framed_console = Console(stderr=True, highlight=False, emoji=False)
+
 
 def say(text: str) -> None:
     """Print one line of human words."""

@@ -23,6 +23,11 @@ from rig.simulation.sensor import SimulatedSensor
 
 _PAPER = SimulatedSensor()
 
+_FLAT = "flat.tiff"
+
+# Names that no view may have.
+_TAKEN = {Path(NOISE_REFERENCE).stem, Path(_FLAT).stem}
+
 
 def darken(
     elemental_set: Annotated[Path, Parameter(name="SET")],
@@ -78,7 +83,7 @@ def darken(
     except ValueError as failure:
         raise BadValue(f"{elemental_set}: cannot be darkened: {failure}; is it the bright set?") from failure
     generator = np.random.default_rng(seed)
-    with building_folder(out, replace_if="elemental.toml" if overwrite else None) as folder:
+    with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=loaded.folder) as folder:
         _write_dark_views(loaded, layouts, folder, sensor, exposure_s, scale, generator)
         write_png(folder / OBJECT_REGION, mask_picture(region))
         photons = float(reference_light[region].mean()) * scale / quantum_efficiency
@@ -123,6 +128,14 @@ def _light(loaded: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArr
     return light
 
 
+def _names(loaded: LoadedSet) -> list[str]:
+    """Return the file names of the dark views: those of the bright ones where that keeps them apart."""
+    stems = [Path(view.image).stem for view in loaded.settings.view]
+    if len({*stems, *_TAKEN}) < len(stems) + len(_TAKEN):
+        stems = [f"view_{index:03d}" for index in range(len(stems))]
+    return [f"{stem}.tiff" for stem in stems]
+
+
 def _write_dark_views(
     loaded: LoadedSet,
     layouts: list[ChannelLayout],
@@ -134,16 +147,16 @@ def _write_dark_views(
 ) -> None:
     """Expose every view anew and write the set; a mosaic stays one."""
     views = []
-    for view, path in zip(progress(loaded.settings.view, "exposing views"), loaded.image_paths, strict=True):
-        photons = _light(loaded, path, layouts) * (scale_e / sensor.quantum_efficiency)
-        name = f"{Path(view.image).stem}.tiff"
+    names = _names(loaded)
+    for view, name in zip(progress(loaded.settings.view, "exposing views"), names, strict=True):
+        photons = _light(loaded, loaded.folder / view.image, layouts) * (scale_e / sensor.quantum_efficiency)
         write_frame(folder / name, sensor.expose(photons, exposure_s, generator))
         views.append(msgspec.structs.replace(view, image=name))
     write_frame(folder / NOISE_REFERENCE, sensor.expose(np.zeros(photons.shape), exposure_s, generator))
     camera = loaded.settings.camera
     if loaded.flat is not None:
-        write_plane(folder / "flat.tiff", loaded.flat, pitch_mm=1.0)
-        camera = msgspec.structs.replace(camera, flat="flat.tiff")
+        write_plane(folder / _FLAT, loaded.flat, pitch_mm=1.0)
+        camera = msgspec.structs.replace(camera, flat=_FLAT)
     noise = Noise(
         gain_dn_per_e=sensor.gain_dn_per_e,
         read_noise_e=sensor.read_noise_e,

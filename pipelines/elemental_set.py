@@ -1,6 +1,7 @@
 """The elemental set: a folder of images with `elemental.toml`, the way in for anyone's images and poses."""
 
 import json
+import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +19,7 @@ from pipelines.frames import read_frame
 from pipelines.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
+NOISE_MAPS = "noise_maps.npz"
 
 # How far the reference view's pose may be from zero: less than any calibration can tell.
 _ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
@@ -160,6 +162,10 @@ class LoadedSet:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
         for name in [FILE_NAME, *_named_files(self.settings)]:
             yield name, sha256(self.folder / name)
+        if isinstance(self.settings.noise, str):
+            maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
+            if maps.is_file():
+                yield str(maps.relative_to(self.folder)), sha256(maps)
 
 
 def load_set(folder: Path) -> LoadedSet:
@@ -267,28 +273,41 @@ def read_noise_json(path: Path, size_px: tuple[int, int]) -> tuple[NoiseModel, N
         fitted = json.loads(path.read_text())
         values = {name: fitted[name]["value"] for name in names}
         missing = [name for name in names if values[name] is None]
-        hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int)
-        extra = {
-            key: value
-            for key in ("quantum_efficiency", "saturation_dn")
-            if (value := fitted[key]["value"] if isinstance(fitted.get(key), dict) else fitted.get(key)) is not None
-        }
-    except (ValueError, KeyError, TypeError) as failure:
+        hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int).reshape(-1, 2)
+        stated = {key: fitted.get(key) for key in ("quantum_efficiency", "saturation_dn")}
+        extra = {key: part["value"] if isinstance(part, dict) else part for key, part in stated.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as failure:
         raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure!r}); run that again") from failure
     if missing:
         why = fitted[missing[0]].get("why", "no reason stated")
         raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
     # An estimate near zero may fall below it; a dark current cannot.
     values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
-    unusable = np.zeros(size_px[::-1], bool)
-    unusable[tuple(hot.reshape(-1, 2).T)] = True
-    maps_path = path.with_name("noise_maps.npz")
-    if maps_path.is_file():
-        with np.load(maps_path, allow_pickle=False) as maps:
-            values |= {name: maps[name] for name in names if name in maps and maps[name].shape == unusable.shape}
-            if "mask" in maps:
-                unusable |= maps["mask"]
-    return NoiseModel(**values, **extra), unusable
+    shape = size_px[::-1]
+    outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
+    if len(outside):
+        raise BadValue(f"{path}: hot pixel {outside[0].tolist()} is not one of {shape}; is it another camera's?")
+    unusable = np.zeros(shape, bool)
+    unusable[tuple(hot.T)] = True
+    maps = _read_noise_maps(path.with_name(NOISE_MAPS), (*names, "mask"), shape)
+    unusable |= maps.pop("mask", False)
+    known = {key: value for key, value in extra.items() if value is not None}
+    return NoiseModel(**(values | maps), **known), unusable
+
+
+def _read_noise_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Any]:
+    """Return those of the named maps (row, column) that lie beside a noise result."""
+    if not path.is_file():
+        return {}
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            maps = {name: file[name] for name in names if name in file}
+    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as failure:
+        raise BadValue(f"{path}: cannot be read ({failure}); run `faintfield noise` again") from failure
+    for name, values in maps.items():
+        if values.shape != shape:
+            raise BadValue(f"{path}: {name} has shape {values.shape}, the camera {shape}; is it another camera's?")
+    return maps
 
 
 def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:

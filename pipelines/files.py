@@ -58,7 +58,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 @contextmanager
-def building_folder(out: Path, *, replace_if: str | None = None) -> Iterator[Path]:
+def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | None = None) -> Iterator[Path]:
     """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
 
     Parameters
@@ -68,26 +68,44 @@ def building_folder(out: Path, *, replace_if: str | None = None) -> Iterator[Pat
     replace_if : str, optional
         A file name by which a folder made earlier by the same command is known: such a folder is replaced, any other
         is left alone.
+    reads : Path, optional
+        What the block reads: it must not be replaced.
 
     Raises
     ------
     OutputExists
         `out` holds something that would be lost.
     """
+    out = out.resolve()
     check_free(out, replace_if=replace_if)
+    if reads is not None and reads.resolve().is_relative_to(out):
+        raise OutputExists(f"{out}: holds {reads}, which is read; name another folder")
     with reported_as_cannot_write(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         building = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
         try:
             yield building
             os.chmod(building, 0o777 & ~_umask())
-            if out.exists():
-                shutil.rmtree(out)
-            os.replace(building, out)
+            _put_in_place(building, out)
         except BaseException:
             shutil.rmtree(building, ignore_errors=True)
             raise
         _sync_folder(out.parent)
+
+
+def _put_in_place(building: Path, out: Path) -> None:
+    """Give a folder its name; what had the name goes in one step, so that nobody sees it half removed."""
+    if not out.exists():
+        os.replace(building, out)
+        return
+    replaced = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    os.replace(out, replaced)
+    try:
+        os.replace(building, out)
+    except BaseException:
+        os.replace(replaced, out)
+        raise
+    shutil.rmtree(replaced, ignore_errors=True)
 
 
 def check_free(out: Path, *, replace_if: str | None = None) -> None:

@@ -1,6 +1,8 @@
 """Image files as the sensor gave them: 16-bit TIFF or PNG, photographs, and raw files with their mosaic."""
 
 import contextlib
+import logging
+import struct
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,8 +20,12 @@ PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
 
-# What tifffile is known to raise on files that are damaged or end early.
-_TIFF_FAILURES = (tifffile.TiffFileError, zlib.error, OSError, LookupError, RuntimeError, TypeError, ValueError)
+# What tifffile is known to raise on files that are damaged or end early; what it logs besides is said in one line here.
+_TIFF_FAILURES = (
+    *(tifffile.TiffFileError, zlib.error, struct.error, OSError, LookupError, RuntimeError, TypeError, ValueError),
+    *(ArithmeticError, MemoryError),
+)
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 # OpenCV fills the rest of a truncated photograph with grey and says nothing; a whole one ends with these bytes.
 _END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
@@ -75,7 +81,9 @@ def read_frame(path: Path) -> Frame:
     pixels = _read_tiff(path) if suffix in TIFF_SUFFIXES else _read_with_opencv(path)
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         pixels = pixels[:, :, :3]
-    if pixels.ndim not in (2, 3) or pixels.size == 0 or (pixels.ndim == 3 and pixels.shape[2] != 3):
+    if pixels.size == 0:
+        raise UnreadableImage(_cannot_decode(path, "no pixels"))
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise UnreadableImage(f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted")
     return Frame(pixels)
 
@@ -93,14 +101,30 @@ def _read_tiff(path: Path) -> NDArray[Any]:
 def _read_with_opencv(path: Path) -> NDArray[Any]:
     """Read what OpenCV decodes, as (row, column) or (row, column, RGB), bit depth and orientation untouched."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
-    content = path.read_bytes()
-    whole = _END_MARKS.get(path.suffix.lower(), b"") in content[-1024:]
-    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content and whole else None
+    try:
+        content = path.read_bytes()
+        whole = _END_MARKS.get(path.suffix.lower(), b"") in content[-1024:] and _sound_png(content)
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content and whole else None
+    except (OSError, cv2.error) as failure:
+        raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
     if pixels is None:
         raise UnreadableImage(_cannot_decode(path, "not an image, or truncated"))
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
         pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
     return np.asarray(pixels)
+
+
+def _sound_png(content: bytes) -> bool:
+    """Return whether every chunk of a PNG has its checksum, true of other files; the decoder would print, not say."""
+    start = 8
+    while content.startswith(b"\x89PNG") and start < len(content):
+        end = start + 8 + int.from_bytes(content[start : start + 4])
+        if zlib.crc32(content[start + 4 : end]) != int.from_bytes(content[end : end + 4]) or end + 4 > len(content):
+            return False
+        if content[start + 4 : start + 8] == b"IEND":
+            break
+        start = end + 4
+    return True
 
 
 def _read_raw(path: Path) -> Frame:

@@ -12,7 +12,7 @@ import numpy as np
 from pipelines.arguments import Count, Fraction, NotNegative, Positive
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
-from pipelines.errors import BadValue, InputError, MissingFile, WrongSize
+from pipelines.errors import BadValue, MissingFile, WrongSize
 from pipelines.files import building_folder, sha256, write_json
 from pipelines.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, Frame, read_frame
 from pipelines.image_files import write_frame
@@ -103,7 +103,7 @@ def import_grid(
     if exposure_s is None:
         say("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
         exposure_s = 1.0
-    with building_folder(out, replace_if="elemental.toml" if overwrite else None) as folder:
+    with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=src) as folder:
         camera, views = _copy_views(grid, folder, first, pitch_mm, fx_px, disparity_px)
         row, column = centre_node(grid.rows, grid.columns)
         write_set(folder, ElementalSet(1, exposure_s, row * grid.columns + column, camera, noise, views))
@@ -193,14 +193,14 @@ def _copy_picture(path: Path, folder: Path, first: Frame) -> str:
             f"{path}: is {frame.pixels_dn.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "
             "all must be alike"
         )
-    if path.suffix.lower() in RAW_SUFFIXES or frame.pixels_dn.dtype == np.uint16:
-        try:
-            shutil.copyfile(path, folder / path.name)
-        except shutil.SameFileError as failure:
-            raise InputError(f"{path}: is in the folder to be written; name another") from failure
-        return path.name
-    if frame.pixels_dn.dtype != np.uint8:
+    if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
         raise BadValue(f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted")
-    name = f"{path.stem}.tiff"
-    write_frame(folder / name, frame.pixels_dn.astype(np.uint16))
+    as_it_is = path.suffix.lower() in RAW_SUFFIXES or frame.pixels_dn.dtype == np.uint16
+    name = path.name if as_it_is else f"{path.stem}.tiff"
+    if (folder / name).exists():
+        raise BadValue(f"{path}: would become {name} like another picture; give it another name")
+    if as_it_is:
+        shutil.copyfile(path, folder / name)
+    else:
+        write_frame(folder / name, frame.pixels_dn.astype(np.uint16))
     return name

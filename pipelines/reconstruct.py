@@ -87,6 +87,7 @@ def reconstruct(
     run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
     write_overview(loaded, out)
     metrics = assess(loaded, run.written)
+    (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
         write_json(out / METRICS_FILE, metrics)
     inputs = dict(loaded.input_hashes())

