@@ -33,10 +33,18 @@ app = App(
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 
 
-for _command in ("simulate:simulate", "darken:darken", "reconstruct:reconstruct", "report:report", "demo:demo"):
+for _command in (
+    "simulate:simulate",
+    "darken:darken",
+    "noise:noise",
+    "reconstruct:reconstruct",
+    "report:report",
+    "demo:demo",
+):
     app.command(f"pipelines.{_command}")
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
+app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
 
 
 @app.meta.default

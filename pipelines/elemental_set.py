@@ -9,15 +9,14 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 
 from calib.lens import Lens
 from calib.noise_model import Map, NoiseModel
 from pipelines.errors import BadValue, MissingFile
-from pipelines.files import sha256, write_whole
+from pipelines.files import sha256
 from pipelines.frames import read_frame
-from pipelines.toml_files import inside, read_toml
+from pipelines.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
 NOISE_MAPS = "noise_maps.npz"
@@ -198,14 +197,7 @@ def load_set(folder: Path) -> LoadedSet:
 
 def write_set(folder: Path, settings: ElementalSet) -> None:
     """Write `elemental.toml`; the images come first, so that a folder with this file is whole."""
-    write_whole(folder / FILE_NAME, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
-
-
-def _without_none(value: Any) -> Any:
-    """Drop the keys that say nothing: TOML has no null."""
-    if isinstance(value, dict):
-        return {key: _without_none(part) for key, part in value.items() if part is not None}
-    return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value
+    write_toml(folder / FILE_NAME, settings)
 
 
 def _named_files(settings: ElementalSet) -> list[str]:
@@ -289,6 +281,8 @@ def read_noise_json(path: Path, size_px: tuple[int, int]) -> tuple[NoiseModel, N
     if missing:
         why = fitted[missing[0]].get("why", "no reason stated")
         raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
+    # An estimate near zero may fall below it; a dark current cannot.
+    values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
     shape = size_px[::-1]
     outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
     if len(outside):

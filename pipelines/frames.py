@@ -143,7 +143,7 @@ def _read_raw(path: Path) -> Frame:
     except rawpy.LibRawError as failure:
         reason = failure.args[0].decode() if isinstance(failure.args[0], bytes) else str(failure)
         raise UnreadableImage(_cannot_decode(path, reason)) from failure
-    return Frame(pixels, mosaic, black_dn, saturation_dn, _exif_exposure_s(path))
+    return Frame(pixels, mosaic, black_dn, saturation_dn, exif_exposure_s(path))
 
 
 def _mosaic_of(raw: Any) -> tuple[str, ...] | None:
@@ -175,7 +175,7 @@ def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
     return black_dn
 
 
-def _exif_exposure_s(path: Path) -> float | None:
+def exif_exposure_s(path: Path) -> float | None:
     """Return the exposure that EXIF states, None where it states none (rawpy would say 1 s)."""
     import exifread  # only sessions with raw files pay for loading it
 

@@ -4,10 +4,13 @@ import difflib
 import re
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import tomli_w
 
 from pipelines.errors import BadValue, MissingFile, UnknownKey
+from pipelines.files import write_whole
 
 
 def read_toml[T](path: Path, kind: type[T]) -> T:
@@ -33,6 +36,11 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
         raise
     except (tomllib.TOMLDecodeError, msgspec.DecodeError, UnicodeDecodeError) as failure:
         raise BadValue(f"{path}: is not TOML ({failure}); correct the line") from failure
+
+
+def write_toml(path: Path, settings: msgspec.Struct) -> None:
+    """Write what `read_toml` reads, whole or not at all; keys without a value are left out, for TOML has no null."""
+    write_whole(path, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
 
 
 def inside(folder: Path, name: str, key: str) -> Path:
@@ -67,3 +75,10 @@ def _known_keys(kind: type) -> set[str]:
     schema = msgspec.json.schema(kind)
     parts = [schema, *schema.get("$defs", {}).values()]
     return {key for part in parts for key in part.get("properties", {})}
+
+
+def _without_none(value: Any) -> Any:
+    """Drop the keys that say nothing."""
+    if isinstance(value, dict):
+        return {key: _without_none(part) for key, part in value.items() if part is not None}
+    return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value

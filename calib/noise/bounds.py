@@ -1,0 +1,138 @@
+"""The Cramér–Rao bound: how well any unbiased method could measure a sensor from a given set of frames.
+
+The log-likelihood of `calib.noise.gaussian` is linear in the sufficient statistics, so its Hessian at their expected
+values is the Fisher information, exactly. Nothing is sampled.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.noise.gaussian import ROUNDING_DN2, information
+from calib.noise.moments import DarkMoments, FlatMoments, Moments
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor as the likelihood sees it.
+
+    Attributes
+    ----------
+    gain_dn_per_e, read_noise_e, dark_current_e_per_s : float
+        EMVA 1288's K, σ_d and μ_I.
+    offset_dn : float
+        Mean of a dark of no exposure.
+    dsnu_e, dcnu_e_per_s : float
+        Standard deviations over the pixels of the offset and of the dark current.
+    jitter_dn : float
+        Standard deviation of the level of a frame.
+    """
+
+    gain_dn_per_e: float
+    read_noise_e: float
+    dark_current_e_per_s: float
+    offset_dn: float = 0.0
+    dsnu_e: float = 0.0
+    dcnu_e_per_s: float = 0.0
+    jitter_dn: float = 0.0
+
+
+def cramer_rao(
+    sensor: Sensor,
+    exposures_s: Sequence[float],
+    frames: int,
+    pixels: int,
+    *,
+    flat_signals_dn: Sequence[float] = (),
+    flat_frames: int = 2,
+) -> dict[str, float]:
+    """Return the least standard errors of gain, read noise and dark current.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        The truth.
+    exposures_s : sequence of float
+        Exposure times of the darks, at least two different.
+    frames : int
+        Darks at each exposure.
+    pixels : int
+        Pixels of a frame.
+    flat_signals_dn : sequence of float
+        Mean signal of each flat series above the offset.
+    flat_frames : int
+        Frames of each flat series.
+
+    Returns
+    -------
+    dict
+        `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`: standard errors in those units.
+    """
+    values = _parameters(sensor)
+    moments = _expected_moments(sensor, np.asarray(exposures_s, float), frames, pixels, flat_signals_dn, flat_frames)
+    fisher = information(values, moments)
+    # A spread that is zero is a boundary of the model; it tells nothing about the others.
+    free = [i for i, (name, value) in enumerate(values.items()) if value > 0 or not name.endswith(("dn2", "per_s2"))]
+    covariance = np.linalg.inv(fisher[np.ix_(free, free)])
+    names = [list(values)[i] for i in free]
+    gradients = _gradients(sensor, names)
+    return {name: float(np.sqrt(gradient @ covariance @ gradient)) for name, gradient in gradients.items()}
+
+
+def _parameters(sensor: Sensor) -> dict[str, float]:
+    """Return the sensor in the parameters of the likelihood."""
+    gain = sensor.gain_dn_per_e
+    return {
+        "offset_dn": sensor.offset_dn,
+        "log_read_dn2": float(np.log((gain * sensor.read_noise_e) ** 2)),
+        "dsnu_dn2": (gain * sensor.dsnu_e) ** 2,
+        "jitter_dn2": sensor.jitter_dn**2,
+        "dark_signal_dn_per_s": gain * sensor.dark_current_e_per_s,
+        "dcnu_dn2_per_s2": (gain * sensor.dcnu_e_per_s) ** 2,
+        "log_gain": float(np.log(gain)),
+    }
+
+
+def _gradients(sensor: Sensor, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Return the derivatives of σ = √r / g, D = d / g and g with respect to the parameters."""
+    sigma, current, gain = sensor.read_noise_e, sensor.dark_current_e_per_s, sensor.gain_dn_per_e
+    derivatives = {
+        "gain_dn_per_e": {"log_gain": gain},
+        "read_noise_e": {"log_read_dn2": sigma / 2, "log_gain": -sigma},
+        "dark_current_e_per_s": {"dark_signal_dn_per_s": 1 / gain, "log_gain": -current},
+    }
+    return {quantity: np.array([by.get(name, 0.0) for name in names]) for quantity, by in derivatives.items()}
+
+
+def _expected_moments(
+    sensor: Sensor,
+    exposures_s: NDArray[np.float64],
+    frames: int,
+    pixels: int,
+    flat_signals_dn: Sequence[float],
+    flat_frames: int,
+) -> Moments:
+    """Return the expected values of the sufficient statistics."""
+    gain = sensor.gain_dn_per_e
+    read_dn2 = (gain * sensor.read_noise_e) ** 2 + ROUNDING_DN2
+    noise_dn2 = read_dn2 + gain**2 * sensor.dark_current_e_per_s * exposures_s
+    n = np.full(exposures_s.shape, float(frames))
+    scatter = np.diag(noise_dn2 / n) + (gain * sensor.dsnu_e) ** 2
+    scatter = scatter + (gain * sensor.dcnu_e_per_s) ** 2 * np.outer(exposures_s, exposures_s)
+    level_dn2 = sensor.jitter_dn**2 + noise_dn2 / pixels
+    signals = np.asarray(flat_signals_dn, float)
+    flat_n = np.full(signals.shape, float(flat_frames))
+    line = sensor.offset_dn + gain * sensor.dark_current_e_per_s * exposures_s
+    return Moments(
+        pixels=float(pixels),
+        freedom=float(pixels),
+        darks=DarkMoments(exposures_s, n, line, (n - 1) * pixels * noise_dn2, (n - 1) * level_dn2, pixels * scatter),
+        flats=FlatMoments(
+            flat_n,
+            sensor.offset_dn + signals,
+            (flat_n - 1) * pixels * (read_dn2 + gain * signals),
+            np.ones_like(signals),
+        ),
+    )

@@ -1,0 +1,256 @@
+"""From fitted parameters to EMVA 1288 quantities with intervals, or with the reason why there is none.
+
+A quantity has a value when the frames tell it: gain and read noise within a tenth, the dark current such that its
+error does not matter beside the noise. Anything worse is no measurement, however confidently a fit returns a number.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from calib.noise.fitting import Fitted
+from calib.noise.gaussian import Fit, dark_variances_dn2
+from calib.noise.moments import Moments
+from calib.noise.response import Response, quantum_efficiency
+from calib.noise.result import Estimate
+from calib.noise.statistics import Series
+
+# A relative standard error above this is no measurement.
+MOST_RELATIVE_SE = 0.1
+
+_FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
+_ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
+_NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
+
+
+def estimate_all(
+    fitted: Fitted, response: Response | None, *, levels_hold: bool, noise_holds: bool
+) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return every quantity, and the covariance of offset, gain, read noise and dark current.
+
+    Parameters
+    ----------
+    fitted : Fitted
+        The fit and what it rests on.
+    response : Response, optional
+        What flats told.
+    levels_hold, noise_holds : bool
+        Whether the dark levels lie on a straight line over exposure time, and the noise of all series on eq. (1).
+    """
+    fit, darks = fitted.fit, fitted.darks
+    quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
+    why_no_gain = _why_no_gain(fit, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+    why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
+    whys = {
+        "offset_dn": None,
+        "gain_dn_per_e": why_no_gain,
+        "read_noise_e": why_no_gain,
+        "dark_current_e_per_s": why_no_current,
+    }
+    estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
+    gain = estimates["gain_dn_per_e"]
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fit, gain, why_no_gain, quantile)
+    estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
+    return estimates | _from_flats(fitted, gain, response, quantile), covariance
+
+
+def _in_electrons(
+    fit: Fit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
+) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
+    """Return the four main quantities, those with a reason why not left out of the covariance."""
+    transforms = _transforms(fit)
+    known = tuple(name for name, why in whys.items() if why is None)
+    jacobian = np.array([transforms[name][1] for name in known])
+    covariance = jacobian @ fit.covariance @ jacobian.T
+    estimates = {name: Estimate(None, why=why) for name, why in whys.items()}
+    for index, name in enumerate(known):
+        se, positive = float(np.sqrt(covariance[index, index])), name in ("gain_dn_per_e", "read_noise_e")
+        quantile = gain_quantile if positive else levels_quantile
+        estimates[name] = _interval(transforms[name][0], se, quantile, positive=positive)
+    return estimates, (known, covariance)
+
+
+def _levels_quantile(fit: Fit, moments: Moments) -> float:
+    """Return how many standard errors make 95 % of what rests on the levels of the darks.
+
+    Student's where the jitter of the levels, known from few frames, matters.
+    """
+    pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
+    freedom = float((moments.darks.frames - 1).sum())
+    if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
+        return float(stats.t.ppf(0.975, freedom))
+    return float(stats.norm.ppf(0.975))
+
+
+def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
+    """Return the four main quantities and their derivatives by the parameters."""
+    values = fit.values
+    index = {name: i for i, name in enumerate(values)}
+
+    def gradient(by: dict[str, float]) -> NDArray[np.float64]:
+        row = np.zeros(len(values))
+        for name, derivative in by.items():
+            if name in index:
+                row[index[name]] = derivative
+        return row
+
+    gain = float(np.exp(values.get("log_gain", 0.0)))
+    sigma = float(np.exp(0.5 * values["log_read_dn2"])) / gain
+    current = values.get("dark_signal_dn_per_s", 0.0) / gain
+    return {
+        "offset_dn": (values["offset_dn"], gradient({"offset_dn": 1.0})),
+        "gain_dn_per_e": (gain, gradient({"log_gain": gain})),
+        "read_noise_e": (sigma, gradient({"log_read_dn2": 0.5 * sigma, "log_gain": -sigma})),
+        "dark_current_e_per_s": (current, gradient({"dark_signal_dn_per_s": 1 / gain, "log_gain": -current})),
+    }
+
+
+def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
+    """Return why gain and read noise in electrons cannot be told, None if they can."""
+    if "log_gain" not in fit.values:
+        return f"{_ONE_EXPOSURE}, or flats"
+    relative = fit.standard_error("log_gain")
+    if from_darks and not holds:
+        return f"without flats it rests on the darks, which contradict the model (see the warnings); {_FLATS_REMEDY}"
+    if not relative <= MOST_RELATIVE_SE:
+        error = f"{relative:.0%}" if relative < 10 else "larger than itself"
+        return (
+            f"its standard error would be {error} (limit {MOST_RELATIVE_SE:.0%}): the darks hold too few dark "
+            f"electrons to tell the gain from the read noise; {_FLATS_REMEDY}"
+        )
+    return None
+
+
+def _why_no_current(
+    fit: Fit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
+) -> str | None:
+    """Return why the dark current cannot be told, None if it can."""
+    if "dark_signal_dn_per_s" not in fit.values:
+        return _ONE_EXPOSURE
+    if why_no_gain is not None:
+        return f"dark current in electrons needs the gain: {why_no_gain}"
+    if not levels_hold:
+        return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
+    signal, se = fit.values["dark_signal_dn_per_s"], fit.standard_error("dark_signal_dn_per_s")
+    gain = float(np.exp(fit.values["log_gain"]))
+    noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
+    longest = float(moments.darks.exposure_s.max())
+    if signal + quantile * se < 0:
+        return (
+            f"the dark level falls with exposure time ({signal:.2g} DN/s), which dark current cannot do: the black "
+            "level drifted; record the exposures in turn, the camera settled"
+        )
+    if se > MOST_RELATIVE_SE * abs(signal) and se * longest / gain > MOST_RELATIVE_SE * noise_e2:
+        return (
+            f"its standard error would be {se / gain:.2g} e-/s, which over {longest:g} s is more than a tenth of the "
+            "read noise variance; record more darks of more and longer exposures, the camera settled"
+        )
+    return None
+
+
+def _interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
+    """Return an estimate with its interval, on a logarithmic scale for what cannot be negative."""
+    if positive:
+        factor = float(np.exp(quantile * se / value))
+        return Estimate(value, se, (value / factor, value * factor))
+    return Estimate(value, se, (value - quantile * se, value + quantile * se))
+
+
+def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
+    """Return the root of a variance that may be zero, times a scale."""
+    low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
+    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
+
+
+def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
+    """Return what needs no gain."""
+    read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
+    read = _interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), quantile, positive=True)
+    signal = Estimate(None, why=_ONE_EXPOSURE)
+    if "dark_signal_dn_per_s" in fit.values:
+        se = fit.standard_error("dark_signal_dn_per_s")
+        signal = _interval(fit.values["dark_signal_dn_per_s"], se, levels_quantile)
+    return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
+
+
+def _spreads(fit: Fit, gain: Estimate, why_no_gain: str | None, quantile: float) -> dict[str, Estimate]:
+    """Return the pixels' own spreads: DSNU and DCNU."""
+    dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
+    spreads = {"dsnu_dn": _root(dsnu2, se, quantile)}
+    if gain.value is None:
+        return spreads | {name: Estimate(None, why=why_no_gain) for name in ("dsnu_e", "dcnu_e_per_s")}
+    spreads["dsnu_e"] = _root(dsnu2, se, quantile, 1 / gain.value)
+    spreads["dcnu_e_per_s"] = Estimate(None, why=_ONE_EXPOSURE)
+    if "dcnu_dn2_per_s2" in fit.values:
+        dcnu2, se = fit.values["dcnu_dn2_per_s2"], fit.standard_error("dcnu_dn2_per_s2")
+        spreads["dcnu_e_per_s"] = _root(dcnu2, se, quantile, 1 / gain.value)
+    return spreads
+
+
+def _shared_noise(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+    """Return the noise that the pixels of a frame, a row or a column share."""
+    if "jitter_dn2" not in fit.values:
+        unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
+        return dict.fromkeys(("frame_jitter_dn", "row_noise_dn", "column_noise_dn"), unknown)
+    rows, columns = darks[0].pattern_dn.shape
+    noise = np.array(dark_variances_dn2(fit.values, np.array([one.conditions.exposure_s for one in darks])))
+    freedom = np.array([one.frames - 1.0 for one in darks])
+
+    def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
+        excess = float(np.average(np.array(variances) - noise / along, weights=freedom))
+        se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
+        return _root(excess, se, quantile)
+
+    return {
+        "frame_jitter_dn": _root(fit.values["jitter_dn2"], fit.standard_error("jitter_dn2"), quantile),
+        "row_noise_dn": shared([one.row_noise_dn2 for one in darks], columns, rows),
+        "column_noise_dn": shared([one.column_noise_dn2 for one in darks], rows, columns),
+    }
+
+
+def _profiles(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+    """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, here in DN."""
+    dark = max(darks, key=lambda one: one.frames)
+    rows, columns = dark.pattern_dn.shape
+    noise = dark_variances_dn2(fit.values, np.array([dark.conditions.exposure_s]))[0]
+
+    def pattern(profile: NDArray[np.float64], along: int, shared_dn2: float) -> Estimate:
+        chance = (max(float(noise) / along, shared_dn2) / dark.frames) + fit.values["dsnu_dn2"] / along
+        return _root(float(profile.var()) - chance, float(profile.var()) * np.sqrt(2 / profile.size), quantile)
+
+    return {
+        "dsnu_row_dn": pattern(dark.row_dn, columns, dark.row_noise_dn2),
+        "dsnu_column_dn": pattern(dark.column_dn, rows, dark.column_noise_dn2),
+    }
+
+
+def _from_flats(fitted: Fitted, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
+    """Return what only flats tell."""
+    prnu = Estimate(None, why=_NO_FLATS)
+    if response is not None:
+        prnu = _interval(response.prnu, response.prnu_se, quantile)
+    nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
+    if (bend := fitted.bend) is not None:
+        se = bend.standard_error("nonlinearity_per_dn")
+        nonlinearity = _interval(bend.values["nonlinearity_per_dn"], se, quantile)
+    efficiency = Estimate(None, why="no flat states its photons per pixel (`photons` in noise.toml)")
+    if gain.value is not None:
+        means_dn = fitted.moments.flats.mean_dn
+        charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]
+        found = quantum_efficiency(fitted.flats, charges, fitted.fit.standard_error("log_gain"))
+        if found is not None:
+            efficiency = _interval(*found, quantile, positive=True)
+    elif fitted.flats:
+        efficiency = Estimate(None, why=gain.why)
+    return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
+
+
+def _light_e(fit: Fit, flat: Series, mean_dn: float) -> float:
+    """Return the electrons that light made in a flat series."""
+    values = fit.values
+    signal = mean_dn - values["offset_dn"]
+    charge_dn = signal * (1 + values.get("nonlinearity_per_dn", 0.0) * signal)
+    dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.exposure_s
+    return float((charge_dn - dark_dn) / np.exp(values["log_gain"]))

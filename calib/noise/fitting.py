@@ -1,0 +1,104 @@
+"""Fitting the series of a sensor: pixels chosen, likelihood chosen, parameters found."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.noise.exact import fit_exact
+from calib.noise.gaussian import Fit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
+from calib.noise.moments import Moments, gather_moments
+from calib.noise.selection import (
+    Likelihood,
+    censored_start,
+    choose_likelihood,
+    collect_counts,
+    gaussian_start,
+    shared_noise_dn2,
+)
+from calib.noise.statistics import Series
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fit and what it rests on.
+
+    Attributes
+    ----------
+    darks, flats : sequence of Series
+        The frames, reduced.
+    moments : Moments
+        The same, reduced further.
+    likelihood : Likelihood
+        Which likelihood was maximised.
+    fit : Fit
+        Where.
+    bend : Fit, optional
+        The fit that let the response bend, where flats of three levels allow one.
+    """
+
+    darks: Sequence[Series]
+    flats: Sequence[Series]
+    moments: Moments
+    likelihood: Likelihood
+    fit: Fit
+    bend: Fit | None
+
+    @property
+    def dark_noise_dn2(self) -> list[float]:
+        """Pixel noise v_j of the dark series."""
+        return dark_variances_dn2(self.fit.values, self.moments.darks.exposure_s)
+
+    @property
+    def flat_noise_dn2(self) -> list[float]:
+        """Pixel noise of the flat series."""
+        return flat_variances_dn2(self.fit.values, self.moments.flats.mean_dn)
+
+    @property
+    def profiles_dn2(self) -> float:
+        """Variance that the fixed patterns of rows and columns add to the offsets of the pixels."""
+        return float(self.darks[0].row_dn.var() + self.darks[0].column_dn.var())
+
+
+def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_]) -> Fitted:
+    """Fit with the simplest likelihood that the frames allow.
+
+    Parameters
+    ----------
+    darks, flats : sequence of Series
+        At least one dark series.
+    usable : array (row, column), bool
+        Pixels to learn from.
+
+    Raises
+    ------
+    PoorFit, NotIdentifiable
+        The likelihood has no maximum, or too much is cut off at the black level to begin.
+    """
+    suspect = np.any([one.suspect for one in darks], axis=0)
+    moments = gather_moments(darks, flats, usable & ~suspect)
+    fit, bend = _fit_gaussian(moments)
+    # Among values cut off at the floor the highest look suspect, and leaving them out would bias the rest.
+    counts = collect_counts(darks, usable)
+    likelihood = choose_likelihood(counts, fit, shared_noise_dn2(darks, fit))
+    if likelihood is not Likelihood.GAUSSIAN:
+        exact = likelihood is Likelihood.EXACT
+        if exact:
+            counts = collect_counts(darks, usable & ~suspect)
+        start = gaussian_start(fit) if exact else censored_start(counts)
+        # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
+        spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
+        fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
+        bend = None
+    return Fitted(darks, flats, moments, likelihood, fit, bend)
+
+
+def _fit_gaussian(moments: Moments) -> tuple[Fit, Fit | None]:
+    """Fit a straight response, and where three light levels allow it a bent one; the bent one where it is bent."""
+    straight = fit_gaussian(moments)
+    if np.unique(np.round(moments.flats.mean_dn, -1)).size < 3:
+        return straight, None
+    bent = fit_gaussian(moments, nonlinear=True)
+    significant = abs(bent.values["nonlinearity_per_dn"]) > 3 * bent.standard_error("nonlinearity_per_dn")
+    return (bent if significant else straight), bent

@@ -1,0 +1,265 @@
+"""The marginal Gaussian likelihood of dark and flat frames, fitted with casadi and IPOPT.
+
+Model of a dark pixel i in frame k of series j: `dn = o_i + d_i t_j + jitter_k + noise`, the noise of variance
+
+    v_j = r + g d t_j + 1/12                                                             (1)
+
+with r = g²σ² the read noise in DN², d = g D the dark signal in DN/s and 1/12 the rounding to whole DN; EMVA 1288
+release 4 has the same line for flats, `σ_y² = K²σ_d² + 1/12 + K(μ_y − μ_dark)`, with K = g. Offsets and dark signals
+of the pixels are integrated out, o_i ~ N(μ, s²) and d_i ~ N(d, q²), instead of being fitted one by one: that would
+lose a degree of freedom in every pixel and series, and bias the noise by (n − 1)/n. What is left of the frames are the
+few numbers of `calib.noise.moments`; see there for the distribution of each.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import PoorFit
+from calib.noise.moments import FlatMoments, Moments
+
+ROUNDING_DN2 = 1.0 / 12.0
+
+# All three are needed for silence; the solver tries points where a variance is negative, and backs off by itself.
+SILENT: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Maximum-likelihood parameters and their covariance, here the inverse of the exact Hessian.
+
+    Attributes
+    ----------
+    values : dict
+        `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, where the design has them,
+        `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, `nonlinearity_per_dn` κ.
+    covariance : array (parameter, parameter)
+        In the order of `values`; zero for a jitter that came out as zero.
+    log_likelihood : float
+        At the maximum.
+    """
+
+    values: dict[str, float]
+    covariance: NDArray[np.float64]
+    log_likelihood: float
+
+    def standard_error(self, name: str) -> float:
+        """Return the standard error of one parameter, infinite for one that the design does not hold."""
+        if name not in self.values:
+            return float("inf")
+        index = list(self.values).index(name)
+        return float(np.sqrt(self.covariance[index, index]))
+
+
+def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
+    """Maximise the marginal likelihood.
+
+    Parameters
+    ----------
+    moments : Moments
+        Sufficient statistics; some series must have two frames or more.
+    nonlinear : bool
+        Fit the bend κ of the response too; needs flats at three light levels.
+
+    Raises
+    ------
+    PoorFit
+        IPOPT did not converge.
+    """
+    start, scale = _start(moments, nonlinear)
+    names = list(start)
+    x = ca.SX.sym("x", len(names))
+    parameters = {name: x[i] * scale[name] for i, name in enumerate(names)}
+    objective = _negative_log_likelihood(parameters, moments)
+    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, SILENT | {"ipopt.acceptable_iter": 0})
+    # The spreads over pixels may come out negative, as unbiased differences of variances do: a bound at zero would
+    # push what contradicts it (a pickup whose phase turns from frame to frame, say) into the read noise.
+    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in names]
+    found = solver(x0=[start[name] / scale[name] for name in names], lbx=lower)
+    if not solver.stats()["success"]:
+        raise PoorFit(
+            f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
+            f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
+        )
+    at = np.array(found["x"]).ravel()
+    hessian = np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
+    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(names)])
+    units = np.array([scale[name] for name in names])
+    return Fit(
+        values={name: float(at[i] * scale[name]) for i, name in enumerate(names)},
+        covariance=_inverse_on(hessian, free) * np.outer(units, units),
+        log_likelihood=-float(found["f"]),
+    )
+
+
+def log_likelihood(values: Mapping[str, float], moments: Moments) -> float:
+    """Return ln L at given parameters, up to a constant that depends on the frames alone."""
+    return -float(ca.DM(ca.evalf(ca.SX(_negative_log_likelihood(values, moments)))))
+
+
+def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.float64]:
+    """Return the Hessian of the negative log-likelihood at given parameters.
+
+    At the expected moments this is the Fisher information, for the likelihood is linear in the statistics.
+    """
+    x = ca.SX.sym("x", len(values))
+    objective = _negative_log_likelihood({name: x[i] for i, name in enumerate(values)}, moments)
+    return np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(list(values.values())))
+
+
+def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64]) -> list[Any]:
+    """Return the pixel noise of each dark series, eq. (1), from numbers or casadi expressions alike.
+
+    A dark signal that falls, because the black level drifts, has no shot noise to take away.
+    """
+    gain = _exp(values["log_gain"]) if "log_gain" in values else 0.0
+    slope = ca.fmax(values.get("dark_signal_dn_per_s", 0.0), 0.0)
+    return [_exp(values["log_read_dn2"]) + gain * slope * t + ROUNDING_DN2 for t in exposure_s]
+
+
+def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) -> list[Any]:
+    """Return the pixel noise of each flat series, eq. (1) with a response that bends.
+
+    The charge behind a signal s is (s/g)(1 + κs), so that one more electron raises s by g/(1 + 2κs).
+    """
+    if not mean_dn.size:
+        return []
+    gain, read = _exp(values["log_gain"]), _exp(values["log_read_dn2"])
+    bend = values.get("nonlinearity_per_dn", 0.0)
+    signals = [mean - values["offset_dn"] for mean in mean_dn]
+    return [(gain * s * (1 + bend * s) + read) / (1 + 2 * bend * s) ** 2 + ROUNDING_DN2 for s in signals]
+
+
+def flat_log_likelihood(
+    values: Mapping[str, Any], flats: FlatMoments, freedom: float
+) -> tuple[Any, list[Any], list[float]]:
+    """Return ln L of the flats up to a constant, and each series' ln v and half its degrees of freedom."""
+    total, log_variances, half_freedom = 0.0, [], []
+    for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
+        weight = flats.evenness[index]
+        degrees = (flats.frames[index] - 1) * freedom * weight
+        total -= _chi_squared(degrees, flats.within_dn2[index] * weight, v)
+        log_variances.append(ca.log(v))
+        half_freedom.append(0.5 * degrees)
+    return total, log_variances, half_freedom
+
+
+def _exp(value: Any) -> Any:
+    """Return exp of a number or a casadi expression."""
+    return ca.exp(value) if isinstance(value, ca.SX) else float(np.exp(value))
+
+
+def _negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
+    """Return −ln L, up to a constant, as a casadi expression."""
+    darks = moments.darks
+    dark_v = dark_variances_dn2(values, darks.exposure_s)
+    total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
+    for j, v in enumerate(dark_v):
+        freedom = (darks.frames[j] - 1) * moments.freedom
+        total += _chi_squared(freedom, darks.within_dn2[j], v)
+    return total - flat_log_likelihood(values, moments.flats, moments.freedom)[0]
+
+
+def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
+    """Return −ln of the restricted likelihood of the frames' levels about the straight line μ + d t.
+
+    Restricted (REML): offset and slope are integrated out, or the jitter would come out too small by the two degrees
+    of freedom that they take.
+    """
+    darks, t = moments.darks, moments.darks.exposure_s
+    total, weight = 0.0, []
+    for j, v in enumerate(dark_v):
+        level = values["jitter_dn2"] + v / moments.pixels
+        weight.append(darks.frames[j] / level)
+        line = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * t[j]
+        total += _chi_squared(darks.frames[j] - 1, darks.level_scatter_dn2[j], level)
+        total += _chi_squared(1.0, (darks.mean_dn[j] - line) ** 2, level / darks.frames[j])
+    w, wt, wtt = (sum(w * t[j] ** power for j, w in enumerate(weight)) for power in range(3))
+    fitted = w * wtt - wt**2 if "dark_signal_dn_per_s" in values else w
+    return total + 0.5 * ca.log(fitted)
+
+
+def _chi_squared(freedom: float, squares: Any, variance: Any) -> Any:
+    """Return −ln of the likelihood of a sum of squares that is `variance` × χ² with `freedom` degrees of freedom."""
+    return 0.5 * (freedom * ca.log(variance) + squares / variance)
+
+
+def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
+    """Return −ln of the Wishart likelihood of the scatter of pixel means, covariance A + s² 11ᵀ + q² ttᵀ.
+
+    A is diagonal with v_j/n_j. Woodbury's identity leaves 2 × 2 matrices, whatever the number of series. A series of
+    one frame has no part: it cannot tell its noise from its pattern, so nothing would check what it claims.
+    """
+    several = moments.darks.frames > 1
+    scatter = moments.darks.scatter_dn2[np.ix_(several, several)]
+    weight = [n / v for n, v in zip(moments.darks.frames, dark_v, strict=True) if n > 1]
+    t = moments.darks.exposure_s[several]
+    s2, q2 = values["dsnu_dn2"], values.get("dcnu_dn2_per_s2", 0.0)
+    basis = (np.ones_like(t), t)
+    p = [[sum(w * a[j] * b[j] for j, w in enumerate(weight)) for b in basis] for a in basis]
+    k = [[_quadratic(weight, a, b, scatter) for b in basis] for a in basis]
+    # M = I + K P with K = diag(s², q²); ln det(A + U K Uᵀ) = ln det A + ln det M, and (M⁻¹ K) mends the trace.
+    m00, m01, m10, m11 = 1 + s2 * p[0][0], s2 * p[0][1], q2 * p[1][0], 1 + q2 * p[1][1]
+    determinant = m00 * m11 - m01 * m10
+    mended = (m11 * s2 * k[0][0] - m01 * q2 * k[1][0] - m10 * s2 * k[0][1] + m00 * q2 * k[1][1]) / determinant
+    log_det = ca.log(determinant) - sum(ca.log(w) for w in weight)
+    trace = sum(w * scatter[j, j] for j, w in enumerate(weight)) - mended
+    return 0.5 * (moments.freedom * log_det + trace)
+
+
+def _quadratic(weight: list[Any], a: NDArray[np.float64], b: NDArray[np.float64], scatter: NDArray[np.float64]) -> Any:
+    """Return aᵀ W S W b with W = diag(weight)."""
+    left = ca.vertcat(*[w * a[j] for j, w in enumerate(weight)])
+    right = ca.vertcat(*[w * b[j] for j, w in enumerate(weight)])
+    return ca.mtimes([left.T, ca.DM(scatter), right])
+
+
+def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[str, float]]:
+    """Return a start from simple moments, and the scale of each parameter; the keys are what the design can hold."""
+    darks, flats = moments.darks, moments.flats
+    measured = darks.frames > 1
+    variance = darks.within_dn2[measured] / ((darks.frames[measured] - 1) * moments.freedom)
+    read = max(float(variance.min()) - ROUNDING_DN2, 1e-3)
+    exposures, repeated = np.unique(darks.exposure_s), np.unique(darks.exposure_s[measured])
+    line = np.polyfit(darks.exposure_s, darks.mean_dn, 1) if exposures.size > 1 else (0.0, darks.mean_dn.mean())
+    # No less than the levels could show; from far off the search for a small jitter would be long.
+    jitter = float(darks.level_scatter_dn2.sum() / max((darks.frames - 1).sum(), 1)) + read / moments.pixels
+    start = {"offset_dn": float(line[1]), "log_read_dn2": float(np.log(read)), "dsnu_dn2": read, "jitter_dn2": jitter}
+    scale = {"offset_dn": 1.0, "log_read_dn2": 1.0, "dsnu_dn2": read, "jitter_dn2": jitter}
+    if exposures.size > 1:
+        longest = float(exposures[-1])
+        start["dark_signal_dn_per_s"], scale["dark_signal_dn_per_s"] = float(line[0]), 1 / longest
+    if repeated.size > 1:
+        start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
+    if flats.frames.size or repeated.size > 1:
+        start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
+    if nonlinear:
+        start["nonlinearity_per_dn"], scale["nonlinearity_per_dn"] = 0.0, 1e-6
+    return start, scale
+
+
+def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> float:
+    """Return a first gain: excess variance over signal, from the brightest flat or the longest dark."""
+    darks, flats = moments.darks, moments.flats
+    if flats.frames.size:
+        k = int(flats.mean_dn.argmax())
+        excess = flats.within_dn2[k] / ((flats.frames[k] - 1) * moments.freedom) - read_dn2
+        signal = flats.mean_dn[k] - darks.mean_dn.min()
+    else:
+        k = int((darks.exposure_s * (darks.frames > 1)).argmax())
+        excess = darks.within_dn2[k] / max((darks.frames[k] - 1) * moments.freedom, 1) - read_dn2
+        signal = slope_dn_per_s * darks.exposure_s[k]
+    return float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
+
+
+def _inverse_on(hessian: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Invert the Hessian over the free parameters; directions that it does not determine get infinite variance."""
+    covariance = np.zeros_like(hessian)
+    values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
+    inverse = np.where(values > 1e-9, 1.0 / np.maximum(values, 1e-9), 1e12)
+    covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
+    return covariance

@@ -1,0 +1,83 @@
+"""How often each digital number should occur, beside how often it did: the test that eyes can make of a fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import fftconvolve
+
+from calib.noise.mass import mass_function
+
+# The Poisson sum costs memory with the charge; beyond this many electrons the normal law is as good.
+_MOST_CHARGE_E = 200.0
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Values of one dark series.
+
+    Attributes
+    ----------
+    exposure_s : float
+        Its exposure.
+    value_dn : array (value,)
+        Digital numbers, every one from the lowest to the highest.
+    count, expected : array (value,)
+        How often each occurred among the sampled pixels and frames, and should by the fit.
+    """
+
+    exposure_s: float
+    value_dn: NDArray[np.int64]
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64]
+
+
+def compare_histogram(
+    values_dn: NDArray[np.int32],
+    exposure_s: float,
+    fitted: Mapping[str, float],
+    pattern_dn2: float,
+    floor_dn: int | None,
+) -> Histogram:
+    """Count the values of one dark series and predict the counts.
+
+    Parameters
+    ----------
+    values_dn : array (frame, pixel), int
+        The values.
+    exposure_s : float
+        Their exposure.
+    fitted : mapping
+        Parameters of the fit, gain included.
+    pattern_dn2 : float
+        Variance over pixels, rows, columns and frames of the level about which a value scatters.
+    floor_dn : int, optional
+        Where values are cut off.
+    """
+    lowest, highest = int(values_dn.min()), int(values_dn.max())
+    value = np.arange(lowest, highest + 1)
+    spread_dn = float(np.sqrt(max(pattern_dn2, 1e-4)))
+    per_dn = max(2, int(np.ceil(2 / spread_dn)))
+    reach = int(np.ceil(5 * spread_dn))
+    offset = np.arange(-reach * per_dn, reach * per_dn + 1) / per_dn
+    prior = np.exp(-0.5 * (offset / spread_dn) ** 2)
+    prior /= prior.sum()
+    u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - fitted["offset_dn"]
+    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in _logs(u, exposure_s, fitted))
+    if floor_dn == lowest:
+        mass[0] = tail[0]
+    count = np.bincount((values_dn - lowest).ravel(), minlength=value.size)
+    return Histogram(exposure_s, value, count, np.maximum(mass, 0) * values_dn.size)
+
+
+def _logs(
+    u_dn: NDArray[np.float64], exposure_s: float, fitted: Mapping[str, float]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ln of the mass at each u = value − offset, and of all below it."""
+    slope = max(fitted.get("dark_signal_dn_per_s", 0.0), 1e-9)
+    log_gain = fitted["log_gain"]
+    charge = float(slope / np.exp(log_gain)) * exposure_s
+    masses = mass_function(u_dn, exposure_s, charge, exact=charge < _MOST_CHARGE_E, spread=False)
+    table = masses(np.array([log_gain, 0.5 * fitted["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
+    return table.log_mass[:, 0], table.log_tail[:, 0]

@@ -1,0 +1,116 @@
+"""From series to the few numbers that the Gaussian likelihood rests on.
+
+Under Gaussian noise nothing else of the frames matters: with R rows, C columns and P pixels in use, taking levels and
+profiles out costs R + C − 1 of the P degrees of freedom, and of what is left
+
+- the sum of squares within pixels, W_j, is v_j χ² with (n_j − 1)(P − R − C + 1) degrees of freedom,
+- the J × J scatter of the pixel means of the dark series is Wishart with P − R − C + 1,
+- the mean of each dark series and the scatter of its frames' levels tell the dark signal and the frame jitter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.noise.statistics import Series
+
+
+@dataclass(frozen=True)
+class DarkMoments:
+    """The dark series, J of them, over the P pixels in use.
+
+    Attributes
+    ----------
+    exposure_s, frames : array (series,)
+        Exposure time t_j and number of frames n_j.
+    mean_dn : array (series,)
+        Mean over frames and pixels.
+    within_dn2 : array (series,)
+        W_j: squared deviations of pixels from their own means, summed over frames and pixels.
+    level_scatter_dn2 : array (series,)
+        Squared deviations of the frames' mean levels from the series' level, summed over frames.
+    scatter_dn2 : array (series, series)
+        S: products of the pixels' deviations from the mean pattern, summed over pixels.
+    """
+
+    exposure_s: NDArray[np.float64]
+    frames: NDArray[np.float64]
+    mean_dn: NDArray[np.float64]
+    within_dn2: NDArray[np.float64]
+    level_scatter_dn2: NDArray[np.float64]
+    scatter_dn2: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FlatMoments:
+    """The flat series, L of them (possibly none).
+
+    Attributes
+    ----------
+    frames, mean_dn, within_dn2 : array (series,)
+        As for the darks.
+    evenness : array (series,)
+        ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: by so much the degrees of freedom shrink where some pixels,
+        being brighter, are noisier than others.
+    """
+
+    frames: NDArray[np.float64]
+    mean_dn: NDArray[np.float64]
+    within_dn2: NDArray[np.float64]
+    evenness: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """The sufficient statistics of all series; `pixels` are in use and give `freedom` degrees of freedom."""
+
+    pixels: float
+    freedom: float
+    darks: DarkMoments
+    flats: FlatMoments
+
+
+def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]) -> Moments:
+    """Sum the statistics of the series over the pixels in use.
+
+    Parameters
+    ----------
+    darks, flats : sequence of Series
+        At least one dark series; all of one size.
+    used : array (row, column), bool
+        Pixels that are neither defective nor suspect.
+    """
+    rows, columns = used.shape
+    pixels = float(used.sum())
+    patterns = np.array([series.pattern_dn[used] for series in darks], np.float64)
+    dark_dn = darks[0].mean_dn
+    return Moments(
+        pixels=pixels,
+        freedom=max(pixels - rows - columns + 1.0, 1.0),
+        darks=DarkMoments(
+            exposure_s=np.array([series.conditions.exposure_s for series in darks]),
+            frames=np.array([series.frames for series in darks], np.float64),
+            mean_dn=np.array([_mean_dn(series, used) for series in darks]),
+            within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in darks]),
+            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
+            scatter_dn2=patterns @ patterns.T,
+        ),
+        flats=FlatMoments(
+            frames=np.array([series.frames for series in flats], np.float64),
+            mean_dn=np.array([_mean_dn(series, used) for series in flats]),
+            within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in flats]),
+            evenness=np.array([_evenness(series.mean_dn[used] - dark_dn[used]) for series in flats]),
+        ),
+    )
+
+
+def _mean_dn(series: Series, used: NDArray[np.bool_]) -> float:
+    """Return the mean over frames and the pixels in use."""
+    return float(series.mean_dn.mean(where=used))
+
+
+def _evenness(signal_dn: NDArray[np.float64]) -> float:
+    """Return ⟨s⟩²/⟨s²⟩."""
+    return float(signal_dn.mean() ** 2 / max(float((signal_dn**2).mean()), 1e-12))

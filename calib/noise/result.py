@@ -1,0 +1,150 @@
+"""What a calibration says: each quantity with its standard error, or the reason why the frames cannot tell it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import NotIdentifiable
+from calib.noise.histogram import Histogram
+from calib.noise_model import Map, NoiseModel
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A measured number, or none.
+
+    Attributes
+    ----------
+    value : float, optional
+        None where the frames cannot tell.
+    se : float, optional
+        Standard error.
+    ci95 : tuple of float, optional
+        95 % confidence interval.
+    why : str, optional
+        Why there is no value, and what to record to get one.
+    """
+
+    value: float | None
+    se: float | None = None
+    ci95: tuple[float, float] | None = None
+    why: str | None = None
+
+
+@dataclass(frozen=True)
+class NoiseMaps:
+    """Numbers per pixel, arrays (row, column) of float32; None where the frames cannot tell.
+
+    Attributes
+    ----------
+    offset_dn, offset_variance_dn2 : array
+        Posterior mean of each pixel's offset, and the variance of its error.
+    dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
+        Likewise of the dark current.
+    read_noise_e : array, optional
+        Read noise.
+    relative_response : array, optional
+        Photo response over its mean: vignetting and PRNU.
+    vignetting : array, optional
+        Its smooth part.
+    unusable : array, bool
+        Hot, noisy, stuck or dead.
+    """
+
+    offset_dn: NDArray[np.float32]
+    offset_variance_dn2: NDArray[np.float32]
+    unusable: NDArray[np.bool_]
+    dark_current_e_per_s: NDArray[np.float32] | None = None
+    dark_current_variance_e2_per_s2: NDArray[np.float32] | None = None
+    read_noise_e: NDArray[np.float32] | None = None
+    relative_response: NDArray[np.float32] | None = None
+    vignetting: NDArray[np.float32] | None = None
+
+
+@dataclass(frozen=True)
+class TransferPoint:
+    """One series as EMVA 1288 plots it: means, variances and the model's own, in DN and DN²."""
+
+    kind: str
+    exposure_s: float
+    frames: int
+    mean_dn: float
+    variance_dn2: float
+    variance_se_dn2: float
+    model_mean_dn: float
+    model_variance_dn2: float
+
+
+@dataclass(frozen=True)
+class NoiseCalibration:
+    """The result of `calib.noise.calibrate`.
+
+    Attributes
+    ----------
+    estimates : dict of Estimate
+        `offset_dn, gain_dn_per_e, read_noise_e, read_noise_dn, dark_current_e_per_s, dark_signal_dn_per_s, dsnu_e,
+        dsnu_dn, dsnu_row_dn, dsnu_column_dn, dcnu_e_per_s, frame_jitter_dn, row_noise_dn, column_noise_dn, prnu,
+        quantum_efficiency, nonlinearity_per_dn`.
+    covariance : tuple (names, array)
+        Of offset, gain, read noise and dark current; of those that have values.
+    likelihood : str
+        The likelihood that was used, by name.
+    maps : NoiseMaps
+        Per pixel.
+    hot, noisy, dead : array (row, column), bool
+        The kinds of unusable pixels.
+    variance_ratio : array (row, column)
+        Each pixel's variance over the frames, over that of the model.
+    points : tuple of TransferPoint
+        The series.
+    histograms : tuple of Histogram
+        Values of the shortest and the longest darks, and their prediction; none while the gain is unknown.
+    saturation_dn : float
+        As given.
+    warnings : tuple of str
+        What is doubtful about the frames.
+    """
+
+    estimates: dict[str, Estimate]
+    covariance: tuple[tuple[str, ...], NDArray[np.float64]]
+    likelihood: str
+    maps: NoiseMaps
+    hot: NDArray[np.bool_]
+    noisy: NDArray[np.bool_]
+    dead: NDArray[np.bool_]
+    variance_ratio: NDArray[np.float32]
+    points: tuple[TransferPoint, ...]
+    histograms: tuple[Histogram, ...]
+    saturation_dn: float
+    warnings: tuple[str, ...]
+
+    def noise_model(self, *, per_pixel: bool = True) -> NoiseModel:
+        """Return what reconstruction needs, per pixel or as single numbers.
+
+        The gain per pixel is the gain alone: photo response belongs to the light, `maps.relative_response`, not to the
+        electrons.
+
+        Raises
+        ------
+        NotIdentifiable
+            Offset, gain or read noise has no value.
+        """
+        required = {name: self._value(name) for name in ("offset_dn", "gain_dn_per_e", "read_noise_e")}
+        dark, efficiency = self.estimates["dark_current_e_per_s"].value, self.estimates["quantum_efficiency"].value
+        fields: dict[str, Map] = {**required, "dark_current_e_per_s": max(dark or 0.0, 0.0)}
+        if per_pixel:
+            maps = {name: getattr(self.maps, name) for name in ("offset_dn", "read_noise_e", "dark_current_e_per_s")}
+            fields |= {name: values for name, values in maps.items() if values is not None}
+        return NoiseModel(
+            **fields,
+            quantum_efficiency=min(efficiency or 1.0, 1.0),
+            saturation_dn=self.saturation_dn,
+        )
+
+    def _value(self, name: str) -> float:
+        """Return a value that must be there."""
+        estimate = self.estimates[name]
+        if estimate.value is None:
+            raise NotIdentifiable(f"{name}: no value: {estimate.why}")
+        return estimate.value

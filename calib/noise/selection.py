@@ -1,0 +1,150 @@
+"""Which likelihood the frames call for, and where its search begins.
+
+Gaussian unless it fails: where values are cut off at the black level it is biased (gain nearly doubled, read noise a
+third), and with read noise below an electron it wastes what single electrons tell.
+"""
+
+from collections.abc import Sequence
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from calib.errors import NotIdentifiable
+from calib.noise.exact import Counts
+from calib.noise.gaussian import Fit, dark_variances_dn2
+from calib.noise.statistics import Series, sample_index
+
+# Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.
+_SUBTLE_READ_E, _SUBTLE_READ_DN = 1.0, 0.5
+
+# Noise that pixels share, as a fraction of the read noise variance, from which single electrons are not to be seen.
+_MOST_SHARED = 0.03
+
+# So many of the values, on the lowest one and more than on the next, are values cut off there.
+_CUT_OFF_FRACTION = 2e-3
+
+# A table of masses wider than this is refused: then the Gaussian is good enough.
+MOST_VALUES_DN = 2000
+
+
+class Likelihood(StrEnum):
+    """The likelihoods by the names that results give."""
+
+    GAUSSIAN = "marginal Gaussian"
+    CENSORED = "censored Gaussian (Tobit), marginal over offsets"
+    EXACT = "rounded Poisson-Gauss, marginal over offsets"
+
+
+def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
+    """Return the sampled values of the pixels in use, with the floor where they are cut off."""
+    keep = used.ravel()[sample_index(used.shape)]
+    values = tuple(series.sample_dn[:, keep] for series in darks)
+    floor = min(series.floor_dn for series in darks)
+    pooled = np.concatenate([v.ravel() for v in values])
+    at_floor, above = (pooled == floor).mean(), (pooled == floor + 1).mean()
+    cut_off = at_floor > max(_CUT_OFF_FRACTION, above)
+    return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
+
+
+def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
+    """Return the variance that frames, rows and columns add to all their pixels at once, in the quietest series."""
+    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
+    variance, quietest = min(
+        (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
+    )
+    dark = darks[quietest]
+    rows, columns = dark.pattern_dn.shape
+    banding = dark.row_noise_dn2 + dark.column_noise_dn2 - variance * (1 / columns + 1 / rows)
+    return gaussian.values["jitter_dn2"] + max(float(banding), 0.0)
+
+
+def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likelihood:
+    """Return the simplest likelihood that the frames allow.
+
+    Parameters
+    ----------
+    counts : Counts
+        The values, with their floor where they are cut off.
+    gaussian : Fit
+        What the Gaussian likelihood makes of them.
+    shared_dn2 : float
+        Noise that pixels share. It blurs single electrons and has no part in the exact likelihood, so that with more
+        than a little of it the Gaussian is the better one.
+    """
+    widest = max(int(np.ptp(values)) for values in counts.values_dn)
+    if widest > MOST_VALUES_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
+        return Likelihood.GAUSSIAN
+    read_dn = np.exp(0.5 * gaussian.values["log_read_dn2"])
+    read_e = read_dn / np.exp(gaussian.values["log_gain"])
+    telling = gaussian.standard_error("log_gain") < 0.5 and gaussian.values["dark_signal_dn_per_s"] > 0
+    if counts.floor_dn is not None:
+        return Likelihood.CENSORED
+    if shared_dn2 > _MOST_SHARED * read_dn**2:
+        return Likelihood.GAUSSIAN
+    if read_dn < _SUBTLE_READ_DN or (telling and read_e < _SUBTLE_READ_E):
+        return Likelihood.EXACT
+    return Likelihood.GAUSSIAN
+
+
+def gaussian_start(gaussian: Fit) -> dict[str, float]:
+    """Return a start for the exact likelihood from the Gaussian fit."""
+    values = gaussian.values
+    signal = max(values["dark_signal_dn_per_s"], 1e-6)
+    return {
+        "log_gain": values["log_gain"],
+        "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
+        "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
+        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
+        "offset_dn": values["offset_dn"],
+        "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
+    }
+
+
+def censored_start(counts: Counts) -> dict[str, float]:
+    """Return a start for the censored likelihood from quantiles above the floor.
+
+    Raises
+    ------
+    NotIdentifiable
+        At some two exposures fewer than a twentieth of the values stand above the black level.
+    """
+    exposure, centre, spread2 = [], [], []
+    for t, values in zip(counts.exposure_s, counts.values_dn, strict=True):
+        normal = _normal_above(values, counts.floor_dn or 0)
+        if normal is not None:
+            exposure.append(t)
+            centre.append(normal[0])
+            spread2.append(normal[1])
+    if len(set(exposure)) < 2:
+        raise NotIdentifiable(
+            f"the darks are cut off at the black level: of {len(counts.exposure_s)} exposures {len(exposure)} have a "
+            "twentieth of their values above it, 2 are needed; raise the camera's black offset and record them again"
+        )
+    slope, offset = np.polyfit(exposure, centre, 1)
+    slope = max(float(slope), 1e-6)
+    excess, both = np.polyfit(exposure, spread2, 1)
+    gain = float(np.clip(excess / slope, 0.05, 50.0))
+    read2 = max(0.7 * float(both), 0.1)
+    return {
+        "log_gain": float(np.log(gain)),
+        "log_read_e": 0.5 * float(np.log(read2)) - float(np.log(gain)),
+        "log_dark_e_per_s": float(np.log(slope / gain)),
+        "dcnu": 0.05,
+        "offset_dn": float(offset),
+        "log_dsnu_dn": 0.5 * float(np.log(max(0.3 * float(both), 0.1))),
+    }
+
+
+def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
+    """Return mean and variance of the normal law through two quantiles above the floor, None if too little is."""
+    hidden = float((values == floor_dn).mean())
+    if hidden > 0.95:
+        return None
+    low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
+    # Half a DN of dither undoes the steps that rounding makes.
+    dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
+    below, above = np.quantile(dithered, [low, high])
+    sigma = float((above - below) / (ndtri(high) - ndtri(low)))
+    return float(below - sigma * ndtri(low)), sigma**2

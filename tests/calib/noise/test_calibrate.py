@@ -1,0 +1,212 @@
+"""What a calibration says, and what it declines to say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
+from calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
+from calib.noise.selection import Likelihood
+from tests.calib.noise.darkroom import Chip, Frames, darks, expose, specimen
+
+EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
+IN_ELECTRONS = ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "dsnu_e", "dcnu_e_per_s")
+
+
+def take(
+    chip: Chip, rng: np.random.Generator, exposures_s: tuple[float, ...] = EXPOSURES_S, frames: int = 10
+) -> list[Series]:
+    taken = darks(chip, exposures_s, frames, rng)
+    return [measure_series(series, Conditions("dark", t)) for t, series in taken.items()]
+
+
+def light(chip: Chip, rng: np.random.Generator, photons: float, frames: int = 4, level: int = 0) -> Series:
+    flats: Frames = [(f"flat_{level}_{k}", expose(chip, 0.1, rng, photons)) for k in range(frames)]
+    return measure_series(flats, Conditions("flat", 0.1, level, photons))
+
+
+def value(result: NoiseCalibration, name: str) -> float:
+    found = result.estimates[name].value
+    assert found is not None, result.estimates[name].why
+    return found
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_short_darks_alone_give_no_gain_and_no_read_noise_in_electrons(seed: int) -> None:
+    chip, rng = specimen(seed, shape=(128, 128))
+    result = calibrate(take(chip, rng, (0.1, 0.3, 1.0)))
+    for name in IN_ELECTRONS:
+        estimate = result.estimates[name]
+        assert (estimate.value, estimate.se, estimate.ci95) == (None, None, None)
+        assert estimate.why
+    assert "record" in str(result.estimates["gain_dn_per_e"].why)
+    assert result.maps.read_noise_e is result.maps.dark_current_e_per_s is None
+    assert value(result, "read_noise_dn") == pytest.approx(2 * 12**0.5, rel=0.01)
+    with pytest.raises(NotIdentifiable, match="gain_dn_per_e: no value"):
+        result.noise_model()
+
+
+def test_one_exposure_tells_neither_gain_nor_dark_current_but_with_flats_the_gain() -> None:
+    chip, rng = specimen(1)
+    series = take(chip, rng, (0.1,))
+    assert calibrate(series).estimates["gain_dn_per_e"].value is None
+    result = calibrate([*series, light(chip, rng, 8000.0, 10)])
+    assert value(result, "gain_dn_per_e") == pytest.approx(2, rel=0.02)
+    assert "one exposure" in str(result.estimates["dark_current_e_per_s"].why)
+
+
+def test_a_camera_without_dark_current_gets_an_interval_around_zero() -> None:
+    chip, rng = specimen(2, dark_current_e_per_s=0.0)
+    result = calibrate([*take(chip, rng), light(chip, rng, 8000.0, 10)])
+    interval = result.estimates["dark_current_e_per_s"].ci95
+    assert interval is not None
+    assert interval[0] <= 0 <= interval[1] < 0.01
+    assert calibrate(take(chip, rng)).estimates["gain_dn_per_e"].value is None
+
+
+def test_hot_pixels_are_found_and_kept_out() -> None:
+    chip, rng = specimen(3, shape=(256, 256), hot_fraction=0.005, dcnu=0.1)
+    result = calibrate(take(chip, rng))
+    found = result.hot
+    assert (found & chip.hot).sum() / chip.hot.sum() >= 0.99
+    assert (found & chip.hot).sum() / found.sum() >= 0.95
+    assert value(result, "dark_current_e_per_s") == pytest.approx(0.2, rel=0.02)
+    np.testing.assert_array_equal(result.maps.unusable, result.hot | result.noisy | result.dead)
+
+
+def test_a_pixel_that_flips_between_two_levels_is_noisy() -> None:
+    chip, rng = specimen(4)
+    taken = darks(chip, EXPOSURES_S, 10, rng)
+    series = []
+    for t, frames in taken.items():
+        for k, (_, frame) in enumerate(frames):
+            frame[20, 30] += 40 * (k % 2)
+        series.append(measure_series(frames, Conditions("dark", t)))
+    result = calibrate(series)
+    assert result.noisy[20, 30]
+    assert result.noisy.sum() <= 2
+
+
+def test_what_flats_tell() -> None:
+    chip, rng = specimen(5, shape=(96, 96), prnu=0.02)
+    chip.response[40, 50] = 0.1
+    result = calibrate(
+        [*take(chip, rng), *(light(chip, rng, p, 8, level) for level, p in enumerate((500.0, 5000.0, 20000.0)))]
+    )
+    assert result.dead[40, 50]
+    assert result.dead.sum() == 1
+    prnu, efficiency = result.estimates["prnu"], result.estimates["quantum_efficiency"]
+    assert prnu.value == pytest.approx(0.02, rel=0.05)
+    assert efficiency.ci95 is not None
+    assert efficiency.ci95[0] < 0.5 < efficiency.ci95[1]
+    bend = result.estimates["nonlinearity_per_dn"]
+    assert bend.value is not None
+    assert bend.se is not None
+    assert abs(bend.value) < 3 * bend.se < 1e-6
+    usable = ~result.maps.unusable
+    response = result.maps.relative_response
+    assert response is not None
+    assert np.std((response - chip.response)[usable]) < 0.004
+
+
+def test_a_bent_response_is_measured_and_spares_the_gain() -> None:
+    bend_per_dn = 2e-6
+    chip, rng = specimen(6, shape=(128, 128), bend_per_dn=bend_per_dn)
+    flats = [light(chip, rng, p, 10, level) for level, p in enumerate((500.0, 4000.0, 10000.0, 20000.0, 28000.0))]
+    result = calibrate([*take(chip, rng), *flats])
+    assert value(result, "nonlinearity_per_dn") == pytest.approx(bend_per_dn, rel=0.15)
+    assert value(result, "gain_dn_per_e") == pytest.approx(2, rel=0.01)
+
+
+def test_maps_beat_raw_means_and_know_how_good_they_are() -> None:
+    chip, rng = specimen(7, shape=(128, 128), dcnu=0.2)
+    series = take(chip, rng)
+    result = calibrate(series)
+    raw_rms = np.sqrt(np.mean((series[0].mean_dn - chip.offset_dn) ** 2))
+    error = result.maps.offset_dn - chip.offset_dn
+    assert np.sqrt(np.mean(error**2)) < 0.75 * raw_rms
+    assert np.mean(error**2 / result.maps.offset_variance_dn2) == pytest.approx(1, abs=0.1)
+    dark, variance = result.maps.dark_current_e_per_s, result.maps.dark_current_variance_e2_per_s2
+    assert dark is not None
+    assert variance is not None
+    assert np.mean((dark - chip.dark_current_e_per_s) ** 2 / variance) == pytest.approx(1, abs=0.15)
+
+
+def test_frames_that_cannot_be_used_are_named() -> None:
+    chip, rng = specimen(8)
+    taken = darks(chip, EXPOSURES_S, 2, rng)
+    singles = [measure_series(frames[:1], Conditions("dark", t)) for t, frames in taken.items()]
+    with pytest.raises(TooFewFrames, match=r"dark_0.1s_0: the only one of the darks of 0.1 s"):
+        calibrate(singles)
+    twice = [("first", taken[1.0][0][1]), ("copy", taken[1.0][0][1].copy())]
+    with pytest.raises(CopiedFrame, match="copy and first: the same frame"):
+        calibrate([measure_series(twice, Conditions("dark", 1.0))])
+    with pytest.raises(TooFewFrames, match="flat_0_0: the only one"):
+        calibrate([*take(chip, rng), light(chip, rng, 1000.0, 1)])
+    with pytest.raises(NotIdentifiable, match="no dark frames"):
+        calibrate([light(chip, rng, 1000.0)])
+    with pytest.raises(TooFewFrames, match="64 pixels"):
+        calibrate(take(*specimen(8, shape=(8, 8))))
+
+
+def test_a_lone_frame_among_the_series_warns() -> None:
+    chip, rng = specimen(9)
+    lone = measure_series(darks(chip, [30.0], 1, rng)[30.0], Conditions("dark", 30.0))
+    result = calibrate([*take(chip, rng), lone])
+    assert any("dark_30s_0: the only one of the darks of 30 s" in warning for warning in result.warnings)
+    assert value(result, "gain_dn_per_e") == pytest.approx(2, rel=0.06)
+
+
+def test_a_drifting_black_level_takes_the_dark_current_away() -> None:
+    chip, rng = specimen(10, jitter_dn=0.05)
+    series = take(chip, rng)
+    drifted = [replace(s, levels_dn=s.levels_dn + d) for s, d in zip(series, (0, 6.0, 0, 0), strict=True)]
+    result = calibrate(drifted)
+    assert result.estimates["dark_current_e_per_s"].value is None
+    assert result.estimates["gain_dn_per_e"].value is None
+    assert any("no straight line" in warning for warning in result.warnings)
+
+
+def test_noise_that_changed_between_series_is_noticed() -> None:
+    quiet, rng = specimen(11, shape=(128, 128))
+    noisy = replace(quiet, sensor=replace(quiet.sensor, read_noise_e=4.2))
+    series = [*take(quiet, rng, (0.1, 1.0, 60.0)), *take(noisy, rng, (10.0,))]
+    result = calibrate(series)
+    assert any("off the model's in variance" in warning for warning in result.warnings)
+    assert result.estimates["gain_dn_per_e"].value is None
+
+
+def test_a_plain_sensor_raises_no_doubts() -> None:
+    result = calibrate(take(*specimen(12, shape=(128, 128), jitter_dn=0.5, banding_dn=1.0, dcnu=0.1)))
+    assert result.warnings == ()
+    assert result.likelihood is Likelihood.GAUSSIAN
+    for name, truth in [("frame_jitter_dn", 0.5), ("row_noise_dn", 1.0), ("dsnu_dn", 3.0), ("dcnu_e_per_s", 0.02)]:
+        assert value(result, name) == pytest.approx(truth, rel=0.3), name
+
+
+def test_the_model_for_reconstruction_is_in_electrons() -> None:
+    chip, rng = specimen(13)
+    model = calibrate(take(chip, rng), saturation_dn=4095.0).noise_model()
+    electrons = model.electrons(expose(chip, 0.1, rng, photons=8.0))
+    assert electrons.mean() == pytest.approx(4.02, abs=0.5)
+    assert model.saturation_dn == 4095
+    assert np.shape(model.offset_dn) == chip.sensor.shape
+    assert np.mean(model.read_variance_e2()) == pytest.approx(12, rel=0.1)
+
+
+def test_the_solver_prints_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    chip, rng = specimen(14)
+    calibrate(take(chip, rng))
+    calibrate(take(*specimen(14, read_noise_e=0.3, shape=(32, 32))))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_histograms_follow_the_fitted_mass_function() -> None:
+    for changes in ({}, {"read_noise_e": 0.3}, {"offset_dn": 2.0}):
+        result = calibrate(take(*specimen(15, **changes)))
+        for histogram in result.histograms:
+            common = histogram.expected > 200
+            share = histogram.count[common] / histogram.expected[common]
+            assert np.abs(share - 1).max() < 0.25
+            assert histogram.count.sum() == pytest.approx(histogram.expected.sum(), rel=0.01)

@@ -1,0 +1,158 @@
+"""The marginal likelihood against dense covariances and closed forms; its fit against the Cramér-Rao bound."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import linalg, stats
+
+from calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
+from calib.noise.gaussian import dark_variances_dn2, fit_gaussian, log_likelihood
+from calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
+from tests.calib.noise.darkroom import Chip, darks, expose, specimen
+
+EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
+TRUTH = {"gain_dn_per_e": 2.0, "read_noise_e": 12.0**0.5, "dark_current_e_per_s": 0.2}
+NO_FLATS = FlatMoments(*(np.empty(0) for _ in range(4)))
+
+
+def take_darks(chip: Chip, rng: np.random.Generator, frames: int = 10) -> list[Series]:
+    taken = darks(chip, EXPOSURES_S, frames, rng)
+    return [measure_series(series, Conditions("dark", t)) for t, series in taken.items()]
+
+
+def test_likelihood_is_that_of_the_dense_covariance() -> None:
+    """P pixels rotated into P − 1 contrasts and a mean: each contrast is an independent normal vector."""
+    rng = np.random.default_rng(0)
+    t, n, pixels = np.array([0.0, 2.0, 7.0]), np.array([2, 3, 4]), 40
+    frame_t, series_of = np.repeat(t, n), np.repeat(np.arange(3), n)
+    y = rng.normal(0, 3, (pixels, n.sum())) + rng.normal(0, 2, (pixels, 1)) + rng.normal(1, 0.4, (pixels, 1)) * frame_t
+    contrasts, levels = linalg.helmert(pixels) @ y, y.mean(0)
+    means = np.array([contrasts[:, series_of == j].mean(1) for j in range(3)])
+    moments = Moments(
+        float(pixels),
+        pixels - 1.0,
+        DarkMoments(
+            t,
+            n.astype(float),
+            np.array([levels[series_of == j].mean() for j in range(3)]),
+            np.array([contrasts[:, series_of == j].var(1).sum() * n[j] for j in range(3)]),
+            np.array([levels[series_of == j].var() * n[j] for j in range(3)]),
+            means @ means.T,
+        ),
+        NO_FLATS,
+    )
+
+    def dense(values: dict[str, float]) -> float:
+        v = np.array(dark_variances_dn2(values, t), float)[series_of]
+        covariance = np.diag(v) + values["dsnu_dn2"] + values["dcnu_dn2_per_s2"] * np.outer(frame_t, frame_t)
+        total = stats.multivariate_normal(np.zeros(n.sum()), covariance).logpdf(contrasts).sum()
+        level = values["jitter_dn2"] + v / pixels
+        line = values["offset_dn"] + values["dark_signal_dn_per_s"] * frame_t
+        design = np.stack([np.ones_like(frame_t), frame_t])
+        restricted = np.linalg.slogdet((design / level) @ design.T)[1]
+        return float(total + stats.norm(line, np.sqrt(level)).logpdf(levels).sum() - 0.5 * restricted)
+
+    one = {
+        "offset_dn": 0.1,
+        "log_read_dn2": 2.0,
+        "dsnu_dn2": 3.0,
+        "jitter_dn2": 0.05,
+        "dark_signal_dn_per_s": 0.9,
+        "dcnu_dn2_per_s2": 0.1,
+        "log_gain": 0.3,
+    }
+    for name, changed in [
+        ("dsnu_dn2", 5.0),
+        ("dcnu_dn2_per_s2", 0.3),
+        ("log_gain", 0.8),
+        ("log_read_dn2", 2.4),
+        ("jitter_dn2", 0.2),
+        ("offset_dn", 0.3),
+    ]:
+        other = one | {name: changed}
+        ours = log_likelihood(one, moments) - log_likelihood(other, moments)
+        assert ours == pytest.approx(dense(one) - dense(other), rel=1e-9), name
+
+
+def test_bound_on_the_gain_from_one_bright_flat_pair() -> None:
+    """With read noise out of sight a pair's variance is the gain times the signal: relative error sqrt(2 / P)."""
+    sensor = Sensor(2.0, 10.0, 1e-3, dsnu_e=1.0)
+    bound = cramer_rao(sensor, (0.0, 60.0), 10, 10_000, flat_signals_dn=(1e9,))["gain_dn_per_e"]
+    assert bound / 2.0 == pytest.approx(np.sqrt(2 / 10_000), rel=0.02)
+
+
+def test_bound_falls_with_the_root_of_the_pixels() -> None:
+    sensor = Sensor(2.0, 12**0.5, 0.2, dsnu_e=1.5)
+    few, many = (cramer_rao(sensor, EXPOSURES_S, 10, pixels) for pixels in (4096, 65536))
+    for name in few:
+        assert few[name] == pytest.approx(4 * many[name], rel=1e-3)
+    assert many["gain_dn_per_e"] / 2.0 == pytest.approx(0.0038, rel=0.05)
+
+
+@pytest.mark.parametrize("rough", [False, True], ids=["plain", "jitter, banding, hot pixels, DCNU"])
+def test_errors_reach_the_bound_and_intervals_cover(rough: bool) -> None:
+    repeats, first_seed = 200, 1000
+    faults = {"jitter_dn": 1.0, "banding_dn": 1.0, "hot_fraction": 0.005, "dcnu": 0.1} if rough else {}
+    sensor = Sensor(2.0, 12**0.5, 0.2, dsnu_e=1.5, dcnu_e_per_s=0.02 * rough, jitter_dn=1.0 * rough)
+    bound = cramer_rao(sensor, EXPOSURES_S, 10, 64 * 64)
+    errors: dict[str, list[float]] = {name: [] for name in TRUTH}
+    covered = dict.fromkeys(TRUTH, 0)
+    for seed in range(first_seed, first_seed + repeats):
+        result = calibrate(take_darks(*specimen(seed, **faults)))
+        for name, truth in TRUTH.items():
+            estimate = result.estimates[name]
+            assert estimate.value is not None
+            assert estimate.ci95 is not None
+            errors[name].append(estimate.value - truth)
+            covered[name] += estimate.ci95[0] <= truth <= estimate.ci95[1]
+    for name in TRUTH:
+        assert np.sqrt(np.mean(np.square(errors[name]))) <= 1.1 * bound[name], name
+        assert 0.92 <= covered[name] / repeats <= 0.98, name
+
+
+def test_a_profile_likelihood_is_off_by_a_tenth_where_the_marginal_one_is_not() -> None:
+    """Offsets fitted pixel by pixel and series by series leave n − 1 of n degrees of freedom, unaccounted for."""
+    chip, rng = specimen(7, shape=(256, 256))
+    series = take_darks(chip, rng)
+    moments = gather_moments(series, [], np.ones(chip.sensor.shape, bool))
+    d = moments.darks
+    profiled = d.within_dn2 / (d.frames * moments.pixels)
+    signal, _ = np.polyfit(d.exposure_s, d.mean_dn, 1)
+    excess, read_dn2 = np.polyfit(d.exposure_s, profiled, 1)
+    naive_gain, naive_read = excess / signal, np.sqrt(read_dn2) / (excess / signal)
+    assert naive_gain / 2.0 - 1 == pytest.approx(-0.10, abs=0.02)
+    assert naive_read / 12**0.5 - 1 == pytest.approx(0.055, abs=0.02)
+    fit = fit_gaussian(moments)
+    assert np.exp(fit.values["log_gain"]) / 2.0 - 1 == pytest.approx(0, abs=3 * fit.standard_error("log_gain"))
+    assert fit.standard_error("log_gain") < 0.005
+
+
+def test_gain_and_read_noise_from_flats_are_sharper_and_right() -> None:
+    chip, rng = specimen(8)
+    series = take_darks(chip, rng)
+    flats = [
+        measure_series(
+            [(f"f{level}{k}", expose(chip, 0.1, rng, photons)) for k in range(8)], Conditions("flat", 0.1, level)
+        )
+        for level, photons in enumerate((400.0, 4000.0, 20000.0))
+    ]
+    dark_only, both = calibrate(series), calibrate([*series, *flats])
+    for name in ("gain_dn_per_e", "read_noise_e"):
+        estimate, alone = both.estimates[name], dark_only.estimates[name]
+        assert estimate.value is not None
+        assert estimate.se is not None
+        assert alone.se is not None
+        assert abs(estimate.value - TRUTH[name]) < 3.5 * estimate.se
+        assert estimate.se < 0.6 * alone.se
+
+
+def test_scaling_the_time_unit_changes_nothing_but_the_dark_current() -> None:
+    series = take_darks(*specimen(9))
+    slower = [replace(s, conditions=replace(s.conditions, exposure_s=s.conditions.exposure_s * 60)) for s in series]
+    one, other = calibrate(series), calibrate(slower)
+    for name, factor in [("gain_dn_per_e", 1), ("read_noise_e", 1), ("offset_dn", 1), ("dark_current_e_per_s", 60)]:
+        a, b = one.estimates[name].value, other.estimates[name].value
+        assert a is not None
+        assert b is not None
+        assert a == pytest.approx(b * factor, rel=1e-5)

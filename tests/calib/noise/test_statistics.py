@@ -1,0 +1,88 @@
+"""The streamed statistics against whole stacks of frames, and the frames that do not belong."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from calib.errors import BadFrame, LightLeak, SaturatedFlat
+from calib.noise import Conditions, measure_series
+from tests.calib.noise.darkroom import darks, expose, specimen
+
+DARK = Conditions("dark", 1.0)
+FLAT = Conditions("flat", 1.0)
+
+
+@given(
+    hnp.arrays(
+        np.uint16, st.tuples(st.integers(2, 6), st.integers(3, 9), st.integers(3, 9)), elements=st.integers(90, 110)
+    )
+)
+def test_one_pass_gives_what_the_whole_stack_gives(stack: np.ndarray) -> None:
+    values = stack + 25.0 * np.arange(stack[0].size).reshape(stack[0].shape)
+    series = measure_series(((str(k), frame.astype(np.uint16)) for k, frame in enumerate(values)), FLAT)
+    assume(not series.suspect.any())
+    level = values.mean((1, 2), keepdims=True)
+    rows, columns = values.mean(2, keepdims=True) - level, values.mean(1, keepdims=True) - level
+    stripped = values - level - rows - columns
+    np.testing.assert_allclose(series.levels_dn, level.ravel())
+    np.testing.assert_allclose(series.pattern_dn, stripped.mean(0), atol=1e-4)
+    np.testing.assert_allclose(series.within_dn2, ((stripped - stripped.mean(0)) ** 2).sum(0), atol=1e-3, rtol=1e-5)
+    np.testing.assert_allclose(series.mean_dn, values.mean(0), atol=1e-3)
+    np.testing.assert_allclose(series.row_noise_dn2, rows.var(0, ddof=1).mean(), atol=1e-9)
+
+
+def test_the_noise_of_a_hot_pixel_stays_out_of_its_row() -> None:
+    rng = np.random.default_rng(1)
+    stack = np.rint(rng.normal(100, 5, (400, 16, 16)))
+    stack[:, 8, 8] += np.rint(rng.normal(3000, 400, 400))
+    series = measure_series(((str(k), f.astype(np.uint16)) for k, f in enumerate(stack)), FLAT)
+    variance = series.within_dn2 / 399
+    assert variance[8, :8].mean() == pytest.approx(variance[3, :8].mean(), rel=0.1)
+
+
+def test_frames_may_jitter_but_a_leak_is_named() -> None:
+    for seed in range(40):
+        chip, rng = specimen(seed, jitter_dn=1.0)
+        frames = darks(chip, [1.0], 10, rng)[1.0]
+        measure_series(frames, DARK)
+        leaky = expose(chip, 1.0, rng, photons=40.0)
+        with pytest.raises(LightLeak, match="the_leak: mean"):
+            measure_series([*frames[:6], ("the_leak", leaky), *frames[6:]], DARK)
+
+
+def test_a_leak_that_is_a_pattern_is_named() -> None:
+    chip, rng = specimen(3)
+    frames = darks(chip, [1.0], 6, rng)[1.0]
+    spotted = frames[0][1].astype(int)
+    spotted[10:30, 10:30] += 40
+    spotted[34:54, 34:54] -= 40
+    with pytest.raises(BadFrame, match="spotted: its pixels spread"):
+        measure_series([*frames[1:], ("spotted", spotted.astype(np.uint16))], DARK)
+
+
+def test_two_frames_are_too_few_to_say_which_leaks_unless_it_is_plain() -> None:
+    chip, rng = specimen(4, jitter_dn=1.0)
+    frames = darks(chip, [1.0], 2, rng)[1.0]
+    measure_series(frames, DARK)
+    with pytest.raises(LightLeak, match="bright"):
+        measure_series([frames[0], ("bright", expose(chip, 1.0, rng, photons=100.0))], DARK)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_saturated_flat_is_named(stated: bool) -> None:
+    chip, rng = specimen(5)
+    flat = np.minimum(expose(chip, 1.0, rng, photons=4000.0), 4095)
+    with pytest.raises(SaturatedFlat, match=r"flat_7: .* stand at 4095 DN"):
+        measure_series([("flat_7", flat)], FLAT, 4095 if stated else np.inf)
+
+
+def test_frames_of_another_size_are_refused() -> None:
+    with pytest.raises(ValueError, match="odd: "):
+        measure_series([("first", np.zeros((8, 8), int)), ("odd", np.zeros((8, 9), int))], DARK)
+
+
+def test_no_frame_is_no_series() -> None:
+    with pytest.raises(ValueError, match="at least one frame"):
+        measure_series([], DARK)

@@ -1,0 +1,43 @@
+"""Noise sets on disk, for the tests of the commands that read them."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tifffile
+import tomli_w
+from numpy.typing import NDArray
+
+from tests.calib.noise.darkroom import Chip, expose
+
+
+def write_frames(folder: Path, frames: Sequence[tuple[NDArray[Any], Mapping[str, Any]]], **settings: Any) -> Path:
+    """Write frames as TIFF with `noise.toml`; each comes with the keys of its entry, named in order if not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    for index, (pixels, keys) in enumerate(frames):
+        name = f"{keys['kind']}_{index:02d}.tiff"
+        tifffile.imwrite(folder / name, pixels)
+        entries.append({"file": name} | dict(keys))
+    (folder / "noise.toml").write_text(tomli_w.dumps({"format": 1, **settings, "frame": entries}))
+    return folder
+
+
+def take_set(
+    chip: Chip,
+    rng: np.random.Generator,
+    exposures_s: Sequence[float] = (0.1, 1.0, 10.0, 60.0),
+    frames: int = 4,
+    photons: Sequence[float] = (),
+) -> list[tuple[NDArray[np.uint16], dict[str, Any]]]:
+    """Take darks, and `frames` flats of 0.1 s at each light level."""
+    taken: list[tuple[NDArray[np.uint16], dict[str, Any]]] = [
+        (expose(chip, t, rng), {"kind": "dark", "exposure_s": t, "temperature_c": -10.0})
+        for t in exposures_s
+        for _ in range(frames)
+    ]
+    for level, light in enumerate(photons):
+        keys = {"kind": "flat", "exposure_s": 0.1, "temperature_c": -10.0, "level": level, "photons": light}
+        taken += [(expose(chip, 0.1, rng, light), keys) for _ in range(frames)]
+    return taken
