@@ -1,0 +1,1 @@
+"""The simulated world: what the rig would meet, without the rig."""
