@@ -29,6 +29,8 @@ app = App(
     result_action="return_value",
 )
 
+app.command("pipelines.stage:app", name="stage")
+
 
 @app.meta.default
 def _launch(

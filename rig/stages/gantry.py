@@ -248,16 +248,17 @@ class Gantry:
             self._trusted &= self._controller.stop()
 
     def recover(self) -> None:
-        """After an error, make the controller listen again, without moving.
+        """After an error, make the controller listen again, without moving, and read its settings anew.
 
         Raises
         ------
-        StageError
+        StageError, WrongFirmware
             It cannot be made to; the message says what the operator should do.
         """
         self._here = None
         with self._judged():
             self._trusted &= self._controller.recover()
+            self._identity = self._controller.identify()
 
     def close(self) -> None:
         """Give the port back; the stage stays where it is, and must be homed after the next connect."""

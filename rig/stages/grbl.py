@@ -20,6 +20,7 @@ _POLL_INTERVAL_S = 0.2
 _BOOT_S = 3.0
 _RECOVERY_S = 2.0
 _RESET_S = 0.4
+_LOCKED = 9
 
 _STATES = {
     "Hold": ("is on hold", "release what holds it, then recover", True),
@@ -139,7 +140,7 @@ class Grbl:
             self.connect()
             return False
         deadline_s = self._clock.now_s() + _RECOVERY_S
-        while self._clock.now_s() < deadline_s:
+        while self._clock.now_s() + _POLL_INTERVAL_S + _RESET_S < deadline_s:
             report = self._poll_anything()
             if report is None:
                 # After alarms 1 and 2 GRBL answers nothing but a reset, and drops one that comes too early.
@@ -195,15 +196,18 @@ class Grbl:
             if isinstance(message, grbl.Ok):
                 return said
             if isinstance(message, grbl.Error):
-                meaning = grbl.ERRORS.get(message.code, "see the firmware's list of errors")
-                raise StageRejected(
-                    f"the controller refused {text!r}: error:{message.code}, {meaning}; "
-                    + ("home the stage first" if message.code == 9 else "nothing moved")
-                )
+                raise self._refusal(text, message.code)
             said.append(message)
         raise StageTimeout(
             f"no answer to {text!r} within {bound_s:g} s; check cable and power, then recover and home the stage"
         )
+
+    def _refusal(self, text: str, code: int) -> RigError:
+        """Return the failure that stands for an error in answer to `text`."""
+        if code == _LOCKED and (report := self._poll()).state in ("Alarm", *_STATES):
+            return self._state_failure(report)
+        meaning = grbl.ERRORS.get(code, "see the firmware's list of errors")
+        return StageRejected(f"the controller refused {text!r}: error:{code}, {meaning}; nothing moved by it")
 
     def _receive(self, deadline_s: float) -> grbl.Message | None:
         """Return the next message; an alarm or a restart, which may come at any time, is raised."""

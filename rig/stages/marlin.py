@@ -15,7 +15,7 @@ from rig.stages.protocol import AxisIndex, Box, Identity, Point
 from rig.stages.transport import LineTransport
 
 _BOOT_S = 3.0
-_QUIET_S = 0.5
+_QUIET_S = 0.3
 _ANSWER_S = bound_s(0.0)
 _RESENDS = 5
 
@@ -102,8 +102,7 @@ class Marlin:
         try:
             self._line.send(b"M410\n")
             # Its own ok, which answers no numbered line, must not be taken for the next answer.
-            for _ in self._line.lines_until(self._clock.now_s() + 0.1):
-                pass
+            self._ignore_for(0.1)
         except StageLost:
             pass  # what cannot be reached cannot be stopped, and the failure that led here is already on its way
 
@@ -111,11 +110,11 @@ class Marlin:
         """Get Marlin to answer again; a controller that was killed has to restart, by opening the port anew."""
         if self._line.is_open:
             try:
-                for _ in self._line.lines_until(self._clock.now_s() + 0.1):
-                    pass
+                self._ignore_for(0.1)
                 self._command("M114 R", _QUIET_S)
             except StageLost:
                 if self._line.is_open:
+                    self._ignore_for(_QUIET_S)
                     self._begin()
                     return False
             except StageError:
@@ -128,6 +127,11 @@ class Marlin:
     def close(self) -> None:
         """Close the connection."""
         self._line.close()
+
+    def _ignore_for(self, duration_s: float) -> None:
+        """Take no notice of what is said for a while."""
+        for _ in self._line.lines_until(self._clock.now_s() + duration_s):
+            pass
 
     def _begin(self) -> None:
         """Begin counting lines, and set what every motion relies on: millimetres, absolute, motors kept on."""
@@ -158,15 +162,16 @@ class Marlin:
         self._sent += 1
         for _ in range(1 + _RESENDS):
             self._line.send(marlin.numbered(self._sent, command))
-            said = self._await_ok(command, self._clock.now_s() + bound_s)
+            said = self._await_ok(command, bound_s)
             if said is not None:
                 return said
         raise StageLost(
             f"line {self._sent} arrived damaged {1 + _RESENDS} times in a row; use a shorter or shielded cable"
         )
 
-    def _await_ok(self, command: str, deadline_s: float) -> list[marlin.Message] | None:
+    def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
         """Return what was said up to the `ok`, or None when the line is wanted again."""
+        deadline_s = self._clock.now_s() + bound_s
         said: list[marlin.Message] = []
         resend = False
         while (text := self._line.next_line(deadline_s)) is not None:
@@ -177,7 +182,10 @@ class Marlin:
                 resend = True
             if isinstance(message, marlin.Ok) or (isinstance(message, marlin.PositionReport) and message.is_ok):
                 return None if resend else self._accepted(said, command)
-        raise StageTimeout(f"no answer to {command!r} in time; check cable and power, then recover and home the stage")
+        raise StageTimeout(
+            f"no answer to {command!r} within {bound_s:.1f} s; look whether the stage still moves, "
+            "check cable and power, then recover and home it"
+        )
 
     def _accepted(self, said: list[marlin.Message], command: str) -> list[marlin.Message]:
         """Return `said` unless it holds a refusal."""
@@ -191,7 +199,7 @@ class Marlin:
         failure: RigError | None = None
         if isinstance(message, marlin.Start):
             failure = StageLost("the controller has restarted, and its position is lost; check its power, then home it")
-        elif isinstance(message, marlin.Resend) and message.number != self._sent:
+        elif isinstance(message, marlin.Resend) and message.number != self._sent and self._sent > 0:
             failure = StageLost(
                 f"the controller waits for line {message.number} and was sent {self._sent}: it has restarted, "
                 "and its position is lost; recover and home it"

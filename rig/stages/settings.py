@@ -6,7 +6,7 @@ from msgspec import Struct
 
 from rig.stages.protocol import Box
 
-type ProtocolName = Literal["grbl", "marlin"]
+type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
 
 class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -15,7 +15,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     protocol : str
-        What its controller speaks.
+        What its controller speaks; `simulated` needs no port and no hardware.
     port : str
         Serial device or pyserial URL, such as `socket://127.0.0.1:7000`.
     baud : int
@@ -33,7 +33,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     protocol: ProtocolName
-    port: str
+    port: str = ""
     baud: int = 115200
     axes: tuple[str, str] = ("X", "Y")
     feed_mm_per_min: float | None = None
@@ -42,6 +42,8 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     keep_out: tuple[Box, ...] = ()
 
     def __post_init__(self) -> None:
+        if not self.port and self.protocol != "simulated":
+            raise ValueError("stage.port is missing; give the serial device, such as /dev/ttyUSB0")
         if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
         if self.approach_mm < 0.0:

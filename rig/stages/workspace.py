@@ -38,7 +38,7 @@ class Workspace(Struct, frozen=True):
             if not self.travel_mm.holds(point, _ROUNDING_MM):
                 raise OutsideTravel(
                     f"position {point} is outside the travel {self.travel_mm}; "
-                    "move the grid's origin or reduce its pitch"
+                    "choose one inside, or move the grid's origin"
                 )
         for start, end in pairwise(path):
             for box in self.keep_out:

@@ -137,6 +137,7 @@ class Mechanics:
     switch_at_high_end: bool
     on_idle: Callable[[], None] = lambda: None
     on_switch: Callable[[], None] = lambda: None
+    endless: bool = False
     _commanded: Vector = (0.0, 0.0)
     _queue: list[tuple[Vector, float, float]] = field(default_factory=list)
     _motion: Motion | None = None
@@ -232,7 +233,7 @@ class Mechanics:
         self._end_motion()
         self._motion = motion
         duration_s = motion.profile.duration_s
-        self._events = [self.clock.after(duration_s, self._finish)]
+        self._events = [] if self.endless else [self.clock.after(duration_s, self._finish)]
         open_now = not any(self.switches())
         hit_s = self._first_contact_s(motion) if open_now else None
         if hit_s is not None:

@@ -255,7 +255,7 @@ class SimulatedMarlin:
     def _release_after(self, seconds: float | None) -> None:
         """Set after how long motors let go; 0 is never, none is now."""
         if seconds is None:
-            self._release()
+            self.release_motors()
             return
         self._idle_limit_s = seconds
         self._watch_idle()
@@ -266,9 +266,9 @@ class SimulatedMarlin:
             self._motors_off.cancel()
             self._motors_off = None
         if self._idle_limit_s and not self.mechanics.moving:
-            self._motors_off = self.clock.after(self._idle_limit_s, self._release)
+            self._motors_off = self.clock.after(self._idle_limit_s, self.release_motors)
 
-    def _release(self) -> None:
+    def release_motors(self) -> None:
         """Let the motors go: the carriages sag by a millimetre, and nobody counts it."""
         self.homed = [False, False]
         for axis in self.mechanics.axes:

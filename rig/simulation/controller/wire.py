@@ -46,6 +46,10 @@ class Wire:
         self._free_at_s = max(self._free_at_s, now_s + _LATENCY_S) + len(data) * _SECONDS_PER_BYTE
         self._under_way.append(self._clock.after(self._free_at_s - now_s, lambda: self._arrive(data)))
 
+    def hold_up(self, duration_s: float) -> None:
+        """Let nothing more through to the host for a while; it arrives afterwards."""
+        self._free_at_s = self._clock.now_s() + duration_s
+
     def arrived(self) -> bool:
         """Return whether bytes wait for the host."""
         return bool(self._arrived)
