@@ -103,7 +103,11 @@ class DriftWatch:
         ------
         PositionDrifted
             With what is suspect. The stage may need `recover` and `home`.
+        PlanRefused
+            There is nothing to compare with, since `begin` did not end well.
         """
+        if set(self._speed_mm_per_s) != set(self._homings()):
+            raise PlanRefused("drift cannot be checked: homing was not timed at the beginning; begin the watch first")
         try:
             if self._stage.identify().homes_together:
                 self._require_open_switches()

@@ -61,12 +61,15 @@ class Grbl:
         self._line.open()
         if self._await_banner(_BOOT_S):
             return
-        # Boards with a USB port of their own keep running. The line end makes other firmwares answer too.
+        # Boards with a USB port of their own keep running. The line end makes other firmwares answer too, and is
+        # itself answered with an ok, which must not be left for the first command to find.
         self._line.send(_POLL + b"\n")
+        reported = False
         for text in self._line.lines_until(self._clock.now_s() + 1.0):
             _refuse_other_firmware(text)
-            if isinstance(grbl.parse(text), grbl.Report):
-                return
+            reported = reported or isinstance(grbl.parse(text), grbl.Report)
+        if reported:
+            return
         raise StageTimeout(
             f"no answer as from GRBL within {_BOOT_S + 1.0:g} s; check power, baud rate and protocol of the controller"
         )
@@ -139,6 +142,7 @@ class Grbl:
         if not self._line.is_open:
             self.connect()
             return False
+        self._line.send(b"\n")  # whatever is left of a damaged line must not be joined to the next
         deadline_s = self._clock.now_s() + _RECOVERY_S
         while self._clock.now_s() + _POLL_INTERVAL_S + _RESET_S < deadline_s:
             report = self._poll_anything()

@@ -15,7 +15,7 @@ from rig.stages.protocol import AxisIndex, Box, Identity, Point
 from rig.stages.transport import LineTransport
 
 _BOOT_S = 3.0
-_QUIET_S = 0.3
+_QUIET_S = 0.2
 _ANSWER_S = bound_s(0.0)
 _RESENDS = 5
 
@@ -141,12 +141,13 @@ class Marlin:
 
     def _await_start(self) -> None:
         """Wait until the controller has started and fallen silent, or has shown that it did not restart."""
-        last_s = self._clock.now_s() + _BOOT_S
-        deadline_s, started = last_s, False
+        deadline_s = last_s = self._clock.now_s() + _BOOT_S
+        started = False
         while (text := self._line.next_line(deadline_s)) is not None:
             if re.match(r"Grbl", text, re.IGNORECASE):
                 raise WrongFirmware(f"the controller answers as GRBL ({text[:60]!r}); use protocol 'grbl'")
-            started = started or isinstance(marlin.parse(text), marlin.Start)
+            if not started and isinstance(marlin.parse(text), marlin.Start):
+                started, last_s = True, self._clock.now_s() + 2.0 * _QUIET_S
             if started:
                 deadline_s = min(self._clock.now_s() + _QUIET_S, last_s)
 
