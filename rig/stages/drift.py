@@ -56,33 +56,39 @@ class DriftWatch:
         self._stage = stage
         self._limit_mm = limit_mm
         self._unchecked: list[object] = []
+        self._doubtful: list[object] = []
         self._home = Point(math.nan, math.nan)
         self._taken_s: dict[AxisIndex | None, float] = {}
         self._speed_mm_per_s: dict[AxisIndex | None, float] = {}
 
     @property
     def unchecked(self) -> tuple[object, ...]:
-        """What was visited since the last good check."""
+        """What was visited since the last good check, and will be vouched for or not by the next."""
         return tuple(self._unchecked)
+
+    @property
+    def doubtful(self) -> tuple[object, ...]:
+        """What was visited before a check that failed, or was never checked before the scale was set anew."""
+        return tuple(self._doubtful)
 
     def visited(self, what: object) -> None:
         """Note that `what` (a node, a frame) relies on the stage being on its scale."""
         self._unchecked.append(what)
 
-    def begin(self) -> tuple[object, ...]:
-        """Home, and learn how long homing takes from known distances.
+    def begin(self) -> None:
+        """Home, and learn how long homing takes from known distances; begin again whenever the stage was homed.
 
-        Returns
-        -------
-        tuple
-            What was visited since the last good check: homing has moved the scale, so it can be checked no more.
+        Homing sets the scale anew: what was visited before and not checked can be checked no more, and is doubtful.
 
         Raises
         ------
         PlanRefused
             Drift of the limit cannot be told from the jitter of the clock, or not at all.
+        PositionDrifted
+            Homing does not take as long twice.
         """
-        unchecked, self._unchecked = self.unchecked, []
+        self._doubt()
+        self._speed_mm_per_s.clear()
         self._home = self._stage.home().position.point
         if self._stage.identify().homes_together and self._stage.identify().pull_off_mm <= self._limit_mm:
             raise PlanRefused(
@@ -94,10 +100,10 @@ class DriftWatch:
             far_s = self._timed(axis, _RUN_UP_MM)
             self._taken_s[axis] = far_s
             self._speed_mm_per_s[axis] = self._speed(far_s - near_s)
-        return unchecked
+        self.check()  # a disturbance while homing was timed would mislead every later check
 
     def check(self) -> Drift:
-        """Home again; what was visited is on its scale if this returns, and suspect if it raises.
+        """Home again; what was visited is on its scale if this returns, and doubtful if it raises.
 
         Raises
         ------
@@ -158,7 +164,9 @@ class DriftWatch:
     def _speed(self, difference_s: float) -> float:
         """Return the homing speed from the time that the half run-up takes."""
         if difference_s <= 0.0:
-            raise PlanRefused("homing takes as long from far as from near, so drift cannot be measured by its time")
+            raise PlanRefused(
+                "homing takes as long from far as from near, so its time tells no drift; go without drift checks"
+            )
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:
             raise PlanRefused(
@@ -167,10 +175,17 @@ class DriftWatch:
             )
         return speed
 
+    def _doubt(self) -> tuple[object, ...]:
+        """Count what is unchecked as doubtful, and return it."""
+        doubtful, self._unchecked = self.unchecked, []
+        self._doubtful.extend(doubtful)
+        return doubtful
+
     def _drifted(self, why: str) -> PositionDrifted:
-        """Return the failure that names what is suspect."""
+        """Return the failure that names what is suspect, and count it as doubtful."""
+        suspect = self._doubt()
         return PositionDrifted(
-            f"the stage has lost its scale: {why}; {len(self._unchecked)} positions since the last good check are "
-            "suspect; look for an obstacle or too high an acceleration, home, and take them again",
-            suspect=self.unchecked,
+            f"the stage has lost its scale: {why}; {len(suspect)} positions since the last good check are suspect: "
+            "look for an obstacle or too high an acceleration, home, and take them again",
+            suspect=suspect,
         )

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 
 from rig.errors import NotHomed
+from rig.stages.drift import DriftWatch
 from rig.stages.protocol import Stage
 
 
-def recover(stage: Stage, may_home: Callable[[str], bool]) -> bool:
+def recover(stage: Stage, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
     """Make the stage usable again after a `StageError`.
 
     Parameters
@@ -16,11 +17,8 @@ def recover(stage: Stage, may_home: Callable[[str], bool]) -> bool:
     may_home : callable
         Asked, with the question in words, before the stage moves to its switches: a prompt to the operator, or an
         answer given in advance (`lambda question: True`).
-
-    Returns
-    -------
-    bool
-        Whether it was homed, so that what had been visited can no longer be checked for drift.
+    watch : DriftWatch, optional
+        Begins anew if the stage is homed; what was not yet checked for drift becomes doubtful.
 
     Raises
     ------
@@ -31,8 +29,10 @@ def recover(stage: Stage, may_home: Callable[[str], bool]) -> bool:
     """
     stage.recover()
     if stage.trusted:
-        return False
+        return
     if not may_home("The stage's position is lost. Home it now? It will move to its switches."):
         raise NotHomed("homing was declined and the stage's position is not known; home it before going on")
-    stage.home()
-    return True
+    if watch is None:
+        stage.home()
+    else:
+        watch.begin()
