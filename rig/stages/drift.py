@@ -165,7 +165,7 @@ class DriftWatch:
         """Return the homing speed from the time that the half run-up takes."""
         if difference_s <= 0.0:
             raise PlanRefused(
-                "homing takes as long from far as from near, so its time tells no drift; go without drift checks"
+                "homing takes as long from near as from far: its time shows no drift; do without the check"
             )
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:

@@ -279,12 +279,12 @@ class SimulatedGrbl:
     def _gcode(self, line: str) -> int:
         """Run the few lines of G-code that a stage may meet: G0, G1 and G92."""
         parsed = dict(_axis_words(line))
-        if re.match(r"G92(?!\d)", line):
+        if re.search(r"G92(?!\d)", line):
             here = self.mechanics.planned_mm()
             self.work_offset = (here[0] - parsed.get("X", 0.0), here[1] - parsed.get("Y", 0.0), 0.0)
             self._reports_to_offset = 0
             return 0
-        if re.match(r"G[01](?!\d)", line):
+        if re.search(r"G[01](?!\d)", line):
             target = self._target(parsed, relative=False, machine="G53" in line)
             if target is None:
                 return 26
