@@ -38,7 +38,8 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None) -> Ga
     traffic = traffic or NoTrafficLog()
     if settings.protocol == "simulated" or settings.port.startswith("simulated:"):
         bench = _simulated_bench(settings)
-        return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol), traffic)
+        port = settings.port or bench.link.url
+        return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
     return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
 
 

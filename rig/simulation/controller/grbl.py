@@ -113,7 +113,7 @@ class SimulatedGrbl:
 
     def say(self, text: str) -> None:
         """Send one line."""
-        self.wire.to_host(text.encode("ascii") + b"\r\n")
+        self.wire.to_host(text.encode("ascii", errors="replace") + b"\r\n")
 
     def alarm(self, code: int) -> None:
         """Stop with an alarm, as its cause would make it."""
@@ -263,7 +263,8 @@ class SimulatedGrbl:
             return 9
         parsed = dict(_axis_words(words))
         modes = re.findall(r"G\d+", words)
-        if not set(modes) <= {"G20", "G21", "G90", "G91", "G53"} or _JOG_WORD.sub("", words):
+        allowed = parsed.keys() <= set("GXYZF") and set(modes) <= {"G20", "G21", "G90", "G91", "G53"}
+        if not allowed or _JOG_WORD.sub("", words):
             return 16
         if "F" not in parsed:
             return 22

@@ -105,7 +105,7 @@ class SimulatedMarlin:
 
     def say(self, text: str) -> None:
         """Send one line."""
-        self.wire.to_host(text.encode("ascii") + b"\n")
+        self.wire.to_host(text.encode("ascii", errors="replace") + b"\n")
 
     def kill(self, reason: str) -> None:
         """Stop for good, as after a failure of the hardware."""
@@ -144,7 +144,7 @@ class SimulatedMarlin:
             return None
         number, command = int(found[1]), found[2]
         if command.startswith("M110"):
-            self._last_line = int(_WORD.findall(command)[-1][1])
+            self._last_line = int(dict(_WORD.findall(command)).get("N", number))
             return command
         if number != self._last_line + 1:
             self._ask_again("Line Number is not Last Line Number+1")

@@ -41,14 +41,18 @@ class Server:
         """
         begun_s = time.monotonic()
         while True:
-            behind_s = speed * (time.monotonic() - begun_s) - self._clock.now_s()
-            self._clock.sleep_s(max(0.0, behind_s))
-            if self._wire.arrived():
-                os.write(self._far, self._wire.take())
+            self.turn(speed * (time.monotonic() - begun_s))
             next_s = self._clock.next_event_s()
-            until_s = _LONGEST_NAP_S if next_s is None else (next_s - self._clock.now_s()) / speed
-            if select.select([self._far], [], [], min(_LONGEST_NAP_S, max(0.0, until_s)))[0]:
-                self._firmware.receive(self._wire.to_controller(os.read(self._far, 4096)))
+            nap_s = _LONGEST_NAP_S if next_s is None else (next_s - self._clock.now_s()) / speed
+            select.select([self._far], [], [], min(_LONGEST_NAP_S, max(0.0, nap_s)))
+
+    def turn(self, now_s: float) -> None:
+        """Let the simulated time reach `now_s`, and pass on what either side has to say."""
+        self._clock.sleep_s(max(0.0, now_s - self._clock.now_s()))
+        if self._wire.arrived():
+            os.write(self._far, self._wire.take())
+        if select.select([self._far], [], [], 0.0)[0]:
+            self._firmware.receive(self._wire.to_controller(os.read(self._far, 4096)))
 
 
 @contextmanager
