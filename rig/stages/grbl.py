@@ -8,8 +8,9 @@ whatever work offset is stored in the controller.
 import re
 from collections.abc import Sequence
 
-from rig.errors import RigError, StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
+from rig.errors import StageLost, StageTimeout, WrongFirmware
 from rig.stages import grbl_messages as grbl
+from rig.stages.grbl_failures import LOCKED, alarm_failure, refusal, state_failure
 from rig.stages.grbl_settings import GrblSettings
 from rig.stages.motion import bound_s
 from rig.stages.protocol import AxisIndex, Identity, Point
@@ -20,18 +21,6 @@ _POLL_INTERVAL_S = 0.2
 _BOOT_S = 3.0
 _RECOVERY_S = 2.0
 _RESET_S = 0.4
-_LOCKED = 9
-
-_STATES = {
-    "Hold": ("is on hold", "release what holds it, then recover", True),
-    "Door": ("stands with its safety door open", "close the door, then recover", True),
-    "Jog": ("is moving although nothing was asked of it", "wait until it stands", True),
-    "Run": ("is moving although nothing was asked of it", "wait until it stands", True),
-    "Check": ("is in check mode, where nothing moves", "recover, which leaves it", True),
-    "Home": ("is homing although nothing was asked of it", "wait until it stands, then home it", False),
-    "Sleep": ("is asleep with its motors off", "recover and home it", False),
-    "Tool": ("waits for a tool change", "recover and home it", False),
-}
 
 
 class Grbl:
@@ -115,7 +104,7 @@ class Grbl:
         """Return the machine position of a report made now, by a stage that stands still."""
         report = self._poll()
         if report.state != "Idle":
-            raise self._state_failure(report)
+            raise state_failure(report, self._alarm)
         return self._machine_point(report)
 
     def switches(self) -> frozenset[AxisIndex]:
@@ -171,7 +160,7 @@ class Grbl:
             case "Run", _:
                 self._line.send(_HOLD)
             case "Door", 1:
-                raise self._state_failure(report)
+                raise state_failure(report, self._alarm)
             case ("Hold", 1) | ("Door", 2 | 3):
                 pass  # still slowing down, when a reset would lose the position
             case _:
@@ -200,18 +189,13 @@ class Grbl:
             if isinstance(message, grbl.Ok):
                 return said
             if isinstance(message, grbl.Error):
-                raise self._refusal(text, message.code)
+                if message.code == LOCKED and (locked := self._poll()).state not in ("Idle", "Jog", "Run"):
+                    raise state_failure(locked, self._alarm)
+                raise refusal(text, message.code)
             said.append(message)
         raise StageTimeout(
             f"no answer to {text!r} within {bound_s:g} s; check cable and power, then recover and home the stage"
         )
-
-    def _refusal(self, text: str, code: int) -> RigError:
-        """Return the failure that stands for an error in answer to `text`."""
-        if code == _LOCKED and (report := self._poll()).state in ("Alarm", *_STATES):
-            return self._state_failure(report)
-        meaning = grbl.ERRORS.get(code, "see the firmware's list of errors")
-        return StageRejected(f"the controller refused {text!r}: error:{code}, {meaning}; nothing moved by it")
 
     def _receive(self, deadline_s: float) -> grbl.Message | None:
         """Return the next message; an alarm or a restart, which may come at any time, is raised."""
@@ -221,7 +205,7 @@ class Grbl:
         message = grbl.parse(text)
         if isinstance(message, grbl.Alarm):
             self._alarm = message.code
-            raise self._alarm_failure(message.code)
+            raise alarm_failure(message.code)
         if isinstance(message, grbl.Banner):
             raise StageLost("the controller has restarted, and its position is lost; check its power, then home it")
         if isinstance(message, grbl.Report) and message.offset is not None:
@@ -271,7 +255,7 @@ class Grbl:
             elif report.state in ("Jog", "Run"):
                 last = None
             else:
-                raise self._state_failure(report)
+                raise state_failure(report, self._alarm)
         raise StageTimeout(
             f"the stage still moves after {bound_s(predicted_s):.1f} s, where {predicted_s:.1f} s were expected; "
             "it was told to stop: recover and home it"
@@ -327,21 +311,6 @@ class Grbl:
     def _read_settings(self) -> dict[int, str]:
         """Return the `$` settings."""
         return {m.number: m.value for m in self._command("$$") if isinstance(m, grbl.Setting)}
-
-    def _alarm_failure(self, code: int) -> StageAlarm:
-        """Return the failure that stands for alarm `code`."""
-        meaning = grbl.ALARMS.get(code, "see the firmware's list of alarms")
-        remedy = "recover it" if code == 2 else "look for the cause, then recover and home it"
-        return StageAlarm(f"ALARM:{code}: {meaning}; {remedy}", code=code, position_kept=code == 2)
-
-    def _state_failure(self, report: grbl.Report) -> RigError:
-        """Return the failure that stands for a state in which nothing can be done."""
-        if report.state == "Alarm":
-            if self._alarm is not None:
-                return self._alarm_failure(self._alarm)
-            return StageAlarm("the controller is locked: it has restarted or was never homed; home the stage")
-        what, remedy, kept = _STATES[report.state]
-        return StageAlarm(f"the controller {what}; {remedy}", position_kept=kept)
 
 
 def _refuse_other_firmware(text: str) -> None:

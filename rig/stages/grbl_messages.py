@@ -136,30 +136,3 @@ def _report(found: re.Match[str]) -> Report:
 def _vector(text: str) -> tuple[float, ...]:
     """Return comma-separated numbers."""
     return tuple(float(number) for number in text.split(","))
-
-
-ERRORS = {
-    2: "bad number format",
-    3: "unknown $ command",
-    5: "homing is not enabled",
-    8: "only allowed when idle",
-    9: "locked by an alarm or a jog in progress",
-    11: "line too long",
-    15: "jog target outside the travel",
-    16: "bad jog command",
-    20: "unsupported command",
-    22: "no feed rate",
-}
-
-ALARMS = {
-    1: "a limit switch was hit; the position is lost",
-    2: "a target was outside the soft limits; the position is kept",
-    3: "reset while moving; the position is lost",
-    4: "probe was already closed",
-    5: "probe found nothing",
-    6: "homing failed: reset during homing",
-    7: "homing failed: safety door opened",
-    8: "homing failed: a switch did not open on pulling off",
-    9: "homing failed: no switch was found",
-    10: "homing failed: the second motor's switch was not found",
-}

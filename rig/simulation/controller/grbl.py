@@ -6,13 +6,12 @@ reset that comes before the message asking for it is lost; a homing that fails s
 work positions come with their offset only now and then.
 """
 
-import math
 import re
 from collections import deque
 from collections.abc import Callable
 
 from rig.simulation.controller.clock import Event, SimulatedClock
-from rig.simulation.controller.kinematics import Axis, Mechanics
+from rig.simulation.controller.kinematics import Axis, Mechanics, along
 from rig.simulation.controller.wire import Wire
 from rig.stages.settings import ProtocolName
 
@@ -314,11 +313,8 @@ class SimulatedGrbl:
     def _queue(self, target: tuple[float, float], feed_mm_per_min: float) -> None:
         """Plan a straight motion at the feed asked for or what the axes allow."""
         start = self.mechanics.planned_mm()
-        length = math.dist(start, target)
-        shares = [abs(b - a) / length if length else 1.0 for a, b in zip(start, target, strict=True)]
-        speed = min([feed_mm_per_min, *(self.number(110 + i) / s for i, s in enumerate(shares) if s)]) / 60.0
-        acceleration = min(self.number(120 + i) / s for i, s in enumerate(shares) if s)
-        self.mechanics.queue(target, speed, acceleration)
+        speed = min(feed_mm_per_min, along((self.number(110), self.number(111)), start, target)) / 60.0
+        self.mechanics.queue(target, speed, along((self.number(120), self.number(121)), start, target))
 
     def _home(self) -> int | None:
         """Begin homing: both axes seek at once, back off, and find the switch again slowly."""

@@ -277,3 +277,10 @@ class Mechanics:
         for event in self._events:
             event.cancel()
         self._events = []
+
+
+def along(limits: Sequence[float], start: Sequence[float], target: Sequence[float]) -> float:
+    """Return the largest rate on the way from `start` to `target` that keeps each axis within its limit."""
+    length = math.dist(start, target)
+    ways = zip(limits, start, target, strict=True)
+    return min((limit * length / abs(b - a) for limit, a, b in ways if a != b), default=limits[0])

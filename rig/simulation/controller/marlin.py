@@ -6,7 +6,6 @@ emergency stop drops motion without slowing down; motors let go after two idle m
 controller that was killed says nothing more until it is restarted.
 """
 
-import math
 import re
 from collections import deque
 from collections.abc import Callable
@@ -14,7 +13,7 @@ from functools import reduce
 from operator import xor
 
 from rig.simulation.controller.clock import Event, SimulatedClock
-from rig.simulation.controller.kinematics import Axis, Mechanics
+from rig.simulation.controller.kinematics import Axis, Mechanics, along
 from rig.simulation.controller.wire import Wire
 from rig.stages.settings import ProtocolName
 
@@ -195,10 +194,9 @@ class SimulatedMarlin:
         for i, axis in enumerate("XY"):
             value = start[i] if axis not in words else words[axis] + (start[i] if self._relative else 0.0)
             target.append(min(max(value, 0.0), self.travel_mm[i]) if self.homed[i] else value)
-        length = math.dist(start, target)
-        share = max((abs(b - a) / length for a, b in zip(start, target, strict=True)), default=1.0) if length else 1.0
-        speed = min(words.get("F", 6000.0) / 60.0, self.settings["M203"] / share)
-        self.mechanics.queue(target, speed, min(self.settings["M204"], self.settings["M201"] / share))
+        speed = min(words.get("F", 6000.0) / 60.0, along([self.settings["M203"]] * 2, start, target))
+        acceleration = min(self.settings["M204"], along([self.settings["M201"]] * 2, start, target))
+        self.mechanics.queue(target, speed, acceleration)
         self._watch_idle()
 
     def _home(self, axes: list[int]) -> None:

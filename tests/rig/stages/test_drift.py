@@ -88,6 +88,26 @@ def test_without_a_beginning_nothing_is_vouched_for() -> None:
     assert watch.unchecked == ("frame",)
 
 
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_disturbance_while_homing_was_timed_is_found_at_once(controller: Controller) -> None:
+    bench = Bench(controller)
+    stage = bench.stage()
+    stage.connect()
+    stage.home()
+    homings: list[bool] = []
+
+    def late_on_the_third(data: bytes) -> bytes:
+        if b"$H" in data or b"G28" in data:
+            homings.append(True)
+            if len(homings) == 3:
+                bench.clock.after(1.0, lambda: bench.wire.hold_up(8.0))
+        return data
+
+    bench.wire.spoil_to_controller.append(late_on_the_third)
+    with pytest.raises(PositionDrifted):
+        DriftWatch(stage).begin()
+
+
 def test_limits_that_cannot_be_kept_are_refused() -> None:
     with pytest.raises(PlanRefused, match=r"resolves 0\.40 mm"):
         watched(Bench(SimulatedMarlin), limit_mm=0.1)

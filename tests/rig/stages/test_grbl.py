@@ -228,6 +228,55 @@ def test_a_restart_during_an_exposure_is_noticed() -> None:
     assert not stage.trusted
 
 
+def test_one_idle_report_does_not_end_a_wait() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    told: list[bytes] = []
+
+    def idle_while_it_moves(data: bytes) -> bytes:
+        if b"<Jog" in data and not told:
+            told.append(data)
+            return data.replace(b"<Jog", b"<Idle")
+        return data
+
+    bench.wire.spoil_to_host.append(idle_while_it_moves)
+    grbl(bench).settings[110] = "3000.000"  # slower than the driver was told, so that it polls too soon
+    assert stage.move_to(-350.0, -350.0).is_at(Point(-350.0, -350.0))
+    assert told
+
+
+def test_settings_are_read_anew_on_recovery() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    grbl(bench).settings[130] = "200.000"
+    bench.firmware.restart()
+    bench.clock.sleep_s(2.0)
+    with pytest.raises(StageLost):
+        stage.position()
+    stage.recover()
+    assert stage.travel().x_mm == (-200.0, 0.0)
+
+
+def test_an_alarm_that_somebody_else_cleared_still_loses_the_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.firmware.receive(b"$J=G91 G21 X-100 F600\n")
+    bench.clock.sleep_s(1.0)
+    bench.firmware.receive(b"\x18")
+    bench.firmware.receive(b"$X\n")
+    stage.recover()
+    assert not stage.trusted
+
+
+def test_what_is_left_of_a_damaged_line_does_not_spoil_the_recovery() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.firmware.receive(b";")
+    stage.recover()
+    stage.home()
+    assert stage.trusted
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

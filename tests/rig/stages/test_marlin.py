@@ -148,6 +148,21 @@ def test_travel_that_is_not_told_has_to_be_configured() -> None:
     assert stage.travel() == travel
 
 
+def test_settings_that_change_while_read_are_not_believed() -> None:
+    bench = Bench(SimulatedMarlin)
+    seen: list[bytes] = []
+
+    def lose_a_digit_once(data: bytes) -> bytes:
+        if data.startswith(b"echo: M92") and not seen:
+            seen.append(data)
+            return data.replace(b"X80", b"X8")
+        return data
+
+    bench.wire.spoil_to_host.append(lose_a_digit_once)
+    with pytest.raises(StageLost, match="read differently"):
+        bench.stage().connect()
+
+
 @pytest.mark.parametrize("line", [b"FIRMWARE_NAME", b"echo: M92", b"echo: M203", b"echo: M201", b"echo: M204"])
 def test_firmware_that_does_not_tell_what_is_needed_is_refused(line: bytes) -> None:
     bench = Bench(SimulatedMarlin)
