@@ -28,6 +28,8 @@ app = App(
     error_console=console,
     result_action="return_value",
 )
+# `run` says in one line what an interrupt leaves behind.
+app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 
 app.command("pipelines.stage:app", name="stage")
 
