@@ -82,6 +82,21 @@ def test_firmware_that_tells_only_projected_positions_is_waited_for() -> None:
     assert bench.true_position() == pytest.approx((200.0, 200.0), abs=0.01)
 
 
+def test_answers_that_come_late_do_not_put_the_recovery_out_of_step() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    for _ in range(3):
+        bench.firmware.say("ok")
+    bench.firmware.say("Resend: 99")
+    bench.wire.hold_up(0.25)
+    bench.firmware.say("ok")
+    stage.recover()
+    stage.home()
+    target = Point(100.0, 100.0)
+    assert stage.move_to(*target).is_at(target)
+    assert bench.true_position() == pytest.approx(target, abs=0.01)
+
+
 def test_a_killed_controller_is_restarted_and_has_to_be_homed() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
