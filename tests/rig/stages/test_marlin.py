@@ -8,16 +8,9 @@ import pytest
 from rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.gantry import Gantry
 from rig.stages.protocol import Box, Point
 from rig.stages.settings import StageSettings
-
-
-def homed(bench: Bench) -> Gantry:
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
-    return stage
+from tests.rig.stages.benches import homed
 
 
 def without(*starts: bytes) -> Callable[[bytes], bytes]:
@@ -64,6 +57,18 @@ def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
         stage.move_to(10.0, 10.0)
     stage.home()
     assert stage.trusted
+
+
+def test_recovery_notices_a_restart_that_nobody_saw() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    stage.recover()
+    assert stage.trusted
+    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.firmware.restart()
+    bench.clock.sleep_s(5.0)
+    stage.recover()
+    assert not stage.trusted
 
 
 def test_a_position_is_not_taken_from_an_answer_that_has_none() -> None:
