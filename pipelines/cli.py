@@ -45,6 +45,7 @@ for _command in (
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
 app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
+app.command("pipelines.stage:app", name="stage")
 
 
 @app.meta.default

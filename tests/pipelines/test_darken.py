@@ -37,7 +37,7 @@ def _light(folder: Path) -> NDArray[np.float64]:
     """What a set's reference view says of the light, in electrons of the bright camera: (row, column, colour)."""
     loaded = load_set(folder)
     parts = [load_channel(loaded, layout).electrons[0] for layout in channel_layouts(loaded)]
-    return np.maximum(np.dstack(parts).astype(float), 0)
+    return np.asarray(np.maximum(np.dstack(parts).astype(float), 0))
 
 
 @pytest.fixture

@@ -119,6 +119,14 @@ def test_pictures_that_are_not_alike_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["src"]
 
 
+def test_a_first_picture_without_whole_numbers_is_refused(tmp_path: Path, faintfield: Command) -> None:
+    src = _pictures(tmp_path / "src", _grid_names([0], [0, 1]))
+    tifffile.imwrite(src / "view_r0_c0.tiff", _picture().astype(np.float32))
+    ended = faintfield("import", "grid", src, tmp_path / "out")
+    assert ended.returncode == 1
+    assert f"faintfield: BadValue: {src / 'view_r0_c0.tiff'}: holds float32 pixels" in ended.stderr
+
+
 @pytest.mark.parametrize("name", ["view_r0_c0.tiff", "view_r0_c0.png"])
 def test_16_bit_pictures_are_kept_byte_for_byte(name: str, tmp_path: Path, done: Command) -> None:
     (tmp_path / "src").mkdir()

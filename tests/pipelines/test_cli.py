@@ -1,0 +1,178 @@
+"""The command line: help, exit codes, and which words go where."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import pytest
+
+from pipelines import cli
+from pipelines.errors import BadValue
+from recon.errors import NotConverged
+
+type Command = Callable[..., CompletedProcess[str]]
+
+COMMANDS = [("simulate",), ("darken",), ("import",), ("import", "grid"), ("reconstruct",), ("report",), ("demo",)]
+
+
+@pytest.mark.parametrize("command", [(), *COMMANDS], ids=" ".join)
+def test_every_command_explains_itself(command: tuple[str, ...], faintfield: Command) -> None:
+    ended = faintfield(*command, "--help")
+    assert ended.returncode == 0
+    assert ended.stderr == ""
+    assert "Usage: faintfield" in ended.stdout
+    for word in command:
+        assert word in ended.stdout
+
+
+def test_the_help_names_every_command(faintfield: Command) -> None:
+    said = faintfield("--help").stdout
+    for name, *_ in COMMANDS:
+        assert f" {name} " in said
+
+
+def test_the_version_is_told(faintfield: Command) -> None:
+    ended = faintfield("--version")
+    assert (ended.returncode, ended.stdout) == (0, "0.1.0\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("nonsense",), 'Unknown command "nonsense"'),
+        (("simulate",), "requires an argument"),
+        (("simulate", "OUT", "--nonsense", "3"), "Unknown option: --nonsense"),
+        (("simulate", "OUT", "--seeds", "3"), "Did you mean --seed?"),
+        (("simulate", "OUT", "EXTRA"), "EXTRA"),
+        (("simulate", "OUT", "--snr", "much"), "much"),
+        (("simulate", "OUT", "--colour", "purple"), "purple"),
+        (("simulate", "OUT", "--seed", "-1"), "Must be at least 0, got -1."),
+        (("simulate", "OUT", "--snr", "0"), "Must be at least 1e-09, got 0."),
+        (("simulate", "OUT", "--snr", "nan"), "got nan."),
+        (("simulate", "OUT", "--snr", "inf"), "got inf."),
+        (("simulate", "OUT", "--rows", "0"), "Must be at least 1, got 0."),
+        (("simulate", "OUT", "--size-px", "640", "-480"), "Must be at least 2, got -480."),
+        (("simulate", "OUT", "--position-error-mm", "-1"), "Must be at least 0, got -1."),
+        (("darken", "SET", "OUT", "--quantum-efficiency", "1.5"), "at most 1, got 1.5."),
+        (("import", "grid", "SRC", "OUT", "--rows", "0"), "Must be at least 1, got 0."),
+        (("import", "grid", "SRC", "OUT", "--disparity-px", "-2"), "Must be at least 0, got -2."),
+        (("import", "nonsense"), "nonsense"),
+        (("reconstruct", "SET", "--depth-mm", "500"), "--out"),
+        (("reconstruct", "SET", "--out", "OUT", "--method", "magic"), "magic"),
+        (("reconstruct", "SET", "--out", "OUT", "--passes", "0"), "Must be at least 1, got 0."),
+        (("demo", "--snr", "-1"), "Must be at least 1e-09, got -1."),
+    ],
+)
+def test_wrong_usage_is_exit_code_2_and_nothing_happens(
+    words: tuple[str, ...], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    ended = faintfield(*words)
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert said in " ".join(ended.stderr.replace("│", " ").split())
+    assert not list(tmp_path.iterdir())
+
+
+def test_usage_errors_are_told_in_full_on_a_narrow_terminal(
+    monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    monkeypatch.setenv("COLUMNS", "50")
+    said = faintfield("darken", "SET", "OUT", "--quantum-efficiency", "1.5").stderr
+    assert "Must be a number of at most 1, got 1.5." in " ".join(said.replace("│", " ").split())
+
+
+@pytest.mark.parametrize("where", ["before", "after"])
+def test_json_prints_one_object_and_nothing_else_on_standard_output(
+    where: str, scene: Path, tmp_path: Path, done: Command
+) -> None:
+    words: tuple[object, ...] = ("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--passes", 2)
+    ended = done(*(("--json", *words) if where == "before" else (*words, "--json")))
+    assert len(ended.stdout.splitlines()) == 1
+    result = json.loads(ended.stdout)
+    assert result["report"] == str(tmp_path / "out" / "report.html")
+    assert [plane["depth_mm"] for plane in result["planes"]] == [500.0]
+    assert {row["depth_mm"] for row in result["metrics"]["planes"]} == {500.0}
+
+
+def test_every_command_has_a_json_result(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
+    def result(*words: object) -> dict[str, Any]:
+        ended = done("--json", *words)
+        found: dict[str, Any] = json.loads(ended.stdout)
+        assert ended.stdout.endswith("\n")
+        return found
+
+    scene, bright = tmp_path / "scene", tmp_path / "scene" / "noise_free"
+    assert result("simulate", scene, *small_options)["views"] == 9
+    assert result("darken", bright, tmp_path / "dark")["snr"] == 0.16
+    (bright / "flat.tiff").unlink()
+    assert result("import", "grid", bright, tmp_path / "set")["rows"] == 3
+    words = ("--out", tmp_path / "planes", "--depth-mm", 500, "--method", "backprojection")
+    assert result("reconstruct", tmp_path / "dark", *words)["metrics"] is None
+    assert result("report", tmp_path / "planes") == {"report": str(tmp_path / "planes" / "report.html")}
+
+
+def test_without_json_only_the_report_is_on_standard_output(
+    scene: Path, tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    assert done("simulate", tmp_path / "other", *small_options).stdout == ""
+    words = ("--depth-mm", 500, "--method", "backprojection")
+    ended = done("reconstruct", scene, "--out", tmp_path / "out", *words)
+    assert ended.stdout == f"{tmp_path / 'out' / 'report.html'}\n"
+    assert "1 plane(s) in " in ended.stderr
+
+
+def test_no_bar_is_drawn_where_there_is_no_terminal(
+    tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    said = done("simulate", tmp_path / "set", *small_options).stderr
+    assert "\x1b" not in said
+    assert "\r" not in said
+    assert len(said.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("failure", "line"),
+    [
+        (BadValue("x = 3; give 4"), "faintfield: BadValue: x = 3; give 4\n"),
+        (NotConverged("[bold]a:100:b[/bold]"), "faintfield: NotConverged: [bold]a:100:b[/bold]\n"),
+        (BadValue("long " * 100 + "line"), "faintfield: BadValue: " + "long " * 100 + "line\n"),
+    ],
+)
+def test_named_failures_are_one_line_as_it_is_and_exit_code_1(
+    failure: Exception, line: str, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("pipelines.report.write_report", fail)
+    ended = faintfield("report", "folder")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", line)
+
+
+def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatch, faintfield: Command) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipelines.report.write_report", interrupt)
+    ended = faintfield("report", "folder")
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.startswith("faintfield: Interrupted: ")
+    assert len(ended.stderr.splitlines()) == 1
+
+
+def test_a_bug_is_not_dressed_up_as_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("pipelines.report.write_report", fail)
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["report", "folder"])
+
+
+def test_main_exits_with_the_code() -> None:
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["reconstruct", "nowhere", "--out", "nowhere", "--depth-mm", "500"])
+    assert ended.value.code == 1

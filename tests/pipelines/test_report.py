@@ -1,0 +1,249 @@
+"""`report`: one page that needs nothing but itself."""
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines.cli import run
+
+type Command = Callable[..., CompletedProcess[str]]
+
+METHOD_TITLES = {"backprojection": "back-projection", "pmlem-osl": "PMLEM (one-step-late, TV)"}
+VOID = {"meta", "img", "input", "br", "hr", "link"}
+
+
+class _Page(HTMLParser):
+    """What is on a page: its elements, its words, and whether every element is closed in turn."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.open: list[str] = []
+        self.words = ""
+        self.mistakes: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.mistakes.append(f"</{tag}> at line {self.getpos()[0]}")
+
+    def handle_data(self, data: str) -> None:
+        if not self.open or self.open[-1] not in ("script", "style"):
+            self.words += data
+
+    def attributes(self, tag: str, name: str) -> list[str]:
+        return [attributes[name] or "" for found, attributes in self.elements if found == tag and name in attributes]
+
+
+@pytest.fixture(scope="session")
+def original(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three depths by two methods, with a focus curve; to be read only."""
+    out = tmp_path_factory.mktemp("report") / "<planes & more>"
+    methods = [word for name in METHOD_TITLES for word in ("--method", name)]
+    words = ["--sweep-mm", "500:700:3", *methods, "--passes", "3"]
+    assert run(["reconstruct", str(simulated_scene), "--out", str(out), *words]) == 0
+    return out
+
+
+@pytest.fixture
+def planes(original: Path, tmp_path: Path) -> Path:
+    """A copy of the results that a test may change."""
+    return Path(shutil.copytree(original, tmp_path / original.name))
+
+
+@pytest.fixture(scope="session")
+def text(original: Path) -> str:
+    return (original / "report.html").read_text()
+
+
+@pytest.fixture(scope="session")
+def page(text: str) -> _Page:
+    return _Page(text)
+
+
+def test_the_page_is_well_formed(text: str, page: _Page) -> None:
+    assert text.startswith("<!doctype html>")
+    assert page.mistakes == []
+    assert page.open == []
+
+
+def test_the_page_needs_nothing_from_elsewhere(text: str, page: _Page) -> None:
+    addresses = set(re.findall(r"[a-z]+://[^\s\"'<>)]+", text))
+    names_of_formats = ("http://www.w3.org/", "http://purl.org/dc/", "http://creativecommons.org/ns#")
+    assert {address for address in addresses if not address.startswith(names_of_formats)} == set()
+    for tag in {tag for tag, _ in page.elements}:
+        for attribute in ("src", "href", "xlink:href", "srcset", "action", "data", "poster"):
+            for target in page.attributes(tag, attribute):
+                assert target.startswith(("data:image/", "#"))
+    assert not {"link", "iframe", "object", "embed", "base"} & {tag for tag, _ in page.elements}
+    assert not re.search(r"@import|\bfetch\(|XMLHttpRequest|import\(", text)
+    for target in re.findall(r"url\(([^)]*)\)", text):
+        assert target.strip("'\"").startswith(("#", "data:"))
+
+
+def test_the_page_forbids_the_browser_to_fetch_anything(page: _Page) -> None:
+    (policy,) = [a["content"] for tag, a in page.elements if tag == "meta" and "http-equiv" in a]
+    assert policy is not None
+    assert policy.startswith("default-src 'none'; img-src data:;")
+
+
+def test_every_picture_can_be_decoded(text: str, page: _Page) -> None:
+    sources = {*page.attributes("img", "src"), *re.findall(r'"src": "(data:[^"]+)"', text)}
+    assert len(sources) >= 3 + 3 * 2 + 3 * 2  # the set, the planes side by side, the slider
+    for source in sources:
+        kind, content = source.split(";base64,")
+        assert kind in ("data:image/png", "data:image/jpeg")
+        picture = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
+        assert picture is not None
+
+
+def test_every_picture_says_what_it_is(page: _Page) -> None:
+    assert len(page.attributes("img", "alt")) == len(page.attributes("img", "src"))
+    assert all(page.attributes("img", "alt"))
+
+
+def test_all_methods_and_depths_are_there_side_by_side_and_on_the_slider(text: str, page: _Page) -> None:
+    alternatives = page.attributes("img", "alt")
+    for title in METHOD_TITLES.values():
+        for depth in ("500.0", "600.0", "700.0"):
+            assert f"{title} at {depth} mm" in alternatives
+    found = re.search(r"const columns = (.*);\n", text)
+    assert found is not None
+    columns = json.loads(found[1])
+    assert [column["title"] for column in columns] == list(METHOD_TITLES.values())
+    for column in columns:
+        assert [plane["depth_mm"] for plane in column["planes"]] == [500.0, 600.0, 700.0]
+
+
+def test_settings_hashes_and_figures_are_there(page: _Page, original: Path) -> None:
+    record = json.loads((original / "pmlem-osl" / "reconstruction.json").read_text())
+    for digest in record["inputs"].values():
+        assert digest in page.words
+    overview = json.loads((original / "overview.json").read_text())
+    for figure in (overview["brightness"]["snr"], overview["brightness"]["photons_from_moments"]):
+        assert f"{figure:.3g}" in page.words
+    for plane in json.loads((original / "metrics.json").read_text())["planes"]:
+        assert f"{plane['mse_bright']:.4f}" in page.words
+    assert "<planes & more>: planes at 3 depths, 500 to 700 mm" in page.words
+
+
+def test_a_focus_curve_is_drawn_in_the_pages_own_ink(text: str) -> None:
+    svg = text[text.index("<svg") : text.index("</svg>")]
+    assert "currentColor" in svg
+    assert "#010203" not in svg
+
+
+def test_drawing_again_gives_the_same_page(planes: Path, text: str, done: Command) -> None:
+    (planes / "report.html").unlink()
+    ended = done("report", planes)
+    assert ended.stdout == f"{planes / 'report.html'}\n"
+    assert (planes / "report.html").read_text() == text
+
+
+def test_results_in_folders_are_shown_together(planes: Path, tmp_path: Path, done: Command) -> None:
+    (planes / "report.html").unlink()
+    shutil.copytree(planes, tmp_path / "both" / "left")
+    shutil.copytree(planes, tmp_path / "both" / "right")
+    done("report", tmp_path / "both")
+    alternatives = _Page((tmp_path / "both" / "report.html").read_text()).attributes("img", "alt")
+    for where in ("left", "right"):
+        for title in METHOD_TITLES.values():
+            assert f"{where} set: {title} at 600.0 mm" in alternatives
+
+
+def test_a_single_plane_needs_no_slider(scene: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
+    page = _Page((tmp_path / "out" / "report.html").read_text())
+    assert page.mistakes == page.open == []
+    assert not page.attributes("input", "type")
+    assert "planes at 500 mm" in page.words
+
+
+def _without(key: str) -> Callable[[dict[str, Any]], object]:
+    return lambda record: record.pop(key)
+
+
+def _with(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda record: record.update(values)
+
+
+def _plane(**values: Any) -> Callable[[dict[str, Any]], object]:
+    return lambda record: record["planes"][0].update(values)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "failure"),
+    [
+        ("mlem/reconstruction.json", _without("planes"), "BadValue"),
+        ("mlem/reconstruction.json", _without("versions"), "BadValue"),
+        ("mlem/reconstruction.json", _with(planes=[]), "BadValue"),
+        ("mlem/reconstruction.json", _with(planes=[{}]), "BadValue"),
+        ("mlem/reconstruction.json", _with(focus={}), "BadValue"),
+        ("mlem/reconstruction.json", _plane(depth_mm="far"), "BadValue"),
+        ("mlem/reconstruction.json", _plane(file="gone.tiff"), "MissingFile"),
+        ("overview.json", _without("brightness"), "BadValue"),
+        ("metrics.json", _without("planes"), "BadValue"),
+        ("metrics.json", _with(planes=[{"depth_mm": 500.0}]), "BadValue"),
+    ],
+)
+def test_a_damaged_result_is_named(
+    name: str, change: Callable[[dict[str, Any]], object], failure: str, planes: Path, faintfield: Command
+) -> None:
+    path = planes / name.replace("mlem", "backprojection")
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
+    before = (planes / "report.html").read_bytes()
+    ended = faintfield("report", planes)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(f"faintfield: {failure}: ")
+    assert path.parent.name in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert (planes / "report.html").read_bytes() == before
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"\xff\xfe"])
+def test_a_result_that_is_no_json_is_named(content: bytes, planes: Path, faintfield: Command) -> None:
+    (planes / "backprojection" / "reconstruction.json").write_bytes(content)
+    ended = faintfield("report", planes)
+    assert ended.returncode == 1
+    assert "BadValue" in ended.stderr
+    assert "backprojection/reconstruction.json: is not a result that can be shown" in ended.stderr
+
+
+def test_a_plane_that_is_missing_or_damaged_is_named(planes: Path, faintfield: Command) -> None:
+    path = planes / "pmlem-osl" / "plane_00600.0.tiff"
+    path.write_bytes(path.read_bytes()[:1000])
+    ended = faintfield("report", planes)
+    assert (ended.returncode, "UnreadableImage" in ended.stderr, str(path) in ended.stderr) == (1, True, True)
+    path.unlink()
+    ended = faintfield("report", planes)
+    assert (ended.returncode, "MissingFile" in ended.stderr, str(path) in ended.stderr) == (1, True, True)
+    assert "reconstruct again" in ended.stderr
+
+
+@pytest.mark.parametrize("name", ["", "nowhere"])
+def test_a_folder_without_results_is_refused(name: str, tmp_path: Path, faintfield: Command) -> None:
+    ended = faintfield("report", tmp_path / name)
+    assert ended.returncode == 1
+    assert "MissingFile" in ended.stderr
+    assert not list(tmp_path.iterdir())
