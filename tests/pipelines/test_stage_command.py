@@ -87,7 +87,7 @@ def test_failures_are_one_line_with_a_name(shell: Shell, arguments: tuple[str, .
 
 
 def test_a_stage_has_to_be_named(shell: Shell) -> None:
-    assert shell.run("info") == 1
+    assert shell.run("info") == 2
     assert "give --port" in shell.words
 
 
