@@ -90,7 +90,7 @@ def import_grid(
     """
     options = {name: value for name, value in locals().items() if name not in ("src", "out", "overwrite")}
     grid = _find_grid(src, rows, columns)
-    first = read_frame(next(iter(grid.paths.values())))
+    first = _read_picture(next(iter(grid.paths.values())))
     noise = Noise(
         gain_dn_per_e=gain_dn_per_e,
         read_noise_e=read_noise_e,
@@ -158,6 +158,14 @@ def _complete_grid(src: Path, named: dict[tuple[int, int], Path]) -> _Grid:
     return _Grid(paths, rows, columns)
 
 
+def _read_picture(path: Path) -> Frame:
+    """Read a picture whose pixels are what a camera's are."""
+    frame = read_frame(path)
+    if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
+        raise BadValue(f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted")
+    return frame
+
+
 def _saturation_dn(frame: Frame) -> float:
     """Return the value at which a picture's pixels are full."""
     return frame.saturation_dn or float(np.iinfo(frame.pixels_dn.dtype).max)
@@ -187,14 +195,12 @@ def _copy_views(
 
 def _copy_picture(path: Path, folder: Path, first: Frame) -> str:
     """Copy a picture as it is, or as 16-bit TIFF when it has 8 bits; return its name in the set."""
-    frame = read_frame(path)
+    frame = _read_picture(path)
     if frame.pixels_dn.shape != first.pixels_dn.shape:
         raise WrongSize(
             f"{path}: is {frame.pixels_dn.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "
             "all must be alike"
         )
-    if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
-        raise BadValue(f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted")
     as_it_is = path.suffix.lower() in RAW_SUFFIXES or frame.pixels_dn.dtype == np.uint16
     name = path.name if as_it_is else f"{path.stem}.tiff"
     if (folder / name).exists():

@@ -1,0 +1,329 @@
+"""`reconstruct`: the files and fields it promises, and how right its planes are on a small simulated scene."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from pipelines.cli import run
+from pipelines.elemental_set import load_set
+from pipelines.frames import read_frame
+from pipelines.image_files import grey_levels, white_level
+
+type Command = Callable[..., CompletedProcess[str]]
+type SetMaker = Callable[..., Path]
+type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+
+DEPTHS = ("--depth-mm", 500, "--depth-mm", 700)
+METHODS = ("backprojection", "mlem", "pmlem-osl")
+
+
+def _run(*words: object) -> None:
+    assert run([str(word) for word in words]) == 0
+
+
+@pytest.fixture(scope="session")
+def larger_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """5 x 5 dark views of 160 x 120 px, to be read only."""
+    folder = tmp_path_factory.mktemp("larger") / "scene"
+    _run("simulate", folder, "--size-px", 160, 120, "--rows", 5, "--columns", 5)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def results(larger_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Both planes of the larger scene by every method, to be read only."""
+    out = tmp_path_factory.mktemp("results") / "planes"
+    _run("reconstruct", larger_scene, "--out", out, *DEPTHS, *(w for name in METHODS for w in ("--method", name)))
+    return out
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((folder / "reconstruction.json").read_text())
+    return record
+
+
+def _names(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+OVERVIEW = {"overview.json", "integral_image.png", "reference_view.png", "noise_reference.png"}
+PLANES = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png")}
+
+
+def test_several_methods_have_a_folder_each(results: Path) -> None:
+    own = {f"{method}/{name}" for method in METHODS for name in (*PLANES, "reconstruction.json")}
+    assert _names(results) == own | OVERVIEW | {"report.html", "metrics.json"}
+    for method in METHODS:
+        record = _record(results / method)
+        assert [(plane["method"], plane["depth_mm"]) for plane in record["planes"]] == [
+            (method, 500.0),
+            (method, 700.0),
+        ]
+        assert record["options"]["method"] == method
+
+
+def test_one_method_stands_in_the_folder_itself(scene: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", scene, "--out", tmp_path / "out", *DEPTHS, "--passes", 2)
+    assert _names(tmp_path / "out") == PLANES | OVERVIEW | {"report.html", "metrics.json", "reconstruction.json"}
+    assert {plane["method"] for plane in _record(tmp_path / "out")["planes"]} == {"pmlem-osl"}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_each_plane_is_recorded_with_how_it_was_made(method: str, results: Path, larger_scene: Path) -> None:
+    camera = load_set(larger_scene).settings.camera
+    for plane in _record(results / method)["planes"]:
+        pixels = tifffile.imread(results / method / plane["file"])
+        assert pixels.dtype == np.float32
+        assert list(pixels.shape) == plane["shape"] == [120, 160]
+        assert plane["channel"] == "grey"
+        pitch_mm = plane["depth_mm"] / camera.fx_px
+        assert plane["pitch_mm"] == pytest.approx(pitch_mm, rel=1e-12)
+        np.testing.assert_allclose(plane["origin_mm"], [-camera.cx_px * pitch_mm, -camera.cy_px * pitch_mm], rtol=1e-12)
+        assert plane["mean_e"] == pytest.approx(pixels.mean(dtype=float), rel=1e-6)
+        # A default sample is a pixel of the reference view: the flux is their sum
+        assert plane["flux_e"] == pytest.approx(pixels.sum(dtype=float), rel=1e-6)
+
+
+def test_only_iterations_have_an_objective_a_penalty_and_a_certificate(results: Path) -> None:
+    for plane in _record(results / "backprojection")["planes"]:
+        assert [plane[key] for key in ("objective", "penalty_weight", "certificate", "epsilon_e2")] == [None] * 4
+        assert plane["passes"] == 1
+    for method, chosen, most in (("mlem", "none: maximum likelihood", 20), ("pmlem-osl", "from the noise level", 50)):
+        for plane in _record(results / method)["planes"]:
+            assert plane["penalty_weight_chosen"] == chosen
+            assert (plane["penalty_weight"] > 0) == (method == "pmlem-osl")
+            assert 1 < plane["passes"] <= most
+            assert np.isfinite(plane["objective"])
+            certificate = plane["certificate"]
+            assert certificate["settled"] == (certificate["relative_change"] < 1e-3)
+            assert {"kind", "oscillates", "kept_at_start"} <= set(certificate)
+
+
+def test_the_planes_state_their_scale(results: Path) -> None:
+    for plane in _record(results / "pmlem-osl")["planes"]:
+        with tifffile.TiffFile(results / "pmlem-osl" / plane["file"]) as file:
+            page = file.pages.first
+            samples_per_cm = np.divide(*page.tags["XResolution"].value)
+            assert page.tags["ResolutionUnit"].value == tifffile.RESUNIT.CENTIMETER
+            assert page.tags["YResolution"].value == page.tags["XResolution"].value
+        assert 10.0 / samples_per_cm == pytest.approx(plane["pitch_mm"], rel=1e-6)
+
+
+def test_previews_show_the_planes(results: Path) -> None:
+    plane = tifffile.imread(results / "pmlem-osl" / "plane_00500.0.tiff")
+    preview = read_frame(results / "pmlem-osl" / "plane_00500.0.png").pixels_dn
+    np.testing.assert_array_equal(preview, grey_levels(plane, white_level(plane)))
+
+
+def test_inputs_options_versions_and_time_are_recorded(results: Path, larger_scene: Path) -> None:
+    record = _record(results / "pmlem-osl")
+    assert record["format"] == 1
+    assert record["command"] == "reconstruct"
+    expected = {
+        "elemental.toml",
+        "flat.tiff",
+        *(f"view_r{row}_c{column}.tiff" for row in range(5) for column in range(5)),
+    }
+    assert set(record["inputs"]) == expected
+    for name, found in record["inputs"].items():
+        assert found == hashlib.sha256((larger_scene / name).read_bytes()).hexdigest()
+    assert record["options"]["depth_mm"] == [500.0, 700.0]
+    assert set(record["versions"]) >= {"python", "faintfield", "numpy", "scipy", "numba"}
+    assert record["wall_time_s"] > 0
+    assert record["focus"] is None
+
+
+def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done: Command) -> None:
+    options = ("--penalty-weight", 0.25, "--passes", 3, "--pitch-mm", 10)
+    done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, *options)
+    record = _record(tmp_path / "out")
+    (plane,) = record["planes"]
+    assert (plane["penalty_weight"], plane["penalty_weight_chosen"]) == (0.25, "given")
+    assert plane["passes"] == 3
+    assert plane["pitch_mm"] == 10.0
+    assert plane["shape"] == [30, 40]  # 500 mm away 96 px of 120 px focal length span 400 mm
+    samples_per_px = (10.0 / (500.0 / 120.0)) ** 2
+    total = tifffile.imread(tmp_path / "out" / plane["file"]).sum(dtype=float)
+    assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
+    stated = {"method": "pmlem-osl", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
+    assert record["options"] == stated
+
+
+def test_running_twice_gives_the_same_planes(larger_scene: Path, results: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", larger_scene, "--out", tmp_path / "again", *DEPTHS)
+    for plane in PLANES:
+        assert (tmp_path / "again" / plane).read_bytes() == (results / "pmlem-osl" / plane).read_bytes()
+    first, again = _record(results / "pmlem-osl"), _record(tmp_path / "again")
+    for record in (first, again):
+        del record["wall_time_s"]
+    assert first == again
+
+
+def test_penalised_planes_have_less_than_a_third_of_the_error_of_back_projected_ones(results: Path) -> None:
+    metrics = json.loads((results / "metrics.json").read_text())
+    errors = {(row["method"], row["depth_mm"]): row for row in metrics["planes"]}
+    assert set(errors) == {(method, depth) for method in METHODS for depth in (500.0, 700.0)}
+    for depth in (500.0, 700.0):
+        penalised, mean = (errors[method, depth]["mse_bright"] for method in ("pmlem-osl", "backprojection"))
+        assert penalised < mean / 3
+        assert penalised < 0.04  # 25 views instead of 49
+
+
+def test_errors_are_against_the_noise_free_sets_back_projection_and_the_texture(
+    results: Path, larger_scene: Path, tmp_path: Path, done: Command
+) -> None:
+    noise_free = larger_scene / "noise_free"
+    done("reconstruct", noise_free, "--out", tmp_path / "bright", *DEPTHS, "--method", "backprojection")
+    metrics = json.loads((results / "metrics.json").read_text())
+    for row in metrics["planes"]:
+        name = f"{row['depth_mm']:07.1f}"
+        plane = tifffile.imread(results / row["method"] / f"plane_{name}.tiff")
+        visible = read_frame(larger_scene / "truth" / f"visible_{name}.png").pixels_dn > 127
+        against = {
+            "mse_bright": tifffile.imread(tmp_path / "bright" / f"plane_{name}.tiff"),
+            "mse_texture": tifffile.imread(larger_scene / "truth" / f"plane_{name}.tiff"),
+        }
+        for key, truth in against.items():
+            error = np.mean(((plane - truth)[visible] / truth[visible].max()) ** 2, dtype=float)
+            assert row[key] == pytest.approx(error, rel=1e-5)
+        assert row["psnr_db"] == pytest.approx(-10 * np.log10(row["mse_bright"]), rel=1e-9)
+        assert (row["object"], row["poses"]) == ({500.0: "truck", 700.0: "airplane"}[row["depth_mm"]], "true")
+    assert metrics["snr"]["asked"] == pytest.approx(0.16)
+    assert metrics["photons_per_px"]["linear"] == pytest.approx(3.84)
+
+
+def test_errors_of_earlier_planes_do_not_stay(scene: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    done("reconstruct", scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
+    assert (out / "metrics.json").is_file()
+    done("reconstruct", scene, "--out", out, "--depth-mm", 600, "--method", "backprojection")
+    assert not (out / "metrics.json").exists()
+    assert "Errors against the truth" not in (out / "report.html").read_text()
+
+
+@pytest.fixture(scope="session")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A focal stack of the larger scene at a SNR of 5, to be read only."""
+    folder = tmp_path_factory.mktemp("sweep")
+    _run("simulate", folder / "scene", "--snr", 5, "--size-px", 160, 120, "--rows", 5, "--columns", 5)
+    _run(
+        "reconstruct",
+        folder / "scene",
+        "--out",
+        folder / "out",
+        "--sweep-mm",
+        "400:900:26",
+        "--method",
+        "backprojection",
+    )
+    return folder / "out"
+
+
+def test_a_sweep_marks_the_depths_of_the_objects(sweep: Path) -> None:
+    focus = _record(sweep)["focus"]
+    np.testing.assert_allclose(focus["depth_mm"], np.linspace(400, 900, 26))
+    assert len(focus["detail_e2"]) == len(focus["sigma_e2"]) == 26
+    # Nearer than half a step
+    assert [round(depth / 10) * 10 for depth in focus["sharp_mm"]] == [500, 700]
+
+
+def test_a_sweep_has_a_plane_per_depth(sweep: Path) -> None:
+    assert len(list(sweep.glob("plane_*.tiff"))) == 26
+    assert [plane["depth_mm"] for plane in _record(sweep)["planes"]] == list(np.linspace(400, 900, 26))
+    assert {"plane_00400.0.tiff", "plane_00420.0.tiff", "plane_00900.0.tiff"} <= _names(sweep)
+
+
+def test_depths_given_twice_are_reconstructed_once(scene: Path, tmp_path: Path, done: Command) -> None:
+    words = ("--depth-mm", 500, "--sweep-mm", "500:600:2", "--depth-mm", 500, "--method", "backprojection")
+    done("reconstruct", scene, "--out", tmp_path / "out", *words)
+    assert [plane["depth_mm"] for plane in _record(tmp_path / "out")["planes"]] == [500.0, 600.0]
+
+
+def test_a_colour_set_gives_colour_planes(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
+    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 20)
+    done("reconstruct", tmp_path / "set", "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
+    plane = tifffile.imread(tmp_path / "out" / "plane_00500.0.tiff")
+    assert plane.shape == (72, 96, 3)
+    records = _record(tmp_path / "out")["planes"]
+    assert [record["channel"] for record in records] == ["red", "green", "blue"]
+    for index, record in enumerate(records):
+        assert record["mean_e"] == pytest.approx(plane[:, :, index].mean(dtype=float), rel=1e-5)
+    texture = tifffile.imread(tmp_path / "set" / "truth" / "plane_00500.0.tiff")
+    visible = read_frame(tmp_path / "set" / "truth" / "visible_00500.0.png").pixels_dn > 127
+    for index in range(3):
+        # Its own colour is nearer than those of the others, whose light it does not see
+        nearest = [np.corrcoef(plane[visible][:, index], texture[visible][:, other])[0, 1] for other in range(3)]
+        assert int(np.argmax(nearest)) == index
+    (row,) = json.loads((tmp_path / "out" / "metrics.json").read_text())["planes"]
+    assert row["mse_bright"] < 0.05
+    preview = read_frame(tmp_path / "out" / "plane_00500.0.png").pixels_dn
+    np.testing.assert_array_equal(preview, grey_levels(plane, white_level(plane)))
+
+
+def test_wrong_poses_make_worse_planes(tmp_path: Path, done: Command) -> None:
+    """The world is not where the gantry was told to go; with the poses it had, the planes are right."""
+    options = ("--size-px", 160, 120, "--rows", 5, "--columns", 5, "--snr", 20)
+    errors = {}
+    for poses in ("true", "nominal"):
+        done("simulate", tmp_path / poses, *options, "--poses", poses)
+        words = ("--depth-mm", 500, "--method", "backprojection")
+        result = json.loads(
+            done("--json", "reconstruct", tmp_path / poses, "--out", tmp_path / f"{poses}-out", *words).stdout
+        )
+        (row,) = result["metrics"]["planes"]
+        assert row["poses"] == poses
+        errors[poses] = row["mse_texture"]
+    assert errors["true"] < 0.7 * errors["nominal"]
+
+
+def test_oscillation_is_told(scene: Path, tmp_path: Path, done: Command) -> None:
+    ended = done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--penalty-weight", 0.6)
+    (plane,) = _record(tmp_path / "out")["planes"]
+    assert plane["certificate"]["oscillates"]
+    assert not plane["certificate"]["settled"]
+    assert "does not settle on 1 of 1 planes" in ended.stderr
+    assert "does not settle" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> None:
+    words = ("--depth-mm", 500, "--penalty-weight", 0.02, "--passes", 300)
+    ended = done("reconstruct", scene / "noise_free", "--out", tmp_path / "out", *words)
+    (plane,) = _record(tmp_path / "out")["planes"]
+    assert plane["certificate"]["settled"]
+    assert plane["passes"] < 300
+    assert "does not settle" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ((), 2, "no plane is asked for"),
+        (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
+        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: two different positive depths"),
+        (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),
+        (("--sweep-mm", "400:900:1"), 2, "at least 2 planes"),
+        (("--sweep-mm", "500:500.3:7"), 2, "would share a file name; keep them 0.1 mm apart"),
+        (("--depth-mm", -500), 1, "GeometryMismatch: a plane at -500.0 mm is not in front of the camera"),
+        (("--depth-mm", "nan"), 1, "GeometryMismatch: a plane at nan mm is not in front"),
+        (("--depth-mm", 500, "--pitch-mm", 900), 1, "GeometryMismatch: plane at 500 mm: a plane needs at least 2 x 2"),
+        (("--depth-mm", 500, "--pitch-mm", 1e-5), 1, "DiskFull: "),
+        (("--depth-mm", 500, "--penalty-weight", 50), 1, "NotConverged: penalty weight 50 makes most denominators"),
+        (("--disparity-px", 3), 1, "BadValue: no plane in front of the cameras has a disparity of 3 px"),
+    ],
+)
+def test_planes_that_cannot_be_are_refused_before_anything_is_written(
+    words: tuple[object, ...], code: int, said: str, simulated_scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    ended = faintfield("reconstruct", simulated_scene, "--out", tmp_path / "out", *words)
+    assert ended.returncode == code
+    assert said in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert ended.stdout == ""
+    assert not list(tmp_path.iterdir())
