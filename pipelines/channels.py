@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from calib.noise_model import NoiseModel
-from pipelines.elemental_set import LoadedSet, noise_of_phase, phase_of
+from pipelines.elemental_set import LoadedSet, noise_of_phase
 from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from pipelines.frames import Frame, read_frame
 from recon.errors import GeometryMismatch
@@ -254,9 +254,7 @@ def _cropped_rays(loaded: LoadedSet, lattice: Lattice) -> NDArray[np.float32]:
 def _response(loaded: LoadedSet, lattice: Lattice) -> NDArray[np.float32]:
     """Return the flat field of a lattice (row, column), zero at unusable pixels."""
     flat = np.ones(lattice.shape, np.float32) if loaded.flat is None else lattice.of(loaded.flat).copy()
-    unusable = phase_of(loaded.unusable, lattice.first, lattice.step, lattice.shape)
-    if unusable is not None:
-        flat[unusable] = 0
+    flat[lattice.of(loaded.unusable)] = 0
     return flat
 
 

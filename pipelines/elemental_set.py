@@ -1,8 +1,7 @@
 """The elemental set: a folder of images with `elemental.toml`, the way in for anyone's images and poses."""
 
-import json
-import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,11 +14,11 @@ from calib.lens import Lens
 from calib.noise_model import Map, NoiseModel
 from pipelines.errors import BadValue, MissingFile
 from pipelines.files import sha256
+from pipelines.fitted_noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from pipelines.frames import read_frame
 from pipelines.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
-NOISE_MAPS = "noise_maps.npz"
 
 # How far the reference view's pose may be from zero: less than any calibration can tell.
 _ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
@@ -88,7 +87,7 @@ class LoadedSet:
         The offset is each raw file's masked black level.
     flat : float array (row, column), optional
         Relative response.
-    unusable : bool array (row, column), optional
+    unusable : bool array (row, column)
         Pixels that never count (hot, dead).
     """
 
@@ -98,7 +97,7 @@ class LoadedSet:
     noise: NoiseModel
     offset_from_files: bool
     flat: NDArray[np.float32] | None
-    unusable: NDArray[np.bool_] | None
+    unusable: NDArray[np.bool_]
 
     @property
     def reference_view(self) -> int:
@@ -184,15 +183,29 @@ def load_set(folder: Path) -> LoadedSet:
     for name in _named_files(settings):
         if not inside(folder, name, f"{path}: file").is_file():
             raise MissingFile(f"{path}: {name} is named but missing in {folder}; put it there or remove its entry")
-    noise, unusable = _read_noise(path, settings)
-    offset_from_files = isinstance(settings.noise, Noise) and settings.noise.offset_dn is None
-    try:
-        camera = settings.camera
+    camera = settings.camera
+    with _complaints_about(path, "camera"):
         lens = Lens(camera.size_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
+    with _complaints_about(path, "noise"):
+        noise = _noise(folder, settings)
+    return LoadedSet(
+        folder,
+        settings,
+        lens,
+        noise.model,
+        offset_from_files=isinstance(settings.noise, Noise) and settings.noise.offset_dn is None,
+        flat=noise.response if camera.flat is None else _read_flat(folder / camera.flat, camera.size_px),
+        unusable=noise.unusable,
+    )
+
+
+@contextmanager
+def _complaints_about(path: Path, table: str) -> Iterator[None]:
+    """Say of a value that cannot be in which file and table it stands."""
+    try:
+        yield
     except ValueError as failure:
-        raise BadValue(f"{path}: camera: {failure}; correct it") from failure
-    flat = None if settings.camera.flat is None else _read_flat(folder / settings.camera.flat, camera.size_px)
-    return LoadedSet(folder, settings, lens, noise, offset_from_files, flat, unusable)
+        raise BadValue(f"{path}: {table}: {failure}; correct it") from failure
 
 
 def write_set(folder: Path, settings: ElementalSet) -> None:
@@ -246,68 +259,15 @@ def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
             raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
 
 
-def _read_noise(path: Path, settings: ElementalSet) -> tuple[NoiseModel, NDArray[np.bool_] | None]:
-    """Return the noise model, and the pixels that it calls unusable."""
-    try:
-        if isinstance(settings.noise, str):
-            return read_noise_json(path.parent / settings.noise, settings.camera.size_px)
-        stated = msgspec.structs.asdict(settings.noise)
-        stated["offset_dn"] = stated["offset_dn"] or 0.0
-        if stated["saturation_dn"] is None:
-            stated["saturation_dn"] = np.inf
-        return NoiseModel(**stated), None
-    except ValueError as failure:
-        raise BadValue(f"{path}: noise: {failure}; correct it") from failure
-
-
-def read_noise_json(path: Path, size_px: tuple[int, int]) -> tuple[NoiseModel, NDArray[np.bool_] | None]:
-    """Return the model that `faintfield noise` fitted, with its maps when they lie beside it, and the unusable pixels.
-
-    Raises
-    ------
-    BadValue
-        The file is no noise result, or a number that a reconstruction needs was not identifiable.
-    """
-    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
-    try:
-        fitted = json.loads(path.read_text())
-        values = {name: fitted[name]["value"] for name in names}
-        missing = [name for name in names if values[name] is None]
-        hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int).reshape(-1, 2)
-        stated = {key: fitted.get(key) for key in ("quantum_efficiency", "saturation_dn")}
-        extra = {key: part["value"] if isinstance(part, dict) else part for key, part in stated.items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure!r}); run that again") from failure
-    if missing:
-        why = fitted[missing[0]].get("why", "no reason stated")
-        raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
-    # An estimate near zero may fall below it; a dark current cannot.
-    values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
-    shape = size_px[::-1]
-    outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
-    if len(outside):
-        raise BadValue(f"{path}: hot pixel {outside[0].tolist()} is not one of {shape}; is it another camera's?")
-    unusable = np.zeros(shape, bool)
-    unusable[tuple(hot.T)] = True
-    maps = _read_noise_maps(path.with_name(NOISE_MAPS), (*names, "mask"), shape)
-    unusable |= maps.pop("mask", False)
-    known = {key: value for key, value in extra.items() if value is not None}
-    return NoiseModel(**(values | maps), **known), unusable
-
-
-def _read_noise_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Any]:
-    """Return those of the named maps (row, column) that lie beside a noise result."""
-    if not path.is_file():
-        return {}
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            maps = {name: file[name] for name in names if name in file}
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as failure:
-        raise BadValue(f"{path}: cannot be read ({failure}); run `faintfield noise` again") from failure
-    for name, values in maps.items():
-        if values.shape != shape:
-            raise BadValue(f"{path}: {name} has shape {values.shape}, the camera {shape}; is it another camera's?")
-    return maps
+def _noise(folder: Path, settings: ElementalSet) -> FittedNoise:
+    """Return the noise model that the `[noise]` table states, or that `faintfield noise` fitted."""
+    camera = settings.camera
+    if isinstance(settings.noise, str):
+        return read_fitted_noise(folder / settings.noise, camera.size_px)
+    numbers = msgspec.structs.asdict(settings.noise)
+    numbers["offset_dn"] = numbers["offset_dn"] or 0.0
+    numbers["saturation_dn"] = np.inf if numbers["saturation_dn"] is None else numbers["saturation_dn"]
+    return FittedNoise(NoiseModel(**numbers), np.zeros(camera.size_px[::-1], bool), None)
 
 
 def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
@@ -321,9 +281,7 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     return flat
 
 
-def phase_of(
-    value: Map | NDArray[np.bool_] | None, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]
-) -> Any:
+def phase_of(value: Map | None, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]) -> Any:
     """Return the part of a map (or the one number, or None) that lies on one phase of a mosaic."""
     if value is None or np.ndim(value) == 0:
         return value

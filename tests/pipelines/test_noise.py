@@ -10,9 +10,12 @@ import pytest
 import tifffile
 
 from pipelines.cli import run
-from pipelines.elemental_set import read_noise_json
+from pipelines.elemental_set import Camera, ElementalSet, View, load_set, write_set
 from pipelines.errors import BadValue
+from pipelines.files import write_json
+from pipelines.fitted_noise import read_fitted_noise
 from pipelines.frames import Frame, exif_exposure_s
+from pipelines.image_files import write_frame
 from pipelines.noise import noise
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import take_set, write_frames
@@ -61,12 +64,11 @@ def test_the_result_is_what_reconstruction_reads(tmp_path: Path) -> None:
     chip, rng = specimen(2, hot_fraction=0.005)
     folder = write_frames(tmp_path, take_set(chip, rng, frames=10))
     result = noise(folder)
-    model, unusable = read_noise_json(folder / "noise.json", (64, 64))
-    assert np.shape(model.offset_dn) == (64, 64)
-    assert model.gain_dn_per_e == result["gain_dn_per_e"]["value"]
-    assert model.saturation_dn == 65535
-    assert unusable is not None
-    np.testing.assert_array_equal(np.argwhere(unusable), result["hot_pixels"])
+    fitted = read_fitted_noise(folder / "noise.json", (64, 64))
+    assert np.shape(fitted.model.offset_dn) == (64, 64)
+    assert fitted.model.gain_dn_per_e == result["gain_dn_per_e"]["value"]
+    assert fitted.model.saturation_dn == 65535
+    np.testing.assert_array_equal(np.argwhere(fitted.unusable), result["hot_pixels"])
 
 
 def test_what_cannot_be_told_is_null_with_the_reason(tmp_path: Path) -> None:
@@ -79,7 +81,7 @@ def test_what_cannot_be_told_is_null_with_the_reason(tmp_path: Path) -> None:
         assert "record" in result[name]["why"] or "photons" in result[name]["why"]
     assert result["covariance"]["names"] == ["offset_dn"]
     with pytest.raises(BadValue, match="gain_dn_per_e is not known"):
-        read_noise_json(folder / "noise.json", (64, 64))
+        read_fitted_noise(folder / "noise.json", (64, 64))
 
 
 def test_colour_phases_are_planes_of_their_own(tmp_path: Path) -> None:
@@ -270,3 +272,22 @@ def test_masked_pixels_that_disagree_with_the_darks_raise_a_doubt(
     doubts = [warning for warning in result["warnings"] if "black level that the files bring" in warning]
     assert len(doubts) == 1
     assert doubts[0].startswith("plane B_r1c1: the darks' offset is ")
+
+
+def test_the_response_that_flats_measured_is_the_flat_field_of_a_set(tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    response = np.linspace(0.5, 1.5, 12, dtype=np.float32).reshape(3, 4)
+    hot = np.zeros((3, 4), bool)
+    hot[1, 2] = True
+    np.savez(folder / "noise_maps.npz", relative_response=response, mask=hot)
+    numbers = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": -0.01}
+    write_json(folder / "noise.json", {name: {"value": value} for name, value in numbers.items()})
+    write_frame(folder / "view.tiff", np.full((3, 4), 110, np.uint16))
+    camera = Camera((4, 3), 4.0, 4.0, 1.5, 1.0)
+    write_set(folder, ElementalSet(1, 0.1, 0, camera, "noise.json", [View("view.tiff", (0, 0, 0, 0, 0, 0))]))
+    loaded = load_set(folder)
+    assert loaded.flat is not None
+    np.testing.assert_array_equal(loaded.flat[~hot], response[~hot])
+    np.testing.assert_array_equal(loaded.unusable, hot)
+    assert loaded.noise.dark_current_e_per_s == 0
