@@ -1,12 +1,13 @@
 """The command line: help, exit codes, and which words go where."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
+from cyclopts import App
 
 from pipelines import cli
 from pipelines.errors import BadValue
@@ -14,7 +15,22 @@ from recon.errors import NotConverged
 
 type Command = Callable[..., CompletedProcess[str]]
 
-COMMANDS = [("simulate",), ("darken",), ("import",), ("import", "grid"), ("reconstruct",), ("report",), ("demo",)]
+
+def _commands(app: App, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Every command and group of commands that is registered."""
+    for name in app:
+        if not name.startswith("-"):
+            yield (*before, name)
+            yield from _commands(app[name], (*before, name))
+
+
+COMMANDS = list(_commands(cli.app))
+
+
+def test_the_commands_of_the_design_are_there() -> None:
+    expected = {"simulate", "darken", "import", "reconstruct", "report", "demo"}
+    assert expected <= {name for name, *_ in COMMANDS}
+    assert ("import", "grid") in COMMANDS
 
 
 @pytest.mark.parametrize("command", [(), *COMMANDS], ids=" ".join)

@@ -1,0 +1,229 @@
+"""What happens to real processes: interrupts, kills, full disks, places where nothing may be written."""
+
+import contextlib
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from pipelines.cli import run
+from pipelines.elemental_set import load_set
+from pipelines.frames import read_frame
+
+# A test may run in the background, where interrupts are ignored and stay so in children
+_LAUNCH = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {before}; " + (
+    "from pipelines.cli import main; main({words!r})"
+)
+_DEADLINE_S = 60.0
+
+# Permissions do not apply to root unless it gives up its capabilities (Linux: capset of version 3, none of them)
+_WITHOUT_PRIVILEGES = (
+    "import ctypes; version = (ctypes.c_uint32 * 2)(0x20080522, 0); none = (ctypes.c_uint32 * 6)(); "
+    "assert ctypes.CDLL(None).capset(version, none) == 0"
+)
+
+# Long enough to be met on its way
+SLOW = ["--size-px", "320", "240", "--rows", "5", "--columns", "5"]
+
+
+def _python(words: Sequence[object], before: str = "pass") -> list[str]:
+    return [sys.executable, "-c", _LAUNCH.format(before=before, words=[str(word) for word in words])]
+
+
+def _finished(words: Sequence[object], before: str = "pass") -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        _python(words, before), capture_output=True, text=True, timeout=_DEADLINE_S, check=False, cwd=_root()
+    )
+
+
+def _root() -> Path:
+    return Path(__file__).parents[2]
+
+
+@contextlib.contextmanager
+def _started(words: Sequence[object]) -> Iterator[subprocess.Popen[str]]:
+    """Start a command, and end it whatever happens."""
+    with subprocess.Popen(
+        _python(words), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=_root()
+    ) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def _wait_until(process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
+    """Return as soon as a condition holds, or the process has ended."""
+    deadline = time.monotonic() + _DEADLINE_S
+    while process.poll() is None and not condition():
+        assert time.monotonic() < deadline, "the process never came so far"
+        time.sleep(0.002)
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def _is_whole(folder: Path) -> bool:
+    """Return whether every file that a set names can be read."""
+    loaded = load_set(folder)
+    return all(read_frame(path).pixels_dn.size > 0 for path in loaded.image_paths)
+
+
+@pytest.fixture(scope="session")
+def small_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("small") / "set"
+    assert run(["simulate", str(folder), "--size-px", "96", "72", "--rows", "3", "--columns", "3"]) == 0
+    return folder
+
+
+def test_ctrl_c_in_the_middle_of_a_simulation_leaves_nothing(tmp_path: Path) -> None:
+    with _started(["simulate", tmp_path / "set", *SLOW]) as process:
+        _wait_until(process, lambda: any(tmp_path.glob(".set.*")))
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=_DEADLINE_S)
+    assert (process.returncode, said) == (1, "")
+    assert complaint.startswith("faintfield: Interrupted: ")
+    assert len(complaint.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_in_the_middle_of_a_reconstruction_keeps_what_was_finished(small_set: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with _started(["reconstruct", small_set, "--out", out, "--sweep-mm", "400:900:2000"]) as process:
+        _wait_until(process, lambda: (out / "plane_00401.0.tiff").exists())
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=_DEADLINE_S)
+    assert (process.returncode, said) == (1, "")
+    assert complaint.startswith("faintfield: Interrupted: ")
+    assert len(complaint.splitlines()) == 1
+    names = [path.name for path in out.iterdir()]
+    assert not [name for name in names if name.startswith(".")]
+    assert "report.html" not in names
+    for path in out.glob("*.tiff"):
+        assert read_frame(path).pixels_dn.shape == (72, 96)
+
+
+@pytest.mark.parametrize("reached", [".", "view_r0_c1.tiff", "truth.json"])
+def test_a_simulation_that_is_killed_leaves_no_set_that_looks_whole(reached: str, tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    with _started(["simulate", out, *SLOW]) as process:
+        _wait_until(process, lambda: any(tmp_path.glob(f".set.*/{reached}")))
+        process.kill()
+        process.communicate(timeout=_DEADLINE_S)
+    # Killed late, it may have put the set in place: then it must be whole
+    assert not out.exists() or _is_whole(out)
+    assert reached == "truth.json" or not out.exists()
+
+
+@pytest.mark.parametrize("reached", ["view_r0_c1.tiff", "truth.json"])
+def test_a_set_that_is_being_replaced_stays_until_the_new_one_is_whole(
+    reached: str, small_set: Path, tmp_path: Path
+) -> None:
+    out = Path(shutil.copytree(small_set, tmp_path / "set"))
+    before = _files(out)
+    with _started(["simulate", out, *SLOW, "--overwrite"]) as process:
+        _wait_until(process, lambda: any(tmp_path.glob(f".set.*/{reached}")))
+        process.kill()
+        process.communicate(timeout=_DEADLINE_S)
+    assert not out.exists() or _is_whole(out)
+    if reached != "truth.json":
+        assert _files(out) == before
+
+
+COMMANDS: dict[str, Callable[[Path, Path], list[object]]] = {
+    "simulate": lambda _, out: ["simulate", out, "--size-px", "96", "72"],
+    "darken": lambda small, out: ["darken", small, out],
+    "import grid": lambda small, out: ["import", "grid", small.parent / "pictures", out],
+    "reconstruct": lambda small, out: ["reconstruct", small, "--out", out, "--depth-mm", 500, "--passes", 2],
+}
+
+
+@pytest.fixture
+def _pictures(small_set: Path) -> None:
+    """A folder of nothing but the views."""
+    pictures = small_set.parent / "pictures"
+    pictures.mkdir(exist_ok=True)
+    for path in small_set.glob("view_*.tiff"):
+        shutil.copy(path, pictures)
+
+
+@pytest.mark.usefixtures("_pictures")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_file_that_the_disk_has_no_room_for_is_named_and_nothing_is_left(
+    command: str, small_set: Path, tmp_path: Path
+) -> None:
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))"
+    ended = _finished(COMMANDS[command](small_set, tmp_path / "out"), before=limit)
+    assert (ended.returncode, ended.stdout) == (1, ""), ended.stderr
+    complaint = ended.stderr.splitlines()[-1]
+    assert complaint.startswith("faintfield: DiskFull: ")
+    assert "no space left on the disk" in complaint
+    assert complaint.endswith("make room or use another")
+    assert "Traceback" not in ended.stderr
+    assert _files(tmp_path) == {}
+
+
+def test_a_report_that_finds_no_room_leaves_the_one_before(small_set: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert run(["reconstruct", str(small_set), "--out", str(out), "--depth-mm", "500", "--passes", "2"]) == 0
+    before = _files(out)
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))"
+    ended = _finished(["report", out], before=limit)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert ended.stderr.startswith(f"faintfield: DiskFull: {out / 'report.html'}: no space left")
+    assert _files(out) == before
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of half a megabyte."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=512k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True, check=False).returncode != 0:
+        pytest.skip("mounting a small disk is not permitted here")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def test_a_disk_that_is_full_is_named_and_nothing_is_left_on_it(small_set: Path, small_disk: Path) -> None:
+    for words in (
+        ["simulate", small_disk / "set", "--size-px", 320, 240],
+        ["reconstruct", small_set, "--out", small_disk / "out", "--sweep-mm", "400:900:50", "--passes", 1],
+    ):
+        ended = _finished(words)
+        assert (ended.returncode, ended.stdout) == (1, "")
+        assert ended.stderr.splitlines()[-1].startswith("faintfield: DiskFull: ")
+        assert _files(small_disk) == {}
+
+
+@pytest.mark.usefixtures("_pictures")
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_folder_that_may_not_be_written_to_is_named(command: str, small_set: Path, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0o555)
+    words = COMMANDS[command](small_set, tmp_path / "locked" / "out")
+    ended = _finished(words, before=_WITHOUT_PRIVILEGES)
+    assert (ended.returncode, ended.stdout) == (1, ""), ended.stderr
+    complaint = ended.stderr.splitlines()[-1]
+    assert complaint.startswith("faintfield: CannotWrite: ")
+    assert "Permission denied; name a place that can be written" in complaint
+    assert not list((tmp_path / "locked").iterdir())
+
+
+@pytest.mark.parametrize("name", ["elemental.toml", "view_r0_c0.tiff", "view_r2_c2.tiff"])
+def test_a_file_that_may_not_be_read_is_named(name: str, small_set: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(small_set, tmp_path / "set"))
+    (folder / name).chmod(0)
+    words = ["reconstruct", folder, "--out", tmp_path / "out", "--depth-mm", 500]
+    ended = _finished(words, before=_WITHOUT_PRIVILEGES)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert len(ended.stderr.splitlines()) == 1
+    assert ended.stderr.startswith(("faintfield: UnreadableImage: ", "faintfield: MissingFile: "))
+    assert name in ended.stderr
+    assert not (tmp_path / "out").exists()
