@@ -187,6 +187,17 @@ def test_a_set_without_light_cannot_be_darkened(make_set: SetMaker, tmp_path: Pa
     assert not (tmp_path / "dark").exists()
 
 
+def test_pixels_darker_than_the_dark_level_count_as_dark(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
+    frame = np.full((60, 80), 20_000, np.uint16)
+    frame[:30] = 90  # the offset is 100
+    done("darken", make_set([frame], name="bright"), tmp_path / "dark", "--snr", 5)
+    dark_set = load_set(tmp_path / "dark")
+    (view,) = load_channel(dark_set, channel_layouts(dark_set)[0]).electrons
+    deviation = np.sqrt((DARK_E + READ_VARIANCE_E2) / (30 * 80))
+    assert view[:30].mean() == pytest.approx(DARK_E, abs=4 * deviation)
+    assert view[30:].mean() > 3
+
+
 def test_without_any_noise_there_is_no_snr_to_reach(bright: Path, tmp_path: Path, faintfield: Command) -> None:
     ended = faintfield("darken", bright, tmp_path / "dark", "--read-noise-e", 0, "--dark-current-e-per-s", 0)
     assert ended.returncode == 1

@@ -39,6 +39,22 @@ def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
 
 
+def test_a_file_takes_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps: list[str] = []
+
+    def watched[**P, R](name: str, step: Callable[P, R]) -> Callable[P, R]:
+        def take(*given: P.args, **named: P.kwargs) -> R:
+            steps.append(name)
+            return step(*given, **named)
+
+        return take
+
+    for name in ("fsync", "replace"):
+        monkeypatch.setattr(os, name, watched(name, getattr(os, name)))
+    write_whole(tmp_path / "file", b"content")
+    assert steps == ["fsync", "replace", "fsync"]  # the content, its name, and the folder's entry
+
+
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
 def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / "file"

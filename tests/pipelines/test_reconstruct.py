@@ -11,10 +11,13 @@ import numpy as np
 import pytest
 import tifffile
 
+from pipelines.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
 from pipelines.cli import run
 from pipelines.elemental_set import load_set
 from pipelines.frames import read_frame
 from pipelines.image_files import grey_levels, white_level
+from recon.likelihoods import negative_log_likelihood
+from recon.penalties import total_variation
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]
@@ -104,6 +107,21 @@ def test_only_iterations_have_an_objective_a_penalty_and_a_certificate(results: 
             certificate = plane["certificate"]
             assert certificate["settled"] == (certificate["relative_change"] < 1e-3)
             assert {"kind", "oscillates", "kept_at_start"} <= set(certificate)
+
+
+@pytest.mark.parametrize("method", ["mlem", "pmlem-osl"])
+def test_the_objective_is_the_likelihood_with_the_penalty(method: str, results: Path, larger_scene: Path) -> None:
+    loaded = load_set(larger_scene)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout)
+    factory = OperatorFactory(loaded, layout, images)
+    for plane in _record(results / method)["planes"]:
+        pixels = tifffile.imread(results / method / plane["file"])
+        operator = factory.at_depth(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
+        likelihood = negative_log_likelihood(operator, pixels, images)
+        penalty = plane["penalty_weight"] * total_variation(pixels, plane["epsilon_e2"])
+        assert plane["objective"] == pytest.approx(likelihood + penalty, rel=1e-9)
+        assert (penalty > 100) == (method == "pmlem-osl")
 
 
 def test_the_planes_state_their_scale(results: Path) -> None:
@@ -230,6 +248,7 @@ def test_a_sweep_marks_the_depths_of_the_objects(sweep: Path) -> None:
     focus = _record(sweep)["focus"]
     np.testing.assert_allclose(focus["depth_mm"], np.linspace(400, 900, 26))
     assert len(focus["detail_e2"]) == len(focus["sigma_e2"]) == 26
+    assert min(focus["sigma_e2"]) > 0
     # Nearer than half a step
     assert [round(depth / 10) * 10 for depth in focus["sharp_mm"]] == [500, 700]
 

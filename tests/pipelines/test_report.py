@@ -13,8 +13,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from pipelines.cli import run
+from pipelines.image_files import grey_levels, white_level
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -132,6 +134,21 @@ def test_all_methods_and_depths_are_there_side_by_side_and_on_the_slider(text: s
     assert [column["title"] for column in columns] == list(METHOD_TITLES.values())
     for column in columns:
         assert [plane["depth_mm"] for plane in column["planes"]] == [500.0, 600.0, 700.0]
+
+
+def test_all_planes_are_shown_on_the_grey_scale_of_the_least_noisy_method(page: _Page, original: Path) -> None:
+    planes = {
+        (name, depth): tifffile.imread(original / name / f"plane_{depth:07.1f}.tiff")
+        for name in METHOD_TITLES
+        for depth in (500.0, 600.0, 700.0)
+    }
+    white = min(max(white_level(planes[name, depth]) for depth in (500.0, 600.0, 700.0)) for name in METHOD_TITLES)
+    assert f"{white:.3g} e⁻ per pixel" in page.words
+    shown = {a["alt"]: a["src"] or "" for tag, a in page.elements if tag == "img"}
+    for (name, depth), plane in planes.items():
+        content = base64.b64decode(shown[f"{METHOD_TITLES[name]} at {depth} mm"].split(";base64,")[1])
+        picture = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(picture, grey_levels(plane, white))
 
 
 def test_settings_hashes_and_figures_are_there(page: _Page, original: Path) -> None:
