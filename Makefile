@@ -33,7 +33,8 @@ lock: ## renew requirements.lock from pyproject.toml
 	  --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
 
 clean: ## remove what the tasks made
-	rm -rf $(VENV) .uv build *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
+	rm -rf $(VENV) .uv build demo *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
 
 $(VENV)/installed: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \

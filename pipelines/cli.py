@@ -33,15 +33,8 @@ app = App(
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 
 
-for _command in (
-    "simulate:simulate",
-    "darken:darken",
-    "noise:noise",
-    "reconstruct:reconstruct",
-    "report:report",
-    "demo:demo",
-):
-    app.command(f"pipelines.{_command}")
+for _name in ("demo", "simulate", "darken", "noise", "reconstruct", "report"):
+    app.command(f"pipelines.{_name}:{_name}")
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
 app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
@@ -74,6 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; any other exception than a named failure is a bug."""
+    _load_what_help_lists(arguments)
     try:
         app.meta(arguments, exit_on_error=False, print_error=True)
     except CycloptsError:
@@ -85,6 +79,19 @@ def run(arguments: Sequence[str]) -> int:
         say(f"faintfield: {type(failure).__name__}: {failure}")
         return FAILED
     except KeyboardInterrupt:
-        say("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, nothing is half-written")
+        say("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, no file is half-written")
         return FAILED
     return DONE
+
+
+def _load_what_help_lists(arguments: Sequence[str]) -> None:
+    """Import the commands of a list that is about to be shown: what they do stands in their modules."""
+    level = app
+    for word in arguments:
+        if word.startswith("-"):
+            break
+        if word not in level:
+            return
+        level = level[word]
+    for name in level:
+        level[name]

@@ -148,7 +148,8 @@ class LoadedSet:
         if not inverse_depth > 0:
             raise BadValue(
                 f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
-                f"the plane at infinity has {self._disparity_at_infinity_px(steps, shift_px):.3g} px: give less"
+                f"give a number below {self._disparity_at_infinity_px(steps, shift_px):.3g} px, that of infinitely far "
+                "points (cameras that move right see near points move left, by a negative number)"
             )
         return float(1 / inverse_depth)
 
@@ -231,8 +232,13 @@ def _check_numbers(path: Path, settings: ElementalSet) -> None:
                 "give rt_cam_ref in rad and mm, or remove the view"
             )
     mosaic = settings.camera.mosaic
-    if mosaic is not None and (not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1):
-        raise BadValue(f'{path}: camera.mosaic = {list(mosaic)}; give rows of equal length, such as ["RG", "GB"]')
+    if mosaic is None:
+        return
+    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1 or set("".join(mosaic)) - set("RGB"):
+        raise BadValue(
+            f"{path}: camera.mosaic = {list(mosaic)}; give rows of equal length of the letters R, G and B, such as "
+            '["RG", "GB"]'
+        )
 
 
 def _check_views(path: Path, settings: ElementalSet) -> None:

@@ -64,8 +64,8 @@ def white_level(plane: NDArray[np.floating]) -> float:
 
 
 def contact_sheet(views: list[Picture], columns: int) -> Picture:
-    """Return small pictures of one size (row, column[, RGB]) laid out in rows with a hairline between them."""
-    gap = 1
+    """Return small pictures of one size (row, column[, RGB]) laid out in rows with a thin line between them."""
+    gap = 3  # thinner lines get lost when a page is shown smaller
     height, width = views[0].shape[:2]
     rows = -(-len(views) // columns)
     sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, *views[0].shape[2:]), 40, np.uint8)

@@ -54,7 +54,8 @@ def import_grid(
 
     The node of a picture is read from the last two numbers of its name, row then column, as in view_r3_c12.jpg; names
     without two numbers are taken in order, row by row, with --rows and --columns. Row 0 is the top, column 0 the left.
-    Pictures are kept as they are, except that 8-bit ones become 16-bit TIFF with the same values.
+    Pictures are kept as they are, except that 8-bit ones become 16-bit TIFF with the same values. They are taken to be
+    proportional to light: photographs with a gamma curve, as most JPEGs are, give pictures but no photometry.
 
     Parameters
     ----------
@@ -67,8 +68,8 @@ def import_grid(
     fx_px
         Focal length; the width of a picture by default.
     disparity_px
-        For pictures aligned (rectified) on a plane: how many pixels that plane moved from node to node before it was
-        aligned, which with the pitch sets its depth to fx · pitch / disparity. 0: the pictures are not aligned.
+        For pictures aligned (rectified) on a plane: by how many pixels that plane moved from node to node before it
+        was aligned (a positive number), which with the pitch sets its depth to fx · pitch / disparity. 0: not aligned.
     rows
         Of the grid, where names do not tell.
     columns
@@ -178,7 +179,7 @@ def _copy_views(
     height, width = first.pixels_dn.shape[:2]
     focal_px = fx_px or float(width)
     if pitch_mm is None:
-        pitch_mm = _FREE_REFERENCE_DEPTH_MM * abs(disparity_px) / focal_px if disparity_px else 1.0
+        pitch_mm = _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px if disparity_px else 1.0
     camera = Camera((width, height), focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
     poses = nominal_poses_rt_cam_ref(grid.rows, grid.columns, pitch_mm)
     row_0, column_0 = centre_node(grid.rows, grid.columns)

@@ -64,7 +64,8 @@ def reconstruct(
     sweep_mm
         FIRST:LAST:COUNT, that many planes in equal steps, with a curve of focus against depth.
     disparity_px
-        Instead of a depth: by how many pixels a point of the plane moves from one node to the next.
+        Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
+        negative for near points, unless the pictures are aligned on a nearer plane.
     method
         backprojection, mlem or pmlem-osl (the default); give it once per method.
     penalty_weight
@@ -148,6 +149,7 @@ class _Run:
             assert images is not None
             assert factory is not None
             operator = self._operator(factory, depth)
+            self._say_which_views_are_blind(operator, depth, len(layout.lattices))
             if with_focus:
                 halves = _halves(self._loaded, len(layout.lattices))
                 self._add_focus(depth, focus_measure(operator, images, halves))
@@ -182,6 +184,15 @@ class _Run:
             return factory.at_depth(depth_mm, self._grids[depth_mm])
         except GeometryMismatch as failure:
             raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
+
+    def _say_which_views_are_blind(self, operator: PlaneOperator, depth_mm: float, phases: int) -> None:
+        """Tell of views that see nothing of a plane: a pose may be wrong."""
+        blind = {int(view) // phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()}
+        if blind:
+            first = self._loaded.settings.view[min(blind)].image
+            say(
+                f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
+            )
 
     def _record(
         self, depth: float, method: Method, layout: ChannelLayout, record: dict[str, Any], plane: NDArray[np.floating]
@@ -245,6 +256,7 @@ def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
     if swings:
         say(
-            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes; it swings "
-            f"by up to {max(swings):.1%} per pass (see reconstruction.json). A smaller --penalty-weight calms it."
+            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
+            f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
+            "--penalty-weight calms it, and leaves more noise."
         )

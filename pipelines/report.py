@@ -86,6 +86,8 @@ def write_report(directory: Path) -> Path:
             rows=_rows(planes, columns, _shown_depths(depths, focus), white),
             slider=_slider(planes, columns, white) if len(depths) > 1 else None,
             slider_column=_slider_column(columns),
+            slider_depth=_slider_depth(depths, focus),
+            depths=len(depths),
             white=white,
             focus_curve=_focus_curve(focus) if focus else None,
             sharp_mm=focus["sharp_mm"] if focus else [],
@@ -207,6 +209,14 @@ def _slider(planes: list[_Plane], columns: list[str], white: float) -> list[dict
 def _slider_column(columns: list[str]) -> int:
     """Return which column the slider shows first: one that was penalised, where there is one."""
     return next((index for index, name in enumerate(columns) if "pmlem" in name), 0)
+
+
+def _slider_depth(depths: list[float], focus: dict[str, Any] | None) -> int:
+    """Return which depth the slider shows first: where the focus curve is highest, the first without a curve."""
+    if focus is None:
+        return 0
+    best = max(zip(focus["detail_e2"], focus["depth_mm"], strict=True))[1]
+    return min(range(len(depths)), key=lambda index: abs(depths[index] - best))
 
 
 def _set_section(folder: Path) -> dict[str, Any]:

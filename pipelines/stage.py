@@ -19,7 +19,7 @@ from rig.simulation.controller.marlin import SimulatedMarlin
 from rig.simulation.controller.server import serving
 from rig.stages.conformance import Check, conformance
 from rig.stages.gantry import Gantry
-from rig.stages.protocol import Identity, Position
+from rig.stages.protocol import Identity, Point, Position
 from rig.stages.settings import StageSettings
 
 app = App(name="stage", help="Bring up a stage: ask it, home it, move it, try it.")
@@ -115,6 +115,7 @@ def goto(
         Home first. Needed, since opening the port restarts most controllers.
     """
     with _connected(connection) as stage:
+        stage.workspace().check_path([Point(x_mm, y_mm)])
         if home:
             stage.home()
         position = stage.move_to(x_mm, y_mm)

@@ -351,7 +351,7 @@ def test_the_depth_of_a_disparity_is_that_of_similar_triangles(
 
 def test_a_disparity_beyond_infinity_is_refused_with_that_of_infinity(tmp_path: Path) -> None:
     loaded = _loaded(_rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1), (1, 0)]), tmp_path)
-    with pytest.raises(BadValue, match=r"disparity of 3 px .* infinity has 2\.5 px"):
+    with pytest.raises(BadValue, match=r"disparity of 3 px .* below 2\.5 px, that of infinitely far"):
         loaded.depth_of_disparity(3.0)
 
 
