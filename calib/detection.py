@@ -1,0 +1,145 @@
+"""Finding boards: markers first, corners between them, then each corner's saddle point."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.board import Board, predefined_dictionary
+from calib.saddle import refine_saddles
+
+# The darkest and brightest shares of pixels that a stretch may lose.
+_STRETCH_QUANTILES = (0.002, 0.998)
+_STRETCH_SAMPLES = 60_000
+
+# The detector wants this much contrast over noise; below, the picture is smoothed until it has it.
+_WANTED_CONTRAST_OVER_NOISE = 14.0
+_MOST_SMOOTHING_PX = 2.5
+
+_SADDLE_RADIUS_PX = (3, 9)
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """The corners of one board found in one image.
+
+    Attributes
+    ----------
+    board : str
+        Its name.
+    corners : int array (corner,)
+        Their numbers.
+    pixels : float array (corner, 2)
+        Column, row.
+    sigma_px : float array (corner,)
+        Standard deviation per axis, from the image's noise.
+    markers : int
+        How many of its markers were found.
+    legacy : bool
+        The print begins with a white square, as boards of an even number of rows did in older OpenCV.
+    """
+
+    board: str
+    corners: NDArray[np.intp]
+    pixels: NDArray[np.float64]
+    sigma_px: NDArray[np.float64]
+    markers: int
+    legacy: bool
+
+
+def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCorners]:
+    """Return the corners of every board of which markers are seen.
+
+    Parameters
+    ----------
+    image : array (row, column)
+        Grey, of any depth and brightness; the mean of repeated frames where one is too dark.
+    boards : sequence of Board
+        Looked for; they share no marker.
+    """
+    light = np.asarray(image, np.float32)
+    stretched = stretch(light)
+    found = (_detect_board(light, stretched, board) for board in boards)
+    return [corners for corners in found if corners is not None]
+
+
+def detect_all(
+    images: Iterable[NDArray[Any]], boards: Sequence[Board], workers: int = 2
+) -> Iterator[list[BoardCorners]]:
+    """Yield what `detect_boards` finds in each image, in order, several at a time."""
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = []
+        for image in images:
+            waiting.append(pool.submit(detect_boards, image, boards))
+            if len(waiting) > workers:  # so that images are not all in memory
+                yield waiting.pop(0).result()
+        for task in waiting:
+            yield task.result()
+
+
+def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an image as the 8 bits that the marker detector wants, whatever its depth; smoothed if it is noisy."""
+    step = max(int(np.sqrt(light.size / _STRETCH_SAMPLES)), 1)
+    black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
+    kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(light, cv2.CV_32F, kernel)[::step, ::step]))) / 6
+    ratio = (white - black - 4 * noise) / max(noise, 1e-12)
+    if ratio < _WANTED_CONTRAST_OVER_NOISE:
+        # a Gaussian of σ lowers the noise by 2√π σ
+        sigma_px = _WANTED_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
+        light = cv2.GaussianBlur(light, (0, 0), min(max(sigma_px, 0.6), _MOST_SMOOTHING_PX))
+        black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
+    return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
+
+
+def _detect_board(light: NDArray[np.float32], stretched: NDArray[np.uint8], board: Board) -> BoardCorners | None:
+    """Try both layouts of the board and keep the one that gives corners."""
+    marker_corners, marker_ids = _own_markers(stretched, board)
+    if not marker_ids.size:
+        return None
+    layouts = (False, True) if board.rows % 2 == 0 else (False,)
+    best: tuple[NDArray[np.float64], NDArray[np.intp], bool] | None = None
+    for legacy in layouts:
+        detector = _detector(board, legacy)
+        pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
+        if pixels is not None and len(pixels) and (best is None or len(pixels) > len(best[0])):
+            best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
+    markers = len(marker_ids)
+    if best is None:
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), markers, legacy=False)
+    guesses, ids, legacy = best
+    pixels, sigma_px = refine_saddles(light, guesses, _saddle_radius_px(board, marker_corners))
+    kept = np.isfinite(sigma_px)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], markers, legacy)
+
+
+def _own_markers(stretched: NDArray[np.uint8], board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+    """Return the markers in the image that are this board's."""
+    corners, ids, _ = _marker_detector(board.dictionary).detectMarkers(stretched)
+    if ids is None:
+        return [], np.empty((0, 1), np.int32)
+    own = [index for index, marker in enumerate(np.ravel(ids)) if int(marker) in board.marker_ids]
+    return [corners[index] for index in own], np.reshape(ids, (-1, 1))[own].astype(np.int32)
+
+
+def _saddle_radius_px(board: Board, marker_corners: Sequence[NDArray[np.float32]]) -> int:
+    """Return the radius that stays clear of the markers, whose nearest points lie on the squares' diagonals."""
+    outlines = [np.reshape(corners, (4, 2)) for corners in marker_corners]
+    sides_px = [np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min() for outline in outlines]
+    gap_px = float(np.median(sides_px)) / board.marker_mm * (board.square_mm - board.marker_mm) / 2
+    return int(np.clip(np.floor(np.sqrt(2) * gap_px), *_SADDLE_RADIUS_PX))
+
+
+@cache
+def _marker_detector(dictionary: str) -> Any:
+    return cv2.aruco.ArucoDetector(predefined_dictionary(dictionary), cv2.aruco.DetectorParameters())
+
+
+@cache
+def _detector(board: Board, legacy: bool) -> Any:
+    return cv2.aruco.CharucoDetector(board.opencv_board(legacy=legacy))
