@@ -64,7 +64,8 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
     """
     light = np.asarray(image, np.float32)
     stretched = stretch(light)
-    found = (_detect_board(light, stretched, board) for board in boards)
+    markers = {name: _markers(stretched, name) for name in {board.dictionary for board in boards}}
+    found = (_detect_board(light, stretched, markers[board.dictionary], board) for board in boards)
     return [corners for corners in found if corners is not None]
 
 
@@ -97,9 +98,11 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
 
 
-def _detect_board(light: NDArray[np.float32], stretched: NDArray[np.uint8], board: Board) -> BoardCorners | None:
+def _detect_board(
+    light: NDArray[np.float32], stretched: NDArray[np.uint8], markers: "_Markers", board: Board
+) -> BoardCorners | None:
     """Try both layouts of the board and keep the one that gives corners."""
-    marker_corners, marker_ids = _own_markers(stretched, board)
+    marker_corners, marker_ids = markers.of(board)
     if not marker_ids.size:
         return None
     layouts = (False, True) if board.rows % 2 == 0 else (False,)
@@ -109,22 +112,32 @@ def _detect_board(light: NDArray[np.float32], stretched: NDArray[np.uint8], boar
         pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
         if pixels is not None and len(pixels) and (best is None or len(pixels) > len(best[0])):
             best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
-    markers = len(marker_ids)
+    count = len(marker_ids)
     if best is None:
-        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), markers, legacy=False)
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
     guesses, ids, legacy = best
     pixels, sigma_px = refine_saddles(light, guesses, _saddle_radius_px(board, marker_corners))
     kept = np.isfinite(sigma_px)
-    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], markers, legacy)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
 
 
-def _own_markers(stretched: NDArray[np.uint8], board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-    """Return the markers in the image that are this board's."""
-    corners, ids, _ = _marker_detector(board.dictionary).detectMarkers(stretched)
-    if ids is None:
-        return [], np.empty((0, 1), np.int32)
-    own = [index for index, marker in enumerate(np.ravel(ids)) if int(marker) in board.marker_ids]
-    return [corners[index] for index in own], np.reshape(ids, (-1, 1))[own].astype(np.int32)
+@dataclass(frozen=True)
+class _Markers:
+    """All markers of one dictionary in an image: their outlines, and their numbers (marker, 1)."""
+
+    corners: Sequence[NDArray[np.float32]]
+    ids: NDArray[np.int32]
+
+    def of(self, board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+        """Return those of one board."""
+        own = [index for index, marker in enumerate(np.ravel(self.ids)) if int(marker) in board.marker_ids]
+        return [self.corners[index] for index in own], self.ids[own]
+
+
+def _markers(stretched: NDArray[np.uint8], dictionary: str) -> _Markers:
+    """Find the markers of a dictionary."""
+    corners, ids, _ = _marker_detector(dictionary).detectMarkers(stretched)
+    return _Markers(corners, np.empty((0, 1), np.int32) if ids is None else np.reshape(ids, (-1, 1)).astype(np.int32))
 
 
 def _saddle_radius_px(board: Board, marker_corners: Sequence[NDArray[np.float32]]) -> int:

@@ -35,6 +35,13 @@ for _command in ("simulate:simulate", "darken:darken", "reconstruct:reconstruct"
     app.command(f"pipelines.{_command}")
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
+for _command in ("geometry:geometry", "board_pdf:board"):
+    app.command(f"pipelines.{_command}")
+app["import"].command("pipelines.import_colmap:import_colmap", name="colmap")
+app["import"].command("pipelines.import_mrcal:import_mrcal", name="mrcal")
+app.command(App(name="export", help="Write the lens and poses of a set for other people's programs."))
+app["export"].command("pipelines.import_colmap:export_colmap", name="colmap")
+app["export"].command("pipelines.import_mrcal:export_mrcal", name="mrcal")
 
 
 @app.meta.default

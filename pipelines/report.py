@@ -19,7 +19,7 @@ from pipelines.metrics import METRICS_FILE
 from pipelines.overview import INTEGRAL_IMAGE, OVERVIEW_FILE, REFERENCE_OF_NOISE, REFERENCE_VIEW
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import Template
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
@@ -77,8 +77,7 @@ def write_report(directory: Path) -> Path:
     columns = list(dict.fromkeys(plane.column for plane in planes))
     white = _shared_white(planes, columns)
     page = (
-        _environment()
-        .get_template("report.html")
+        template("report.html")
         .render(
             title=_title(directory, results),
             sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
@@ -269,9 +268,10 @@ def _focus_curve(focus: dict[str, Any]) -> str:
     return svg[svg.index("<svg") :].replace(ink, "currentColor")
 
 
-def _environment() -> "Environment":
+def template(name: str) -> "Template":
+    """Return a page's template, with `figure` to write a number to three digits."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when all images are out of memory
 
     environment = Environment(loader=PackageLoader("pipelines"), autoescape=True, undefined=StrictUndefined)
     environment.filters["figure"] = lambda value, digits=3: "–" if value is None else f"{value:.{digits}g}"
-    return environment
+    return environment.get_template(name)
