@@ -101,7 +101,7 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _detect_board(
     light: NDArray[np.float32], stretched: NDArray[np.uint8], markers: "_Markers", board: Board
 ) -> BoardCorners | None:
-    """Try both layouts of the board and keep the one that gives corners."""
+    """Try the board's layouts until one gives corners."""
     marker_corners, marker_ids = markers.of(board)
     if not marker_ids.size:
         return None
@@ -110,8 +110,9 @@ def _detect_board(
     for legacy in layouts:
         detector = _detector(board, legacy)
         pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
-        if pixels is not None and len(pixels) and (best is None or len(pixels) > len(best[0])):
+        if pixels is not None and len(pixels):  # the wrong layout finds markers and no corners
             best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
+            break
     count = len(marker_ids)
     if best is None:
         return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)

@@ -89,6 +89,8 @@ class LoadedSet:
         Relative response.
     unusable : bool array (row, column), optional
         Pixels that never count (hot, dead).
+    measured_in : Path, optional
+        The geometry.json that lens and poses were taken from; None where they are the set's own.
     """
 
     folder: Path
@@ -98,6 +100,7 @@ class LoadedSet:
     offset_from_files: bool
     flat: NDArray[np.float32] | None
     unusable: NDArray[np.bool_] | None
+    measured_in: Path | None = None
 
     @property
     def reference_view(self) -> int:
@@ -161,6 +164,8 @@ class LoadedSet:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
         for name in [FILE_NAME, *_named_files(self.settings)]:
             yield name, sha256(self.folder / name)
+        if self.measured_in is not None:
+            yield self.measured_in.name, sha256(self.measured_in)
 
 
 def load_set(folder: Path) -> LoadedSet:

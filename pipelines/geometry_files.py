@@ -10,7 +10,15 @@ import msgspec
 import numpy as np
 
 from calib.board import Board
-from calib.geometry import BoardObservation, GeometrySettings, Node, RigGeometry, Target, rms_over_views, transfer_sigma_at
+from calib.geometry import (
+    BoardObservation,
+    GeometrySettings,
+    Node,
+    RigGeometry,
+    Target,
+    rms_over_views,
+    transfer_sigma_at,
+)
 from calib.geometry.stage import StageReport
 from calib.lens import Lens
 from pipelines.errors import BadValue, MissingFile

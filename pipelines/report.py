@@ -76,25 +76,22 @@ def write_report(directory: Path) -> Path:
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
     columns = list(dict.fromkeys(plane.column for plane in planes))
     white = _shared_white(planes, columns)
-    page = (
-        template("report.html")
-        .render(
-            title=_title(directory, results),
-            sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
-            columns=[{"name": name, "title": _column_title(name)} for name in columns],
-            rows=_rows(planes, columns, _shown_depths(depths, focus), white),
-            slider=_slider(planes, columns, white) if len(depths) > 1 else None,
-            slider_column=_slider_column(columns),
-            white=white,
-            focus_curve=_focus_curve(focus) if focus else None,
-            sharp_mm=focus["sharp_mm"] if focus else [],
-            metrics=_metrics(directory),
-            method_names=METHOD_NAMES,
-            results=[
-                {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
-                for folder, result in results.items()
-            ],
-        )
+    page = template("report.html").render(
+        title=_title(directory, results),
+        sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
+        columns=[{"name": name, "title": _column_title(name)} for name in columns],
+        rows=_rows(planes, columns, _shown_depths(depths, focus), white),
+        slider=_slider(planes, columns, white) if len(depths) > 1 else None,
+        slider_column=_slider_column(columns),
+        white=white,
+        focus_curve=_focus_curve(focus) if focus else None,
+        sharp_mm=focus["sharp_mm"] if focus else [],
+        metrics=_metrics(directory),
+        method_names=METHOD_NAMES,
+        results=[
+            {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
+            for folder, result in results.items()
+        ],
     )
     path = directory / REPORT_FILE
     write_whole(path, page)

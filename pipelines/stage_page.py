@@ -70,9 +70,13 @@ def node_drawing(geometry: RigGeometry, stage: StageReport) -> str:
     factor = _magnification(residuals, float(pitch.min()))
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
-    figure = Figure(figsize=(6.6, float(np.clip(6.0 * across_mm[1] / across_mm[0], 2.5, 8)) + 0.7), layout="constrained")
+    figure = Figure(
+        figsize=(6.6, float(np.clip(6.0 * across_mm[1] / across_mm[0], 2.5, 8)) + 0.7), layout="constrained"
+    )
     axes = figure.subplots()
-    axes.plot(*nominal.T, "+", color=ink, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best")
+    axes.plot(
+        *nominal.T, "+", color=ink, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
+    )
     limit = float(np.abs(residuals[:, 2]).max()) or 1e-6
     dots = axes.scatter(
         *real.T, c=1e3 * residuals[:, 2], cmap="coolwarm", s=60, zorder=3, edgecolors=ink, linewidths=0.6,

@@ -39,7 +39,9 @@ class Seed:
 def seed_from(observations: Observations, size_px: tuple[int, int], square_mm: float) -> Seed:
     """Return the focal length that fits single views best, and poses along the tree of the best-determined views."""
     focal_px = _focal_by_trial(observations, size_px, square_mm)
-    poses = [_pose(observations, view, _matrix(focal_px, size_px), square_mm) for view in range(len(observations.node_of))]
+    poses = [
+        _pose(observations, view, _matrix(focal_px, size_px), square_mm) for view in range(len(observations.node_of))
+    ]
     camera_from_ref, ref_from_board = _tree(observations, [pose for pose, _ in poses], [error for _, error in poses])
     return Seed(
         focal_px,

@@ -64,19 +64,29 @@ def approach_directions(visits: Sequence[tuple[Node, int]]) -> dict[Node, tuple[
     Parameters
     ----------
     visits : sequence of ((int, int), int)
-        Node and sweep in the order of capture. An axis that did not move keeps the direction of its last move.
+        Node and sweep in the order of capture. An axis that does not move keeps the direction of its last move;
+        before its first move it is taken to have come the way it then goes on.
     """
-    last: dict[int, tuple[Node, list[float]]] = {}
-    seen: dict[Node, list[tuple[float, float]]] = {}
-    for node, sweep in visits:
-        before, direction = last.get(sweep, (None, [0.0, 0.0]))
-        if before is not None:
-            moves = (node[1] - before[1], node[0] - before[0])
-            direction = [float(np.sign(move)) or old for move, old in zip(moves, direction, strict=True)]
-        last[sweep] = (node, direction)
-        seen.setdefault(node, []).append((direction[0], direction[1]))
-    means = {node: np.mean(directions, axis=0) for node, directions in seen.items()}
+    directions: dict[Node, list[NDArray[np.float64]]] = {}
+    for sweep in dict.fromkeys(sweep for _, sweep in visits):
+        path = [node for node, of_sweep in visits if of_sweep == sweep]
+        moves = np.sign(np.diff(np.array(path, float)[:, ::-1], axis=0, prepend=np.nan))
+        for axis in (0, 1):
+            _fill_forward(moves[:, axis])
+        for node, direction in zip(path, moves, strict=True):
+            directions.setdefault(node, []).append(direction)
+    means = {node: np.mean(of_node, axis=0) for node, of_node in directions.items()}
     return {node: (float(mean[0]), float(mean[1])) for node, mean in means.items()}
+
+
+def _fill_forward(moves: Numbers) -> None:
+    """Replace standing still (0, or NaN at the start) by the last move, and by the first one before that."""
+    moving = np.flatnonzero(np.nan_to_num(moves))
+    if not moving.size:
+        moves[:] = 0.0
+        return
+    last = np.maximum(np.searchsorted(moving, np.arange(len(moves)), side="right") - 1, 0)
+    moves[:] = moves[moving[last]]
 
 
 def stage_report(

@@ -68,7 +68,11 @@ def six_boards(corner_rows: int, corner_columns: int, square_mm: float) -> list[
 
 
 def printed_board(
-    name: str, picture: NDArray[np.floating], pitch_mm: float, board: SimulatedBoard, first_corner_mm: tuple[float, float]
+    name: str,
+    picture: NDArray[np.floating],
+    pitch_mm: float,
+    board: SimulatedBoard,
+    first_corner_mm: tuple[float, float],
 ) -> TexturedPlane:
     """Return a print of a board standing where `board` says.
 
