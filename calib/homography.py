@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.lens import Lens
 
-# Steps of the central differences, relative to 1 + |value|: rounding and curvature both stay below 1e-6 of a derivative.
+# Step of the central differences over 1 + |value|: rounding and curvature both stay below 1e-6 of a derivative.
 _STEP = 1e-6
 _POINTS_ACROSS = 5
 
@@ -123,12 +123,12 @@ def transfer_sigma_px(
     array (view, point)
         NaN where the view does not see the point within its image.
     """
-    pixels = image_lattice(lens.size_px) if pixels is None else np.asarray(pixels, np.float64)
-    sigma_px = np.full((len(rt_cam_ref), len(pixels)), np.nan)
+    points = image_lattice(lens.size_px) if pixels is None else np.asarray(pixels, np.float64)
+    sigma_px = np.full((len(rt_cam_ref), len(points)), np.nan)
     for view, (rt, covariance) in enumerate(zip(np.asarray(rt_cam_ref, float), covariances, strict=True)):
-        derivative = _transfer_derivative(lens, rt, rt_ref_plane, pixels)
+        derivative = _transfer_derivative(lens, rt, rt_ref_plane, points)
         variances = np.einsum("pai,ij,paj->p", derivative, covariance, derivative)
-        seen_at = transfer(lens, rt, rt_ref_plane, pixels)
+        seen_at = transfer(lens, rt, rt_ref_plane, points)
         seen = ((seen_at >= -0.5) & (seen_at <= np.array(lens.size_px) - 0.5)).all(axis=1)
         sigma_px[view, seen] = np.sqrt(np.maximum(variances[seen], 0))
     return sigma_px

@@ -85,7 +85,7 @@ class Lens:
         LensNotInvertible
             Some pixel is the image of no ray, or of several.
         """
-        return self._undistorted(np.asarray(pixels, np.float64)[np.newaxis])[0]
+        return np.asarray(self._undistorted(np.asarray(pixels, np.float64)[np.newaxis])[0])
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the pixels (point, 2) of points (point, 3) in the camera's coordinates; NaN behind the camera."""

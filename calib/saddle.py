@@ -113,7 +113,7 @@ def _noise_sd(image: NDArray[np.float32], points: NDArray[np.float64], radius_px
     size = 2 * radius_px + 1
     detail = cv2.blur(cv2.filter2D(image, cv2.CV_32F, _NOISE_KERNEL) ** 2, (size, size)) / 36
     columns, rows = np.rint(points).astype(int).T
-    return np.sqrt(detail[rows, columns].astype(np.float64))
+    return np.asarray(np.sqrt(detail[rows, columns]), np.float64)
 
 
 def _inside(points: NDArray[np.float64], shape: tuple[int, ...], radius_px: int) -> NDArray[np.bool_]:

@@ -19,7 +19,14 @@ from pipelines.errors import BadValue, MissingFile
 from pipelines.files import write_whole
 
 # Name, number of parameters, by COLMAP's number of the model.
-_MODELS = {0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8), 6: ("FULL_OPENCV", 12)}  # fmt: skip
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    6: ("FULL_OPENCV", 12),
+}
 _NUMBERS = {name: number for number, (name, _) in _MODELS.items()}
 _HALF_PX = 0.5
 
@@ -157,7 +164,7 @@ def _images_text(path: Path) -> list[ColmapImage]:
 def _cameras_binary(path: Path) -> dict[int, Lens]:
     lenses = {}
     with path.open("rb") as file:
-        for _ in range(_take(file, "Q")[0]):
+        for _ in range(int(_take(file, "Q")[0])):
             number, model, width, height = _take(file, "iiQQ")
             name = _model_name(int(model))
             numbers = _take(file, f"{_MODELS[int(model)][1]}d")
@@ -168,7 +175,7 @@ def _cameras_binary(path: Path) -> dict[int, Lens]:
 def _images_binary(path: Path) -> list[ColmapImage]:
     images = []
     with path.open("rb") as file:
-        for _ in range(_take(file, "Q")[0]):
+        for _ in range(int(_take(file, "Q")[0])):
             _, *numbers, camera = _take(file, "i7di")
             name = b""
             while (letter := file.read(1)) not in (b"\0", b""):

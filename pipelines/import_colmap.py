@@ -44,7 +44,6 @@ def import_colmap(
     overwrite
         Replace an earlier set in OUT.
     """
-    options = {"mm_per_unit": mm_per_unit, "reference": reference}
     model = read_model(src)
     used = sorted({image.camera for image in model.images})
     if len(used) != 1:
@@ -59,7 +58,7 @@ def import_colmap(
         reference=reference,
         exposure_s=exposure_s,
         command="import colmap",
-        options=options,
+        options={"mm_per_unit": mm_per_unit, "reference": reference},
         overwrite=overwrite,
     )
     return {"out": str(out), "views": len(posed), "reference": name}

@@ -12,7 +12,7 @@ from pipelines.files import write_whole
 
 PAGE_FILE = "geometry.html"
 
-_FIGURES = (
+_FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
     ("pitch_y_mm", "pitch along columns", "mm", 1.0),
     ("scale_x", "scale along rows, real over told", "", 1.0),
@@ -32,7 +32,7 @@ def write_stage_page(out: Path, geometry: RigGeometry, stage: StageReport, conte
     from pipelines.report import template  # loads jinja2
 
     page = template("geometry.html").render(
-        rows=[_row(getattr(stage, name), *words) for name, *words in _FIGURES],
+        rows=[_row(getattr(stage, name), words, unit, factor) for name, words, unit, factor in _FIGURES],
         drawing=node_drawing(geometry, stage) if stage.residuals_mm else None,
         geometry=content,
         nodes=[
@@ -78,16 +78,15 @@ def node_drawing(geometry: RigGeometry, stage: StageReport) -> str:
         *nominal.T, "+", color=ink, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
     )
     limit = float(np.abs(residuals[:, 2]).max()) or 1e-6
-    dots = axes.scatter(
-        *real.T, c=1e3 * residuals[:, 2], cmap="coolwarm", s=60, zorder=3, edgecolors=ink, linewidths=0.6,
-        vmin=-1e3 * limit, vmax=1e3 * limit, label=f"camera, deviation × {factor:g}",
-    )  # fmt: skip
+    deviation = {"c": 1e3 * residuals[:, 2], "cmap": "coolwarm", "vmin": -1e3 * limit, "vmax": 1e3 * limit}
+    dots = axes.scatter(real[:, 0], real[:, 1], s=60, zorder=3, edgecolors=ink, linewidths=0.6, **deviation)
+    dots.set_label(f"camera, deviation × {factor:g}")
     for start, end in zip(nominal, real, strict=True):
         axes.plot(*np.array([start, end]).T, color=ink, linewidth=0.8, alpha=0.7, zorder=2)
     bar = figure.colorbar(dots, ax=axes, shrink=0.8)
     bar.set_label("along the normal (µm)", color=ink)
     bar.ax.tick_params(colors=ink)
-    bar.outline.set_edgecolor(ink)  # type: ignore[operator]
+    bar.outline.set_edgecolor(ink)
     axes.set_aspect("equal")
     axes.margins(0.1)
     axes.invert_yaxis()

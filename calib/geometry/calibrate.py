@@ -12,7 +12,7 @@ from calib.geometry.bundle import LENS_MODELS, Bundle, Problem, solve
 from calib.geometry.covariance import Uncertainty, uncertainty
 from calib.geometry.gates import require_determined
 from calib.geometry.holdout import holdout_ratio
-from calib.geometry.observations import BoardObservation, Node, Observations, gather
+from calib.geometry.observations import BoardObservation, Node, gather
 from calib.geometry.rig_geometry import BoardPose, RigGeometry
 from calib.lens import Lens
 

@@ -1,4 +1,4 @@
-"""Hold-out: does a geometry found without a board explain that board?"""
+"""Hold-out: whether a geometry found without a board explains that board."""
 
 import numpy as np
 

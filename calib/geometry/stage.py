@@ -116,16 +116,17 @@ def stage_report(
     residuals = centres - design @ solution
     covariance = _solution_covariance(solver, residuals, geometry.centre_covariance_mm2(), design.shape)
     estimate = _Propagated(solution, covariance)
-    pitches = [estimate(lambda s, k=axis: float(np.linalg.norm(s[1 + k]))) for axis in (0, 1)]
-    backlash = [_backlash(estimate, axis, told) for axis in (0, 1)]
+    pitch_x, pitch_y = (_pitch(estimate, axis) for axis in (0, 1))
     freedom = max(residuals.size - solution.size, 1)
     rms_mm = float(np.sqrt(3 * (residuals**2).sum() / freedom))
     return StageReport(
-        *pitches,
-        *(_scale(pitch, pitch_mm) for pitch in pitches),
+        pitch_x_mm=pitch_x,
+        pitch_y_mm=pitch_y,
+        scale_x=_scale(pitch_x, pitch_mm),
+        scale_y=_scale(pitch_y, pitch_mm),
         squareness_rad=estimate(_squareness_rad),
-        backlash_x_mm=backlash[0],
-        backlash_y_mm=backlash[1],
+        backlash_x_mm=_backlash(estimate, 0, told),
+        backlash_y_mm=_backlash(estimate, 1, told),
         tilt_rad=estimate(_tilt_rad),
         node_residual_rms_mm=Estimate(rms_mm, float(rms_mm / np.sqrt(2 * freedom))),
         residuals_mm=[(x, y, z) for x, y, z in (residuals @ _grid_axes(solution).T).tolist()],
@@ -168,11 +169,15 @@ def _design(geometry: RigGeometry, directions: dict[Node, tuple[float, float]]) 
 
 
 def _solution_covariance(solver: Numbers, residuals: Numbers, measured: Numbers, shape: tuple[int, ...]) -> Numbers:
-    """Return the covariance of the fitted terms (term·3, term·3): measurement of the centres, and scatter of the nodes."""
+    """Return the covariance of the fitted terms (3·term, 3·term): of measurement, and of the nodes' scatter."""
     freedom = max(3 * (shape[0] - shape[1]), 1)
     scatter = max(float((residuals**2).sum()) / freedom - float(np.trace(measured)) / len(measured), 0.0)
     spread = np.kron(solver, np.eye(3))
     return np.asarray(spread @ (measured + scatter * np.eye(len(measured))) @ spread.T)
+
+
+def _pitch(estimate: _Propagated, axis: int) -> Estimate:
+    return estimate(lambda s: float(np.linalg.norm(s[1 + axis])))
 
 
 def _backlash(estimate: _Propagated, axis: int, told: list[int | None]) -> Estimate:
@@ -209,4 +214,5 @@ def _grid_axes(solution: Numbers) -> Numbers:
 
 
 def _nothing(why: str) -> StageReport:
-    return StageReport(*[Estimate(None, None, why)] * 9, residuals_mm=[])
+    none = Estimate(None, None, why)
+    return StageReport(none, none, none, none, none, none, none, none, none, [])
