@@ -86,7 +86,7 @@ class Board:
         return np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
 
     def opencv_board(self, *, legacy: bool = False) -> Any:
-        """Return the board as OpenCV knows it; `legacy` boards with an even number of rows begin with a white square."""
+        """Return the board as OpenCV knows it; `legacy`: an even number of rows begins with a white square."""
         size, ids = (self.columns, self.rows), np.array(self.marker_ids)
         lengths = (float(self.square_mm), float(self.marker_mm))
         board = cv2.aruco.CharucoBoard(size, *lengths, predefined_dictionary(self.dictionary), ids)

@@ -78,7 +78,12 @@ def node_drawing(geometry: RigGeometry, stage: StageReport) -> str:
         *nominal.T, "+", color=ink, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
     )
     limit = float(np.abs(residuals[:, 2]).max()) or 1e-6
-    deviation = {"c": 1e3 * residuals[:, 2], "cmap": "coolwarm", "vmin": -1e3 * limit, "vmax": 1e3 * limit}
+    deviation: dict[str, Any] = {
+        "c": 1e3 * residuals[:, 2],
+        "cmap": "coolwarm",
+        "vmin": -1e3 * limit,
+        "vmax": 1e3 * limit,
+    }
     dots = axes.scatter(real[:, 0], real[:, 1], s=60, zorder=3, edgecolors=ink, linewidths=0.6, **deviation)
     dots.set_label(f"camera, deviation × {factor:g}")
     for start, end in zip(nominal, real, strict=True):

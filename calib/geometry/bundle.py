@@ -120,7 +120,7 @@ def solve(problem: Problem, seed: Seed | None = None) -> Bundle:
 
 
 def solve_again(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
-    """Solve with only some of the views (view,) from where another solution ended; outliers stay as they were marked."""
+    """Solve with only some of the views (view,) from where another solution ended; outliers stay marked."""
     return Bundle(_optimised(_restricted(bundle, observations, chosen)))
 
 
