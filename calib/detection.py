@@ -19,9 +19,12 @@ _STRETCH_SAMPLES = 60_000
 
 # The detector wants this much contrast over noise; below, the picture is smoothed until it has it.
 _WANTED_CONTRAST_OVER_NOISE = 14.0
-_MOST_SMOOTHING_PX = 2.5
+_LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX = 0.6, 2.5
 
-_SADDLE_RADIUS_PX = (3, 9)
+_SADDLE_RADIUS_PX = (3, 11)
+
+# Of the distance to the nearest marker, which lies on the squares' diagonals: beyond it the fit's weights are small.
+_SADDLE_REACH = 1.15
 
 
 @dataclass(frozen=True)
@@ -89,12 +92,13 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
     kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(light, cv2.CV_32F, kernel)[::step, ::step]))) / 6
+    sigma_px = _LEAST_SMOOTHING_PX
     ratio = (white - black - 4 * noise) / max(noise, 1e-12)
     if ratio < _WANTED_CONTRAST_OVER_NOISE:
         # a Gaussian of σ lowers the noise by 2√π σ
         sigma_px = _WANTED_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
-        light = cv2.GaussianBlur(light, (0, 0), min(max(sigma_px, 0.6), _MOST_SMOOTHING_PX))
-        black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
+    light = cv2.GaussianBlur(light, (0, 0), float(np.clip(sigma_px, _LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX)))
+    black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
     return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
 
 
@@ -142,11 +146,11 @@ def _markers(stretched: NDArray[np.uint8], dictionary: str) -> _Markers:
 
 
 def _saddle_radius_px(board: Board, marker_corners: Sequence[NDArray[np.float32]]) -> int:
-    """Return the radius that stays clear of the markers, whose nearest points lie on the squares' diagonals."""
+    """Return the radius that stays about clear of the markers, judged by how large these are seen."""
     outlines = [np.reshape(corners, (4, 2)) for corners in marker_corners]
     sides_px = [np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min() for outline in outlines]
     gap_px = float(np.median(sides_px)) / board.marker_mm * (board.square_mm - board.marker_mm) / 2
-    return int(np.clip(np.floor(np.sqrt(2) * gap_px), *_SADDLE_RADIUS_PX))
+    return int(np.clip(np.floor(_SADDLE_REACH * np.sqrt(2) * gap_px), *_SADDLE_RADIUS_PX))
 
 
 @cache

@@ -19,7 +19,7 @@ def refine_saddles(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the saddle points nearest to guesses, and their standard deviations per axis.
 
-    About each guess the image is fitted by `a + b·u + uᵀ H u / 2` with weights that fall off as a Gaussian; the saddle
+    About each guess the image is fitted by `a + b·u + uᵀ H u / 2` with weights (1 − |u|²/r²)²; the saddle
     is at `−H⁻¹ b`, and the fit is made again about it until it stays. Where both colours lie point-symmetric about a
     corner, so does every term that the fit leaves out: it is unbiased there. σ² is the pixels' noise, found from the
     image's finest detail, carried through the same linear map.
@@ -40,10 +40,10 @@ def refine_saddles(
     sigma_px : array (corner,)
         NaN likewise.
     """
-    radius_px = max(radius_px, 2)
+    radius_px = max(radius_px, 3)
     across = np.arange(-radius_px, radius_px + 1)
     offsets = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
-    offsets = offsets[np.square(offsets).sum(axis=1) <= radius_px**2]
+    offsets = offsets[np.square(offsets).sum(axis=1) <= (radius_px + 1) ** 2]
     points = np.array(guesses, np.float64)
     alive = _inside(points, image.shape, radius_px)
     moving = alive.copy()
@@ -89,7 +89,8 @@ def _design(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the terms of the fit about each point (corner, pixel, 6), and the same times their weights."""
     x, y = np.moveaxis(offsets - (points - np.rint(points))[:, np.newaxis], -1, 0)
-    weights = np.exp(-(x * x + y * y) / (2 * (radius_px / 2) ** 2))
+    # vanishing with its slope at the radius, so that it does not matter which pixels happen to lie within
+    weights = np.square(np.clip(1 - (x * x + y * y) / radius_px**2, 0, None))
     terms = np.stack([np.ones_like(x), x, y, x * x / 2, x * y, y * y / 2], axis=-1)
     return terms, terms * weights[..., np.newaxis]
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import NotIdentifiable
+from calib.errors import LensNotInvertible, NotIdentifiable
 from calib.geometry.observations import Observations
 from calib.geometry.rig_geometry import RigGeometry
 from calib.homography import fronto_parallel_rt_ref_plane, transfer_sigma_px
@@ -44,11 +44,14 @@ def require_determined(
         With the σ found, the limit, and what the boards lack.
     """
     for depth_mm in depths_mm:
-        sigma_px = rms_over_views(transfer_sigma_at(geometry, depth_mm))
+        try:
+            sigma_px = rms_over_views(transfer_sigma_at(geometry, depth_mm))
+        except LensNotInvertible:  # a lens that nothing determines folds over itself
+            sigma_px = np.inf
         if not sigma_px <= limit_px:
             raise NotIdentifiable(
                 f"plane at {depth_mm:g} mm: its transfer between views is known to {sigma_px:.3g} px only, "
-                f"limit {limit_px:g} px, although the corners fit to {geometry.rms_inlier_px:.2g} px: "
+                f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
                 f"{'; '.join(_lacks(geometry, observations, depth_mm))}"
             )
 
@@ -58,7 +61,9 @@ def _lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -
     found = []
     boards = geometry.boards
     if len(boards) < _FEWEST_BOARDS:
-        found.append(f"{len(boards)} board pose(s) only: show at least {_FEWEST_BOARDS}, better 6")
+        found.append(
+            f"{len(boards)} board pose(s) only: show at least {_FEWEST_BOARDS}, better 6, tilted by 20 to 40 degrees"
+        )
     tilt_rad = max(_tilt_rad(board.rt_ref_board) for board in boards)
     if tilt_rad < _LEAST_TILT_RAD:
         found.append(

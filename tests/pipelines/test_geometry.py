@@ -1,6 +1,7 @@
 """`faintfield geometry` from images to files, on a small rendered set; boards on paper; other people's formats."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def test_measured_poses_replace_the_sets_own(measured: tuple[Path, dict[str, Any
 
 def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     simulate(tmp_path / "other", rows=1, columns=1, size_px=(160, 120), snr=1.0)
-    with pytest.raises(BadValue, match="is of .* px images"):
+    with pytest.raises(BadValue, match=r"is of .* px images"):
         with_measured_geometry(load_set(tmp_path / "other"), measured[0])
     simulate(tmp_path / "larger", rows=5, columns=3, size_px=(320, 240), snr=1.0)
     with pytest.raises(BadValue, match="has no pose for 6 of 15 views"):
@@ -119,11 +120,9 @@ def test_a_set_with_one_board_is_refused_in_one_line(
     poor = tmp_path / "poor"
     poor.mkdir()
     for path in folder.glob("b3_*.tiff"):
-        (poor / path.name).symlink_to(path)
+        shutil.copyfile(path, poor / path.name)
     (poor / "charuco.toml").write_text("[[image]]".join(kept))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("pipelines.toml_files.Path.resolve", Path.absolute)
-        assert cli.run(["geometry", str(poor)]) == 1
+    assert cli.run(["geometry", str(poor)]) == 1
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("faintfield: NotIdentifiable: ")
     assert "1 board pose(s) only" in last
@@ -243,7 +242,7 @@ def test_damaged_models_are_named_failures(tmp_path: Path) -> None:
         read_model(tmp_path)
     (tmp_path / "cameras.bin").write_bytes(b"\x01\0\0")
     (tmp_path / "images.bin").write_bytes(b"")
-    with pytest.raises(BadValue, match="cannot|can be read"):
+    with pytest.raises(BadValue, match="can be read"):
         read_model(tmp_path)
     (tmp_path / "x.cameramodel").write_text("{ nonsense")
     with pytest.raises(BadValue, match="is not a camera model"):
