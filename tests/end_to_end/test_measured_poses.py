@@ -19,7 +19,7 @@ BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for i
 
 def test_measured_poses_are_as_good_as_true_ones_and_nominal_ones_are_not(tmp_path: Path) -> None:
     scene, boards = tmp_path / "scene", tmp_path / "boards"
-    simulate(scene, rows=3, columns=3, pitch_mm=100.0, size_px=(320, 240), snr=0.5, poses="nominal", seed=2)
+    simulate(scene, rows=3, columns=3, pitch_mm=100.0, size_px=(320, 240), snr=4.0, poses="nominal", seed=2)
     truth = read_truth(scene)
     assert truth is not None
     paper = paper_experiment(320, 240)
