@@ -77,6 +77,26 @@ class Lens:
             rays[strip] = self._undistorted(np.stack(np.meshgrid(columns, rows[strip]), axis=-1))
         return rays
 
+    def rays_at(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return x, y at unit depth of any pixels (point, 2) given as column, row.
+
+        Raises
+        ------
+        LensNotInvertible
+            Some pixel is the image of no ray, or of several.
+        """
+        return np.asarray(self._undistorted(np.asarray(pixels, np.float64)[np.newaxis])[0])
+
+    def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the pixels (point, 2) of points (point, 3) in the camera's coordinates; NaN behind the camera."""
+        points = np.asarray(points, np.float64)
+        in_front = points[:, 2] > 0
+        pixels = np.full((len(points), 2), np.nan)
+        if in_front.any():
+            arguments = (np.zeros(3), np.zeros(3), self.camera_matrix(), self._coefficients())
+            pixels[in_front] = cv2.projectPoints(points[in_front], *arguments)[0][:, 0]
+        return pixels
+
     def _undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rays of pixels (row, column, 2), checked by imaging them again."""
         if not any(self.distortion):

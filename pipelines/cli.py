@@ -39,6 +39,13 @@ app.command(App(name="import", help="Make a set of images and poses, or of frame
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
 app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
 app.command("pipelines.stage:app", name="stage")
+app.command("pipelines.geometry:geometry")
+app.command("pipelines.board_pdf:board")
+app["import"].command("pipelines.import_colmap:import_colmap", name="colmap")
+app["import"].command("pipelines.import_mrcal:import_mrcal", name="mrcal")
+app.command(App(name="export", help="Write the lens and poses of a set for other people's programs."))
+app["export"].command("pipelines.import_colmap:export_colmap", name="colmap")
+app["export"].command("pipelines.import_mrcal:export_mrcal", name="mrcal")
 
 
 @app.meta.default

@@ -89,6 +89,8 @@ class LoadedSet:
         Relative response.
     unusable : bool array (row, column)
         Pixels that never count (hot, dead).
+    measured_in : Path, optional
+        The geometry.json that lens and poses were taken from; None where they are the set's own.
     """
 
     folder: Path
@@ -98,6 +100,7 @@ class LoadedSet:
     offset_from_files: bool
     flat: NDArray[np.float32] | None
     unusable: NDArray[np.bool_]
+    measured_in: Path | None = None
 
     @property
     def reference_view(self) -> int:
@@ -166,6 +169,8 @@ class LoadedSet:
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
             if maps.is_file():
                 yield str(maps.relative_to(self.folder)), sha256(maps)
+        if self.measured_in is not None:
+            yield self.measured_in.name, sha256(self.measured_in)
 
 
 def load_set(folder: Path) -> LoadedSet:

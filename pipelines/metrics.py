@@ -69,7 +69,7 @@ def _errors(
     return {
         "depth_mm": depth,
         "method": method,
-        "poses": truth.poses,
+        "poses": truth.poses if loaded.measured_in is None else "measured",
         "object": at_depth.name,
         "mse_bright": error,
         "mse_texture": mean_square_error(plane, texture, region),

@@ -25,6 +25,7 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
@@ -47,6 +48,7 @@ def reconstruct(
     penalty_weight: NotNegative | None = None,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
+    geometry: Path | None = None,
 ) -> dict[str, Any]:
     """Reconstruct planes of the scene at chosen depths.
 
@@ -74,6 +76,8 @@ def reconstruct(
         At most this many passes over the data.
     pitch_mm
         Distance of the plane's samples; by default one detector pixel of the reference view.
+    geometry
+        geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
     """
     started = time.monotonic()
     methods: list[Method] = list(dict.fromkeys(method or ["pmlem-osl"]))
@@ -81,6 +85,8 @@ def reconstruct(
     if not (depth_mm or swept or disparity_px):
         raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
     loaded = load_set(elemental_set)
+    if geometry is not None:
+        loaded = with_measured_geometry(loaded, geometry)
     depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
     folders = {name: out if len(methods) == 1 else out / name for name in methods}
     run = _Run(loaded, depths, pitch_mm, folders)
@@ -92,7 +98,13 @@ def reconstruct(
     if metrics:
         write_json(out / METRICS_FILE, metrics)
     inputs = dict(loaded.input_hashes())
-    options = {"depth_mm": depths, "penalty_weight": penalty_weight, "passes": passes, "pitch_mm": pitch_mm}
+    options: dict[str, Any] = {
+        "depth_mm": depths,
+        "penalty_weight": penalty_weight,
+        "passes": passes,
+        "pitch_mm": pitch_mm,
+    }
+    options["poses"] = "stated" if loaded.measured_in is None else "measured"
     for name, folder in folders.items():
         result = {
             "format": 1,

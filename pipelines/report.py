@@ -19,7 +19,7 @@ from pipelines.overview import INTEGRAL_IMAGE, OVERVIEW_FILE, REFERENCE_OF_NOISE
 from pipelines.result_files import Errors, Overview, Result, read_result
 
 if TYPE_CHECKING:
-    from jinja2 import Environment
+    from jinja2 import Template
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
@@ -76,28 +76,24 @@ def write_report(directory: Path) -> Path:
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
     columns = list(dict.fromkeys(plane.column for plane in planes))
     white = _shared_white(planes, columns)
-    page = (
-        _environment()
-        .get_template("report.html")
-        .render(
-            title=_title(directory, results),
-            sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
-            columns=[{"name": name, "title": _column_title(name)} for name in columns],
-            rows=_rows(planes, columns, _shown_depths(depths, focus), white),
-            slider=_slider(planes, columns, white) if len(depths) > 1 else None,
-            slider_column=_slider_column(columns),
-            slider_depth=_slider_depth(depths, focus),
-            depths=len(depths),
-            white=white,
-            focus_curve=_focus_curve(focus) if focus else None,
-            sharp_mm=focus["sharp_mm"] if focus else [],
-            metrics=_metrics(directory),
-            method_names=METHOD_NAMES,
-            results=[
-                {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
-                for folder, result in results.items()
-            ],
-        )
+    page = template("report.html").render(
+        title=_title(directory, results),
+        sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
+        columns=[{"name": name, "title": _column_title(name)} for name in columns],
+        rows=_rows(planes, columns, _shown_depths(depths, focus), white),
+        slider=_slider(planes, columns, white) if len(depths) > 1 else None,
+        slider_column=_slider_column(columns),
+        slider_depth=_slider_depth(depths, focus),
+        depths=len(depths),
+        white=white,
+        focus_curve=_focus_curve(focus) if focus else None,
+        sharp_mm=focus["sharp_mm"] if focus else [],
+        metrics=_metrics(directory),
+        method_names=METHOD_NAMES,
+        results=[
+            {"where": str(folder.relative_to(directory)), "method": _method_of(result), **result}
+            for folder, result in results.items()
+        ],
     )
     path = directory / REPORT_FILE
     write_whole(path, page)
@@ -271,9 +267,10 @@ def _focus_curve(focus: dict[str, Any]) -> str:
     return svg[svg.index("<svg") :].replace(ink, "currentColor")
 
 
-def _environment() -> "Environment":
+def template(name: str) -> "Template":
+    """Return a page's template, with `figure` to write a number to three digits."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when all images are out of memory
 
     environment = Environment(loader=PackageLoader("pipelines"), autoescape=True, undefined=StrictUndefined)
     environment.filters["figure"] = lambda value, digits=3: "–" if value is None else f"{value:.{digits}g}"
-    return environment
+    return environment.get_template(name)

@@ -1,0 +1,163 @@
+"""Finding boards: markers first, corners between them, then each corner's saddle point."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.board import Board, predefined_dictionary
+from calib.saddle import refine_saddles
+
+# The darkest and brightest shares of pixels that a stretch may lose.
+_STRETCH_QUANTILES = (0.002, 0.998)
+_STRETCH_SAMPLES = 60_000
+
+# The detector wants this much contrast over noise; below, the picture is smoothed until it has it.
+_WANTED_CONTRAST_OVER_NOISE = 14.0
+_LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX = 0.6, 2.5
+
+_SADDLE_RADIUS_PX = (3, 11)
+
+# Of the distance to the nearest marker, which lies on the squares' diagonals: beyond it the fit's weights are small.
+_SADDLE_REACH = 1.15
+
+
+@dataclass(frozen=True)
+class BoardCorners:
+    """The corners of one board found in one image.
+
+    Attributes
+    ----------
+    board : str
+        Its name.
+    corners : int array (corner,)
+        Their numbers.
+    pixels : float array (corner, 2)
+        Column, row.
+    sigma_px : float array (corner,)
+        Standard deviation per axis, from the image's noise.
+    markers : int
+        How many of its markers were found.
+    legacy : bool
+        The print begins with a white square, as boards of an even number of rows did in older OpenCV.
+    """
+
+    board: str
+    corners: NDArray[np.intp]
+    pixels: NDArray[np.float64]
+    sigma_px: NDArray[np.float64]
+    markers: int
+    legacy: bool
+
+
+def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCorners]:
+    """Return the corners of every board of which markers are seen.
+
+    Parameters
+    ----------
+    image : array (row, column)
+        Grey, of any depth and brightness; the mean of repeated frames where one is too dark.
+    boards : sequence of Board
+        Looked for; they share no marker.
+    """
+    light = np.asarray(image, np.float32)
+    stretched = stretch(light)
+    markers = {name: _markers(stretched, name) for name in {board.dictionary for board in boards}}
+    found = (_detect_board(light, stretched, markers[board.dictionary], board) for board in boards)
+    return [corners for corners in found if corners is not None]
+
+
+def detect_all(
+    images: Iterable[NDArray[Any]], boards: Sequence[Board], workers: int = 2
+) -> Iterator[list[BoardCorners]]:
+    """Yield what `detect_boards` finds in each image, in order, several at a time."""
+    with ThreadPoolExecutor(workers) as pool:
+        waiting = []
+        for image in images:
+            waiting.append(pool.submit(detect_boards, image, boards))
+            if len(waiting) > workers:  # so that images are not all in memory
+                yield waiting.pop(0).result()
+        for task in waiting:
+            yield task.result()
+
+
+def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Return an image as the 8 bits that the marker detector wants, whatever its depth; smoothed if it is noisy."""
+    step = max(int(np.sqrt(light.size / _STRETCH_SAMPLES)), 1)
+    black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
+    kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(light, cv2.CV_32F, kernel)[::step, ::step]))) / 6
+    sigma_px = _LEAST_SMOOTHING_PX
+    ratio = (white - black - 4 * noise) / max(noise, 1e-12)
+    if ratio < _WANTED_CONTRAST_OVER_NOISE:
+        # a Gaussian of σ lowers the noise by 2√π σ
+        sigma_px = _WANTED_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
+    light = cv2.GaussianBlur(light, (0, 0), float(np.clip(sigma_px, _LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX)))
+    black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
+    return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
+
+
+def _detect_board(
+    light: NDArray[np.float32], stretched: NDArray[np.uint8], markers: "_Markers", board: Board
+) -> BoardCorners | None:
+    """Try the board's layouts until one gives corners."""
+    marker_corners, marker_ids = markers.of(board)
+    if not marker_ids.size:
+        return None
+    layouts = (False, True) if board.rows % 2 == 0 else (False,)
+    best: tuple[NDArray[np.float64], NDArray[np.intp], bool] | None = None
+    for legacy in layouts:
+        detector = _detector(board, legacy)
+        pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
+        if pixels is not None and len(pixels):  # the wrong layout finds markers and no corners
+            best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
+            break
+    count = len(marker_ids)
+    if best is None:
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
+    guesses, ids, legacy = best
+    pixels, sigma_px = refine_saddles(light, guesses, _saddle_radius_px(board, marker_corners))
+    kept = np.isfinite(sigma_px)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
+
+
+@dataclass(frozen=True)
+class _Markers:
+    """All markers of one dictionary in an image: their outlines, and their numbers (marker, 1)."""
+
+    corners: Sequence[NDArray[np.float32]]
+    ids: NDArray[np.int32]
+
+    def of(self, board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+        """Return those of one board."""
+        own = [index for index, marker in enumerate(np.ravel(self.ids)) if int(marker) in board.marker_ids]
+        return [self.corners[index] for index in own], self.ids[own]
+
+
+def _markers(stretched: NDArray[np.uint8], dictionary: str) -> _Markers:
+    """Find the markers of a dictionary."""
+    corners, ids, _ = _marker_detector(dictionary).detectMarkers(stretched)
+    return _Markers(corners, np.empty((0, 1), np.int32) if ids is None else np.reshape(ids, (-1, 1)).astype(np.int32))
+
+
+def _saddle_radius_px(board: Board, marker_corners: Sequence[NDArray[np.float32]]) -> int:
+    """Return the radius that stays about clear of the markers, judged by how large these are seen."""
+    outlines = [np.reshape(corners, (4, 2)) for corners in marker_corners]
+    sides_px = [np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min() for outline in outlines]
+    gap_px = float(np.median(sides_px)) / board.marker_mm * (board.square_mm - board.marker_mm) / 2
+    return int(np.clip(np.floor(_SADDLE_REACH * np.sqrt(2) * gap_px), *_SADDLE_RADIUS_PX))
+
+
+@cache
+def _marker_detector(dictionary: str) -> Any:
+    return cv2.aruco.ArucoDetector(predefined_dictionary(dictionary), cv2.aruco.DetectorParameters())
+
+
+@cache
+def _detector(board: Board, legacy: bool) -> Any:
+    return cv2.aruco.CharucoDetector(board.opencv_board(legacy=legacy))

@@ -1,0 +1,196 @@
+"""The bundle adjustment: one lens, the pose of every node, the pose of every board as it stood (mrcal)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mrcal
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.geometry.observations import Observations
+from calib.geometry.seed import Seed, seed_from
+
+LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8)}}
+
+# Newton steps after mrcal's own stopping, which halts about 1e-6 px short of the optimum.
+_POLISHING_STEPS = 5
+_POLISHED_STEP = 1e-11
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is asked of the solver.
+
+    Parameters
+    ----------
+    observations : Observations
+        The corners.
+    size_px : (int, int)
+        Width and height of the detector.
+    square_mm : float
+        Of all boards.
+    lens_model : str
+        One of `LENS_MODELS`.
+    with_warp : bool
+        The boards may be bent, all alike; only where they are all of one shape.
+    """
+
+    observations: Observations
+    size_px: tuple[int, int]
+    square_mm: float
+    lens_model: str
+    with_warp: bool
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A solved problem.
+
+    Attributes
+    ----------
+    inputs : dict
+        mrcal's optimisation inputs at the optimum: `mrcal.optimize(**inputs)` stays there.
+    """
+
+    inputs: dict[str, Any]
+
+    @property
+    def intrinsics(self) -> NDArray[np.float64]:
+        """Fx, fy, cx, cy, and the distortion."""
+        return np.asarray(self.inputs["intrinsics"][0])
+
+    @property
+    def rt_cam_ref(self) -> NDArray[np.float64]:
+        """Poses (node, 6), the reference first."""
+        return np.vstack([np.zeros(6), self.inputs["rt_cam_ref"]])
+
+    @property
+    def rt_ref_board(self) -> NDArray[np.float64]:
+        """Poses (target, 6) of the boards."""
+        return np.asarray(self.inputs["rt_ref_frame"])
+
+    @property
+    def warp_mm(self) -> NDArray[np.float64]:
+        """How far the boards bulge at their middle along x and y, (2,)."""
+        warp = self.inputs["calobject_warp"]
+        return np.zeros(2) if warp is None else np.asarray(warp)
+
+    @property
+    def inlier(self) -> NDArray[np.bool_]:
+        """Which corners were seen and believed, (view, row, column)."""
+        return np.asarray(self.inputs["observations_board"][..., 2] > 0)
+
+    def residuals(self) -> NDArray[np.float64]:
+        """Return the weighted residuals in pixels (view, row, column, 2): model minus corner; zero where masked."""
+        x = mrcal.optimizer_callback(**self.inputs, no_jacobian=True, no_factorization=True)[1]
+        shape = (*self.inputs["observations_board"].shape[:3], 2)
+        return np.asarray(x[: np.prod(shape)]).reshape(shape)
+
+    def state_slices(self) -> dict[str, slice]:
+        """Return where in mrcal's state the intrinsics, the cameras and the boards are."""
+        counts = {
+            "intrinsics": (mrcal.state_index_intrinsics(0, **self.inputs), len(self.intrinsics)),
+            "cameras": (mrcal.state_index_extrinsics(0, **self.inputs), 6 * len(self.inputs["rt_cam_ref"])),
+            "boards": (mrcal.state_index_frames(0, **self.inputs), 6 * len(self.rt_ref_board)),
+        }
+        return {name: slice(first, first + count) for name, (first, count) in counts.items()}
+
+
+def solve(problem: Problem, seed: Seed | None = None) -> Bundle:
+    """Adjust poses, then lens, then everything with outliers marked, each stage from where the last ended."""
+    seed = seed or seed_from(problem.observations, problem.size_px, problem.square_mm)
+    inputs = _inputs(problem, seed)
+    stages: list[dict[str, bool]] = [
+        {"do_optimize_intrinsics_core": False, "do_optimize_intrinsics_distortions": False},
+        {"do_optimize_intrinsics_distortions": False},
+        {},
+        {"do_optimize_calobject_warp": problem.with_warp, "do_apply_outlier_rejection": True},
+    ]
+    for stage in stages:
+        inputs |= {
+            "do_optimize_intrinsics_core": True,
+            "do_optimize_intrinsics_distortions": problem.lens_model != "pinhole",
+            "do_optimize_calobject_warp": False,
+            "do_apply_outlier_rejection": False,
+            **stage,
+        }
+        mrcal.optimize(**inputs)
+    inputs["do_apply_outlier_rejection"] = False
+    return Bundle(_polished(inputs))
+
+
+def solve_again(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
+    """Solve with only some of the views (view,) from where another solution ended; outliers stay marked."""
+    return Bundle(_optimised(_restricted(bundle, observations, chosen)))
+
+
+def fit_boards(bundle: Bundle, other: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
+    """Fit only the boards of some views (view,), with the corners of `bundle` and the cameras of `other`."""
+    inputs = _restricted(bundle, observations, chosen)
+    inputs["intrinsics"] = other.inputs["intrinsics"].copy()
+    inputs["rt_cam_ref"] = other.inputs["rt_cam_ref"].copy()
+    inputs["calobject_warp"] = None if other.inputs["calobject_warp"] is None else other.inputs["calobject_warp"].copy()
+    locked = ("intrinsics_core", "intrinsics_distortions", "extrinsics", "calobject_warp")
+    inputs |= {f"do_optimize_{name}": False for name in locked}
+    return Bundle(_optimised(inputs))
+
+
+def _inputs(problem: Problem, seed: Seed) -> dict[str, Any]:
+    """Return mrcal's optimisation inputs at the seed."""
+    observations = problem.observations
+    model = LENS_MODELS[problem.lens_model]
+    width, height = problem.size_px
+    intrinsics = np.zeros((1, mrcal.lensmodel_num_params(model)))
+    intrinsics[0, :4] = seed.focal_px, seed.focal_px, (width - 1) / 2, (height - 1) / 2
+    return {
+        "lensmodel": model,
+        "intrinsics": intrinsics,
+        "imagersizes": np.array([problem.size_px], np.int32),
+        "rt_cam_ref": seed.rt_cam_ref[1:].copy(),
+        "rt_ref_frame": seed.rt_ref_board.copy(),
+        "points": None,
+        "observations_point": None,
+        "indices_point_camintrinsics_camextrinsics": None,
+        "observations_board": np.concatenate([observations.pixels, observations.weights[..., np.newaxis]], axis=-1),
+        "indices_frame_camintrinsics_camextrinsics": _indices(observations.target_of, observations.node_of),
+        "calibration_object_spacing": problem.square_mm,
+        "calobject_warp": np.zeros(2) if problem.with_warp else None,
+        "do_optimize_extrinsics": True,
+        "do_optimize_frames": True,
+        "do_apply_regularization": True,
+        "verbose": False,
+    }
+
+
+def _indices(target_of: NDArray[np.int32], node_of: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return mrcal's (frame, intrinsics, extrinsics) per view; the reference camera has no extrinsics: −1."""
+    return np.ascontiguousarray(np.column_stack([target_of, np.zeros_like(target_of), node_of - 1]), np.int32)
+
+
+def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return copies of a solution's inputs with some of its views, and only the boards that those see."""
+    targets, frame_of = np.unique(observations.target_of[chosen], return_inverse=True)
+    inputs = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in bundle.inputs.items()}
+    inputs["rt_ref_frame"] = np.ascontiguousarray(inputs["rt_ref_frame"][targets])
+    inputs["observations_board"] = np.ascontiguousarray(inputs["observations_board"][chosen])
+    indices = _indices(frame_of.astype(np.int32), observations.node_of[chosen])
+    inputs["indices_frame_camintrinsics_camextrinsics"] = indices
+    return inputs
+
+
+def _optimised(inputs: dict[str, Any]) -> dict[str, Any]:
+    mrcal.optimize(**inputs)
+    return inputs
+
+
+def _polished(inputs: dict[str, Any]) -> dict[str, Any]:
+    """Take Gauss-Newton steps until they no longer move, so that a solution does not depend on where it began."""
+    for _ in range(_POLISHING_STEPS):
+        state, x, jacobian, factor = mrcal.optimizer_callback(**inputs)
+        if factor is None:
+            break
+        step = factor.solve_xt_JtJ_bt((jacobian.T @ x)[np.newaxis])[0]
+        mrcal.ingest_packed_state(state - step, **inputs)
+        if np.abs(step).max() < _POLISHED_STEP:
+            break
+    return inputs

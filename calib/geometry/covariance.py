@@ -1,0 +1,140 @@
+"""How well the solution is known: the covariance of its state, and how far the gantry comes back to a node.
+
+To first order the weighted residuals are `x = M (ε + G δ)`: M = I − J (JᵀJ)⁻¹ Jᵀ, with J the optimizer's Jacobian,
+ε the corners' noise of variance σ², and δ what the gantry missed each node by in each sweep, of variance τ² per axis,
+which moves the corners by G δ. With K = GᵀMG = Q Λ Qᵀ the numbers `v = Λ^(−1/2) Qᵀ Gᵀ x` are independent with variances
+`σ² + τ² λ`, and what they leave of the residuals has variance σ² alone: σ and τ follow from their restricted likelihood
+(REML). The state's covariance is `σ² (JᵀJ)⁻¹ + τ² B Bᵀ` with B = (JᵀJ)⁻¹ Jᵀ G.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mrcal
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from calib.errors import NotIdentifiable
+from calib.geometry.bundle import Bundle
+from calib.geometry.observations import Observations
+from calib.geometry.rig_geometry import Repeatability
+
+# Directions in which a node's misses are absorbed by the fit tell nothing of them.
+_LEAST_EIGENVALUE = 1e-6
+
+# Below this variance ratio the gantry's misses cannot be told from none.
+_LOG_RATIO_RANGE = (-12.0, 8.0)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the residuals say of the solution.
+
+    Attributes
+    ----------
+    covariance : array (state, state)
+        Of mrcal's state, in rad, mm and pixels.
+    sigma_px : float
+        Standard deviation of a corner of weight one, per axis.
+    repeatability : Repeatability, optional
+        None with a single sweep.
+    """
+
+    covariance: NDArray[np.float64]
+    sigma_px: float
+    repeatability: Repeatability | None
+
+
+def uncertainty(bundle: Bundle, observations: Observations) -> Uncertainty:
+    """Return the covariance of a solution's state, with the gantry's repeatability in it where there are sweeps.
+
+    Raises
+    ------
+    NotIdentifiable
+        Some direction of the state is not determined by the corners at all.
+    """
+    state, x, jacobian, factor = mrcal.optimizer_callback(**bundle.inputs)
+    if factor is None:
+        raise NotIdentifiable(
+            "the boards leave some pose or lens parameter free (the normal equations are singular); "
+            "show more boards, tilted by 20 to 40 degrees, from more nodes"
+        )
+    scale = np.ones_like(state)
+    mrcal.unpack_state(scale, **bundle.inputs)
+    inverse = factor.solve_xt_JtJ_bt(np.eye(len(state)))
+    freedom = 2 * int(bundle.inlier.sum()) - len(state)
+    if freedom <= 0:
+        raise NotIdentifiable(
+            f"{bundle.inlier.sum()} corners cannot determine {len(state)} numbers; show boards with more corners"
+        )
+    boards = bundle.inlier.size * 2
+    sweeps = {target.sweep for target in observations.targets}
+    squares = float(x[:boards] @ x[:boards])
+    if len(sweeps) == 1:
+        sigma = float(np.sqrt(squares / freedom))
+        return Uncertainty(inverse * np.outer(scale, scale) * sigma**2, sigma, None)
+    misses = _misses(bundle, observations, jacobian[:boards], scale)
+    crossed = np.asarray((jacobian[:boards].T @ misses).todense())
+    absorbed = inverse @ crossed
+    spread = np.asarray((misses.T @ misses).todense()) - crossed.T @ absorbed
+    sigma, repeatability = _variance_components(spread, misses.T @ x[:boards], squares, freedom)
+    packed = inverse * sigma**2 + absorbed @ absorbed.T * repeatability.sd_mm**2
+    return Uncertainty(packed * np.outer(scale, scale), sigma, repeatability)
+
+
+def _misses(bundle: Bundle, observations: Observations, jacobian: Any, scale: NDArray[np.float64]) -> Any:
+    """Return G (measurement, 3·(node, sweep)): how corners move when the camera moves by 1 mm at one node in one sweep.
+
+    A camera's translation is the last step of both its pose and, at the reference node, the boards': its columns are
+    those of the Jacobian, cut to the rows of one sweep.
+    """
+    slices = bundle.state_slices()
+    rows_per_view = 2 * int(np.prod(bundle.inlier.shape[1:]))
+    groups: dict[tuple[int, int], int] = {}
+    blocks, places = [], []
+    by_row = jacobian.tocsr()
+    for view, (node, target) in enumerate(zip(observations.node_of, observations.target_of, strict=True)):
+        kind, index = ("cameras", node - 1) if node else ("boards", target)
+        first = slices[kind].start + 6 * int(index) + 3
+        columns = slice(first, first + 3)
+        rows = by_row[view * rows_per_view : (view + 1) * rows_per_view]
+        blocks.append(rows.toarray()[:, columns] / scale[columns])
+        places.append(groups.setdefault((int(node), observations.targets[target].sweep), len(groups)))
+    row = np.arange(len(blocks) * rows_per_view).repeat(3)
+    column = np.repeat(places, rows_per_view)[:, np.newaxis] * 3 + np.arange(3)
+    values = np.concatenate(blocks).ravel()
+    return scipy.sparse.csr_array((values, (row, column.ravel())), shape=(len(row) // 3, 3 * len(groups)))
+
+
+def _variance_components(
+    spread: NDArray[np.float64], projected: NDArray[np.float64], squares: float, freedom: int
+) -> tuple[float, Repeatability]:
+    """Return σ and the gantry's repeatability by restricted maximum likelihood; see the module's own words."""
+    eigenvalues, vectors = np.linalg.eigh(spread)
+    kept = eigenvalues > _LEAST_EIGENVALUE * eigenvalues[-1]
+    eigenvalues = eigenvalues[kept]
+    v2 = (vectors[:, kept].T @ projected) ** 2 / eigenvalues
+    rest = squares - v2.sum()
+
+    def variance(ratio: float) -> float:
+        return float((rest + (v2 / (1 + ratio * eigenvalues)).sum()) / freedom)
+
+    def minus_log_likelihood(ratio: float) -> float:
+        return float(freedom * np.log(variance(ratio)) + np.log1p(ratio * eigenvalues).sum()) / 2
+
+    unit = float(eigenvalues.mean())
+    best = minimize_scalar(
+        lambda log_ratio: minus_log_likelihood(np.exp(log_ratio) / unit), bounds=_LOG_RATIO_RANGE, method="bounded"
+    )
+    ratio = float(np.exp(best.x) / unit)
+    if minus_log_likelihood(0.0) <= best.fun:
+        ratio = 0.0
+    sigma2 = variance(ratio)
+    tau2 = ratio * sigma2
+    se_of_tau2 = np.sqrt(2 / ((eigenvalues / (sigma2 + tau2 * eigenvalues)) ** 2).sum())
+    sd_mm = float(np.sqrt(tau2))
+    # at zero the square root has no slope: the standard error is then that of the square
+    se_mm = float(se_of_tau2 / (2 * sd_mm)) if tau2 > se_of_tau2 else float(np.sqrt(se_of_tau2))
+    return float(np.sqrt(sigma2)), Repeatability(sd_mm, se_mm)

@@ -1,0 +1,106 @@
+"""Boards in the simulated world: where they stand, and where the camera sees their corners."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rig.simulation.optics import SimulatedOptics, distort
+from rig.simulation.scene import TexturedPlane
+
+# Turned about x and y (degrees) and put at x, y, z (mm): tilted all ways, near and far, seen from the whole grid.
+_SIX_PLACES = (
+    (22.0, 4.0, -60.0, -50.0, 540.0),
+    (-24.0, 6.0, 70.0, 40.0, 560.0),
+    (5.0, 28.0, 40.0, -45.0, 560.0),
+    (-4.0, -26.0, -50.0, 45.0, 900.0),
+    (20.0, -20.0, 10.0, 10.0, 900.0),
+    (0.0, 3.0, -10.0, 0.0, 950.0),
+)
+
+
+@dataclass(frozen=True)
+class SimulatedBoard:
+    """A chessboard's inner corners in space.
+
+    Parameters
+    ----------
+    corner_rows, corner_columns : int
+        Of the inner corners.
+    square_mm : float
+        Their distance.
+    rt_ref_board : array (6,)
+        Rodrigues rad and mm, from the board, whose origin is its first corner, to the reference camera.
+    """
+
+    corner_rows: int
+    corner_columns: int
+    square_mm: float
+    rt_ref_board: NDArray[np.float64]
+
+    def points_ref_mm(self) -> NDArray[np.float64]:
+        """Return the corners (corner, 3) in the reference frame, along the rows."""
+        row, column = np.divmod(np.arange(self.corner_rows * self.corner_columns), self.corner_columns)
+        flat = np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
+        return _transformed(self.rt_ref_board, flat)
+
+    def seen(self, optics: SimulatedOptics, rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where a camera sees the corners (corner, 2) in pixels; NaN for those it does not."""
+        points = _transformed(rt_cam_ref, self.points_ref_mm())
+        x, y = distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], optics.distortion)
+        pixels = np.column_stack([x * optics.fx_px + optics.cx_px, y * optics.fy_px + optics.cy_px])
+        inside = (pixels >= 0).all(axis=1) & (pixels <= np.array(optics.size_px) - 1).all(axis=1) & (points[:, 2] > 0)
+        return np.where(inside[:, np.newaxis], pixels, np.nan)
+
+
+def six_boards(corner_rows: int, corner_columns: int, square_mm: float) -> list[SimulatedBoard]:
+    """Return a board at six places about the scene, as a careful person would hold it."""
+    centre_mm = np.array([(corner_columns - 1) * square_mm / 2, (corner_rows - 1) * square_mm / 2, 0.0])
+    boards = []
+    for about_x, about_y, *place_mm in _SIX_PLACES:
+        rotation = _rotation(np.radians([0, about_y, 0])) @ _rotation(np.radians([about_x, 0, 0]))
+        r = cv2.Rodrigues(rotation)[0].ravel()
+        boards.append(
+            SimulatedBoard(corner_rows, corner_columns, square_mm, np.append(r, place_mm - rotation @ centre_mm))
+        )
+    return boards
+
+
+def printed_board(
+    name: str,
+    picture: NDArray[np.floating],
+    pitch_mm: float,
+    board: SimulatedBoard,
+    first_corner_mm: tuple[float, float],
+) -> TexturedPlane:
+    """Return a print of a board standing where `board` says.
+
+    Parameters
+    ----------
+    name : str
+        Of the plane.
+    picture : array (row, column)
+        Its reflectance, 0…1.
+    pitch_mm : float
+        Distance of the picture's samples.
+    board : SimulatedBoard
+        Where it stands.
+    first_corner_mm : (float, float)
+        x, y of the first inner corner from the outer edges of the picture's first sample.
+    """
+    height, width = picture.shape
+    centre_mm = np.array([width * pitch_mm / 2 - first_corner_mm[0], height * pitch_mm / 2 - first_corner_mm[1], 0.0])
+    pose = np.append(board.rt_ref_board[:3], _transformed(board.rt_ref_board, centre_mm[np.newaxis])[0])
+    opaque = np.ones(picture.shape, np.float32)
+    rx, ry, rz, x, y, z = pose.tolist()
+    return TexturedPlane(name, picture.astype(np.float32), opaque, pitch_mm, (rx, ry, rz, x, y, z))
+
+
+def _rotation(rodrigues: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(cv2.Rodrigues(rodrigues)[0], np.float64)
+
+
+def _transformed(rt: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Apply a pose to points (point, 3)."""
+    return np.asarray(points @ _rotation(np.asarray(rt[:3], np.float64)).T + rt[3:], np.float64)

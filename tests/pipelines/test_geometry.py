@@ -1,0 +1,249 @@
+"""`faintfield geometry` from images to files, on a small rendered set; boards on paper; other people's formats."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import mrcal
+import numpy as np
+import pytest
+
+from calib.board import Board
+from calib.geometry import GeometrySettings, calibrate_geometry
+from pipelines import cli
+from pipelines.board_pdf import board
+from pipelines.board_set import load_board_set
+from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from pipelines.elemental_set import load_set
+from pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
+from pipelines.geometry import geometry
+from pipelines.geometry_files import CORNERS_FILE, COVARIANCE_FILE, read_corners, read_geometry
+from pipelines.import_colmap import export_colmap, import_colmap
+from pipelines.import_mrcal import export_mrcal, import_mrcal
+from pipelines.measured_poses import with_measured_geometry
+from pipelines.simulate import simulate
+from pipelines.simulate_boards import simulate_board_set
+from pipelines.truth import read_truth
+from rig.simulation.experiment import SimulatedExperiment, paper_experiment
+
+BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("scene") / "set"
+    simulate(out, rows=3, columns=3, pitch_mm=100.0, poses="nominal", size_px=(320, 240), seed=3)
+    return out
+
+
+@pytest.fixture(scope="module")
+def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    folder = tmp_path_factory.mktemp("boards")
+    paper = paper_experiment(320, 240)
+    experiment = SimulatedExperiment(paper.planes, paper.optics, paper.sensor, 3, 3, 100.0)
+    truth = read_truth(scene)
+    assert truth is not None
+    simulate_board_set(folder, experiment, np.array(truth.true_rt_cam_ref), BOARDS, np.random.default_rng(1))
+    return folder, geometry(folder)
+
+
+def test_the_files_say_where_the_camera_was(measured: tuple[Path, dict[str, Any]], scene: Path) -> None:
+    folder, result = measured
+    truth = read_truth(scene)
+    assert truth is not None
+    found = read_geometry(folder)
+    np.testing.assert_allclose([node.rt_cam_ref for node in found.nodes], truth.true_rt_cam_ref, atol=0.6)
+    assert found.camera_lens().fx_px == pytest.approx(400.0, abs=1.0)
+    assert result["rms_inlier_px"] < 0.1
+    content = json.loads((folder / "geometry.json").read_text())
+    assert set(content["transfer_sigma_px"]) == {"500", "700"}
+    assert set(content["inputs"]) >= {"charuco.toml", "b0_r0_c0.tiff"}
+    with np.load(folder / COVARIANCE_FILE, allow_pickle=False) as stored:
+        assert stored["covariance"].shape == (9 + 6 * 9,) * 2
+    page = (folder / "geometry.html").read_text()
+    assert "<svg" in page
+    assert "squareness" in page
+
+
+def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = measured
+    content = read_geometry(folder)
+    corners = read_corners(folder / CORNERS_FILE)
+    boards = {one.name: one for one in BOARDS}
+    again = calibrate_geometry(boards, corners, content.size_px, (1, 1), GeometrySettings())
+    pixels, here = np.array([[20.0, 30.0], [160.0, 100.0], [300.0, 200.0]]), content.camera_lens()
+    points = np.column_stack([here.rays_at(pixels), np.ones(3)]) * 600.0
+    for rt, node in zip(again.rt_cam_ref, content.nodes, strict=True):
+        np.testing.assert_allclose(rt, node.rt_cam_ref, atol=1e-8)
+    np.testing.assert_allclose(again.lens.project(points), here.project(points), atol=1e-6)
+
+
+def test_mrcal_opens_the_camera_models(measured: tuple[Path, dict[str, Any]]) -> None:
+    folder, _ = measured
+    found = read_geometry(folder)
+    for node in found.nodes:
+        row, column = node.node
+        model = mrcal.cameramodel(str(folder / "cameras" / f"node_r{row}_c{column}.cameramodel"))
+        np.testing.assert_allclose(model.rt_cam_ref()[3:] * 1000, node.rt_cam_ref[3:], atol=1e-6)
+        assert model.intrinsics()[0] == "LENSMODEL_OPENCV5"
+        point = np.array([[0.1, -0.05, 1.0]])
+        np.testing.assert_allclose(
+            mrcal.project(point, *model.intrinsics()), found.camera_lens().project(point), atol=1e-4
+        )
+
+
+def test_measured_poses_replace_the_sets_own(measured: tuple[Path, dict[str, Any]], scene: Path) -> None:
+    loaded = with_measured_geometry(load_set(scene), measured[0])
+    assert loaded.settings.view[0].rt_cam_ref == read_geometry(measured[0]).nodes[0].rt_cam_ref
+    assert loaded.lens.fx_px == read_geometry(measured[0]).lens.fx_px
+    assert "geometry.json" in dict(loaded.input_hashes())
+
+
+def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    simulate(tmp_path / "other", rows=1, columns=1, size_px=(160, 120), snr=1.0)
+    with pytest.raises(BadValue, match=r"is of .* px images"):
+        with_measured_geometry(load_set(tmp_path / "other"), measured[0])
+    simulate(tmp_path / "larger", rows=5, columns=3, size_px=(320, 240), snr=1.0)
+    with pytest.raises(BadValue, match="has no pose for 6 of 15 views"):
+        with_measured_geometry(load_set(tmp_path / "larger"), measured[0])
+    with pytest.raises(MissingFile, match="run `faintfield geometry`"):
+        with_measured_geometry(load_set(tmp_path / "other"), tmp_path)
+
+
+def test_a_set_with_one_board_is_refused_in_one_line(
+    measured: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder, _ = measured
+    lines = (folder / "charuco.toml").read_text().split("[[image]]")
+    kept = [lines[0], *(part for part in lines[1:] if "b0_" in part)]
+    poor = tmp_path / "poor"
+    poor.mkdir()
+    for path in folder.glob("b0_*.tiff"):
+        shutil.copyfile(path, poor / path.name)
+    (poor / "charuco.toml").write_text("[[image]]".join(kept))
+    assert cli.run(["geometry", str(poor)]) == 1
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("faintfield: NotIdentifiable: ")
+    assert "1 board pose(s) only" in last
+    assert not (poor / "geometry.json").exists()
+
+
+BOARD_TOML = """format = 1
+[[board]]
+name = "a"
+columns = 9
+rows = 7
+square_mm = 40.0
+marker_mm = 29.0
+dictionary = "DICT_4X4_250"
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (BOARD_TOML + '[[image]]\nfile = "no.tiff"\nnode = [0, 0]\nsweep = 0\n', "no.tiff is named but missing"),
+        (BOARD_TOML + "image = []\n", "image"),
+        (BOARD_TOML.replace("columns", "colums"), "did you mean 'columns'"),
+        (BOARD_TOML.replace("29.0", "39.0") + '[[image]]\nfile = "a"\nnode = [0, 0]\n', "does not fit squares"),
+        (BOARD_TOML + BOARD_TOML[11:] + '[[image]]\nfile = "a"\nnode = [0, 0]\n', "two boards are named 'a'"),
+        (
+            BOARD_TOML + BOARD_TOML[11:].replace('"a"', '"b"') + '[[image]]\nfile = "a"\nnode = [0, 0]\n',
+            "share markers 0 to 30",
+        ),
+        (BOARD_TOML + '[[image]]\nfile = "../a"\nnode = [0, 0]\n', "leaves the folder"),
+    ],
+)
+def test_board_sets_that_cannot_be_are_refused(text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / "charuco.toml").write_text(text)
+    with pytest.raises(InputError, match=words):
+        load_board_set(tmp_path)
+
+
+def test_the_board_pdf_is_true_to_size(tmp_path: Path) -> None:
+    result = board(tmp_path / "b.pdf", paper="A3", boards=2, square_mm=30.0)
+    content = (tmp_path / "b.pdf").read_bytes().decode("ascii")
+    assert "/MediaBox [0 0 1190.55118 841.88976]" in content  # 420 x 297 mm in points
+    assert "/Count 2" in content
+    first, second = result["board"]
+    markers = first["columns"] * first["rows"] // 2
+    assert second["first_marker_id"] == first["first_marker_id"] + markers
+    squares = [line.split() for line in content.splitlines() if line.endswith(" re")]
+    assert sum(line[2] == line[3] == "30.00000" for line in squares) == 2 * -(-first["columns"] * first["rows"] // 2)
+    start = int(content.split("startxref\n")[1].split()[0])
+    assert content[start:].startswith("xref")
+    for number, line in enumerate(content[start:].splitlines()[3:], start=1):
+        if not line.endswith(" n "):
+            break
+        assert content[int(line.split()[0]) :].startswith(f"{number} 0 obj")
+
+
+def test_boards_that_do_not_fit_the_paper_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(WrongUsage, match="do not fit A4"):
+        board(tmp_path / "b.pdf", paper="A4", columns=20)
+    with pytest.raises(WrongUsage, match="take a larger dictionary"):
+        board(tmp_path / "b.pdf", boards=5, dictionary="DICT_5X5_50")
+    assert not (tmp_path / "b.pdf").exists()
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_colmap_there_and_back(scene: Path, tmp_path: Path, binary: bool) -> None:
+    export_colmap(scene, tmp_path / "model", binary=binary)
+    import_colmap(tmp_path / "model", tmp_path / "back", images=scene, reference="view_r1_c1.tiff", exposure_s=0.1)
+    given, back = load_set(scene), load_set(tmp_path / "back")
+    np.testing.assert_allclose(back.poses_rt_cam_ref, given.poses_rt_cam_ref, atol=1e-9)
+    assert back.lens.cx_px == pytest.approx(given.lens.cx_px, abs=1e-12)
+    assert [view.node for view in back.settings.view] == [view.node for view in given.settings.view]
+
+
+def test_mrcal_there_and_back(scene: Path, tmp_path: Path) -> None:
+    export_mrcal(scene, tmp_path / "models")
+    import_mrcal(tmp_path / "models", tmp_path / "back", images=scene, reference="view_r1_c1.tiff", exposure_s=0.1)
+    given, back = load_set(scene), load_set(tmp_path / "back")
+    np.testing.assert_allclose(back.poses_rt_cam_ref, given.poses_rt_cam_ref, atol=1e-6)
+    assert back.lens.distortion == pytest.approx((*given.lens.distortion,), abs=1e-9)
+
+
+def test_colmaps_text_as_it_writes_it(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("# Camera list\n1 SIMPLE_RADIAL 640 480 800.0 320.0 240.0 -0.1\n")
+    (tmp_path / "images.txt").write_text(
+        "# Image list\n1 0.7071067811865476 0 0 0.7071067811865476 1 2 3 1 a.png\n10 20 -1\n"
+        "2 1 0 0 0 4 5 6 1 b c.png\n\n"
+    )
+    model = read_model(tmp_path)
+    lens = model.lenses[1]
+    assert (lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px) == (800.0, 800.0, 319.5, 239.5)
+    assert lens.distortion == (-0.1, 0.0)
+    np.testing.assert_allclose(model.images[0].rt_cam_world, [0, 0, np.pi / 2, 1, 2, 3], atol=1e-12)
+    assert model.images[1].name == "b c.png"
+
+
+def test_a_binary_model_is_the_text_model(tmp_path: Path) -> None:
+    lens = load_lens()
+    images = [ColmapImage(f"{k}.png", 1, np.array([0.1 * k, 0.2, -0.3, 1.0, 2.0, k])) for k in range(3)]
+    write_model(tmp_path / "t", ColmapModel({1: lens}, images), binary=False)
+    write_model(tmp_path / "b", ColmapModel({1: lens}, images), binary=True)
+    text, binary = read_model(tmp_path / "t"), read_model(tmp_path / "b")
+    assert text.lenses == binary.lenses
+    for one, other in zip(text.images, binary.images, strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.rt_cam_world, other.rt_cam_world)
+
+
+def load_lens() -> Any:
+    from calib.lens import Lens
+
+    return Lens((640, 480), 800.0, 801.0, 319.0, 241.0, (-0.1, 0.02, 0.001, -0.002, 0.003))
+
+
+def test_damaged_models_are_named_failures(tmp_path: Path) -> None:
+    with pytest.raises(MissingFile, match=r"cameras.bin or cameras.txt"):
+        read_model(tmp_path)
+    (tmp_path / "cameras.bin").write_bytes(b"\x01\0\0")
+    (tmp_path / "images.bin").write_bytes(b"")
+    with pytest.raises(BadValue, match="can be read"):
+        read_model(tmp_path)
+    (tmp_path / "x.cameramodel").write_text("{ nonsense")
+    with pytest.raises(BadValue, match="is not a camera model"):
+        import_mrcal(tmp_path, tmp_path / "out")
