@@ -79,7 +79,7 @@ def simulate_board_set(
     images = []
     for board, place in progress(tasks, "photographing boards"):
         plane = standing_board(board, place, experiment)
-        views = render([plane], experiment.optics, poses_rt_cam_ref)
+        views = render([plane], experiment.optics, poses_rt_cam_ref, samples_per_px=1)  # blurred: nothing to alias
         for node, view in zip(nodes, views, strict=True):
             name = f"{board.name}_r{node[0]}_c{node[1]}.tiff"
             photons = view.light * (white_e / _WHITE / experiment.sensor.quantum_efficiency)
