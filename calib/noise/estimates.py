@@ -22,6 +22,10 @@ MOST_RELATIVE_SE = 0.1
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
+_ONE_REPEATED = (
+    "only one exposure has more than one dark, so that the growth of the noise cannot be seen; record at least 2 darks "
+    "each of 2 exposures, better 10 each of 4 up to 60 s"
+)
 _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
 
 
@@ -41,7 +45,7 @@ def estimate_all(
     """
     fit, darks = fitted.fit, fitted.darks
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
-    why_no_gain = _why_no_gain(fit, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+    why_no_gain = _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
     why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
         "offset_dn": None,
@@ -51,7 +55,7 @@ def estimate_all(
     }
     estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fit, gain, why_no_gain, quantile)
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
     estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
     return estimates | _from_flats(fitted, gain, response, quantile), covariance
 
@@ -107,10 +111,10 @@ def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
     }
 
 
-def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
+def _why_no_gain(fit: Fit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
     """Return why gain and read noise in electrons cannot be told, None if they can."""
     if "log_gain" not in fit.values:
-        return f"{_ONE_EXPOSURE}, or flats"
+        return f"{_why_no_growth(moments)}, or flats"
     relative = fit.standard_error("log_gain")
     if from_darks and not holds:
         return f"without flats it rests on the darks, which contradict the model (see the warnings); {_FLATS_REMEDY}"
@@ -121,6 +125,11 @@ def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
             f"electrons to tell the gain from the read noise; {_FLATS_REMEDY}"
         )
     return None
+
+
+def _why_no_growth(moments: Moments) -> str:
+    """Return why the darks do not tell how noise and pattern grow with exposure time."""
+    return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
 
 
 def _why_no_current(
@@ -175,14 +184,15 @@ def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estim
     return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
 
 
-def _spreads(fit: Fit, gain: Estimate, why_no_gain: str | None, quantile: float) -> dict[str, Estimate]:
+def _spreads(fitted: Fitted, gain: Estimate, quantile: float) -> dict[str, Estimate]:
     """Return the pixels' own spreads: DSNU and DCNU."""
+    fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
     spreads = {"dsnu_dn": _root(dsnu2, se, quantile)}
     if gain.value is None:
-        return spreads | {name: Estimate(None, why=why_no_gain) for name in ("dsnu_e", "dcnu_e_per_s")}
+        return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
     spreads["dsnu_e"] = _root(dsnu2, se, quantile, 1 / gain.value)
-    spreads["dcnu_e_per_s"] = Estimate(None, why=_ONE_EXPOSURE)
+    spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
     if "dcnu_dn2_per_s2" in fit.values:
         dcnu2, se = fit.values["dcnu_dn2_per_s2"], fit.standard_error("dcnu_dn2_per_s2")
         spreads["dcnu_e_per_s"] = _root(dcnu2, se, quantile, 1 / gain.value)

@@ -56,6 +56,17 @@ def test_one_exposure_tells_neither_gain_nor_dark_current_but_with_flats_the_gai
     assert "one exposure" in str(result.estimates["dark_current_e_per_s"].why)
 
 
+def test_several_exposures_of_which_one_has_two_frames_are_not_called_one_exposure() -> None:
+    chip, rng = specimen(16)
+    series = [*take(chip, rng, (1.0,), 2), *take(chip, rng, (2.0, 12.0), 1)]
+    without, with_flats = calibrate(series), calibrate([*series, light(chip, rng, 8000.0, 10)])
+    for why in (without.estimates["gain_dn_per_e"].why, with_flats.estimates["dcnu_e_per_s"].why):
+        assert "only one exposure has more than one dark" in str(why)
+        assert "all darks" not in str(why)
+    alone = calibrate([*take(chip, rng, (1.0,), 2), light(chip, rng, 8000.0, 10)])
+    assert "all darks have one exposure" in str(alone.estimates["dcnu_e_per_s"].why)
+
+
 def test_a_camera_without_dark_current_gets_an_interval_around_zero() -> None:
     chip, rng = specimen(2, dark_current_e_per_s=0.0)
     result = calibrate([*take(chip, rng), light(chip, rng, 8000.0, 10)])
