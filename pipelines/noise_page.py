@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,35 +31,65 @@ _ROWS = (
 )
 
 
+_ACROSS = 3
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot of the page; `missing` says why it would have nothing to show, None where it has."""
+
+    title: str
+    draw: Callable[[Axes, NoiseCalibration], None]
+    missing: str | None = None
+
+
 def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
-    """Return the page as a PNG."""
-    figure = Figure(figsize=(15.5, 14.5), layout="constrained")
+    """Return the page as a PNG: the panels that have something to show, and below them what is left out and why."""
+    panels = page_panels(calibration)
+    shown = [panel for panel in panels if panel.missing is None]
+    down = -(-len(shown) // _ACROSS)
+    figure = Figure(figsize=(15.5, 0.4 + 4.7 * down), layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.subplots(3, 3)
-    panels: tuple[Callable[[Axes, NoiseCalibration], None], ...] = (
-        _photon_transfer,
-        _dark_signal,
-        _table,
-        _offset_map,
-        _dark_map,
-        _variance_map,
-        _histograms,
-        _spectrogram,
-        _response_map,
-    )
-    for axes, panel in zip(grid.flat, panels, strict=True):
-        panel(axes, calibration)
+    # Half panels as the unit, so that a last row of fewer panels can stand in the middle.
+    grid = figure.add_gridspec(down, 2 * _ACROSS)
+    for index, panel in enumerate(shown):
+        row, column = divmod(index, _ACROSS)
+        first = 2 * column + (down * _ACROSS - len(shown) if row == down - 1 else 0)
+        axes = figure.add_subplot(grid[row, first : first + 2])
+        axes.set_title(panel.title)
+        panel.draw(axes, calibration)
     how = f"{STANDARD}; likelihood: {calibration.likelihood}"
     figure.suptitle(f"Noise calibration: {title.strip()}    ({how})", fontsize=13)
+    left_out = "; ".join(f"{panel.title} ({panel.missing})" for panel in panels if panel.missing)
+    if left_out:
+        figure.supxlabel(f"Not shown: {left_out}", fontsize=9, color="0.4")
     page = io.BytesIO()
     figure.savefig(page, format="png", dpi=110)
     return page.getvalue()
 
 
+def page_panels(calibration: NoiseCalibration) -> tuple[Panel, ...]:
+    """Return every panel of the page, in order."""
+    maps = calibration.maps
+    offset = calibration.estimates["offset_dn"].value or 0.0
+    cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
+    no_mass = None if calibration.histograms else "no gain, or values too wide apart"
+    return (
+        Panel("Photon transfer" + cut_off, _photon_transfer),
+        Panel("Dark signal against exposure time", _dark_signal),
+        Panel("Results, 95 % intervals", _table),
+        _map("Offset less its mean (DSNU) [DN]", maps.offset_dn - offset, maps.unusable),
+        _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
+        # Even, unless something is missing from the model.
+        _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
+        Panel("Dark values and the fitted mass function", _histograms, no_mass),
+        Panel("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        _map("Relative response to light", maps.relative_response, maps.unusable),
+    )
+
+
 def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
     """Variance against mean, less the dark's, with the line of the model."""
-    cut_off = calibration.likelihood.startswith("censored")
-    axes.set_title("Photon transfer" + (" (moments as they are, cut off)" if cut_off else ""))
     offset = calibration.estimates["offset_dn"].value or 0.0
     measured = [point for point in calibration.points if point.frames > 1]
     flats = any(point.kind == "flat" for point in measured)
@@ -83,18 +114,20 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
 
 def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
     """Mean dark signal against exposure time, with what remains once the line is taken off."""
-    axes.set_title("Dark signal against exposure time")
     points = [point for point in calibration.points if point.kind == "dark"]
     t = _column(points, "exposure_s")
     axes.plot(t, _column(points, "mean_dn"), "o", ms=4, color=_SECOND, label="mean of a series")
     order = np.argsort(t)
-    axes.plot(t[order], _column(points, "model_mean_dn")[order], color=_MODEL, lw=1, label="model")
+    model = _column(points, "model_mean_dn")
+    axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
     axes.set_xlabel("exposure time [s]")
     axes.set_ylabel(r"$\mu_{y.\mathrm{dark}}$ [DN]")
-    axes.legend(fontsize=8, loc="upper left")
-    below = axes.inset_axes((0.56, 0.12, 0.42, 0.3))
+    # Both out of the way of a line that rises, or falls.
+    falls = model[order[-1]] < model[order[0]]
+    axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
+    below = axes.inset_axes((0.1, 0.1, 0.34, 0.26) if falls else (0.56, 0.12, 0.42, 0.3))
     below.axhline(0, color=_MODEL, lw=1)
-    below.plot(t, _column(points, "mean_dn") - _column(points, "model_mean_dn"), "o", ms=3, color=_SECOND)
+    below.plot(t, _column(points, "mean_dn") - model, "o", ms=3, color=_SECOND)
     below.set_title("measured − model [DN]", fontsize=7)
     below.tick_params(labelsize=7)
 
@@ -102,7 +135,6 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     """List the numbers with their intervals."""
     axes.axis("off")
-    axes.set_title("Results, 95 % intervals")
     cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
     table = axes.table(
         cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
@@ -124,50 +156,31 @@ def _words(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
 
 
-def _offset_map(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Each pixel's offset."""
-    offset = calibration.estimates["offset_dn"].value or 0.0
-    _map(axes, calibration, calibration.maps.offset_dn - offset, "Offset less its mean (DSNU) [DN]")
+def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> Panel:
+    """Return the panel of one map, with a scale that spans the usable pixels."""
+
+    def draw(axes: Axes, _: NoiseCalibration) -> None:
+        assert values is not None
+        low, high = np.quantile(values[~unusable], [0.005, 0.995])
+        image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
+        axes.set_xlabel("column [px]")
+        axes.set_ylabel("row [px]")
+        axes.figure.colorbar(image, ax=axes, shrink=0.8)
+
+    return Panel(title, draw, _sameness(values, unusable))
 
 
-def _dark_map(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Each pixel's dark current."""
-    _map(axes, calibration, calibration.maps.dark_current_e_per_s, "Dark current [e⁻/s]")
-
-
-def _variance_map(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Each pixel's temporal variance over that of the model: even, unless something is missing from the model."""
-    _map(axes, calibration, calibration.variance_ratio, "Temporal variance, measured / model")
-
-
-def _response_map(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Each pixel's response to light."""
-    _map(axes, calibration, calibration.maps.relative_response, "Relative response to light")
-
-
-def _map(axes: Axes, calibration: NoiseCalibration, values: NDArray[np.floating] | None, title: str) -> None:
-    """Draw one map with a scale that spans the usable pixels."""
-    usable = ~calibration.maps.unusable
-    axes.set_title(title)
+def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+    """Return why a map shows nothing, None where it shows something."""
     if values is None:
-        _nothing(axes, "not identifiable\nfrom these frames")
-        return
-    if not np.ptp(values[usable]):
-        _nothing(axes, "the same for all pixels")
-        return
-    low, high = np.quantile(values[usable], [0.005, 0.995])
-    image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
-    axes.set_xlabel("column [px]")
-    axes.set_ylabel("row [px]")
-    axes.figure.colorbar(image, ax=axes, shrink=0.8)
+        return "not identifiable from these frames"
+    if unusable.all():
+        return "no usable pixel"
+    return None if np.ptp(values[~unusable]) else "the same for all pixels"
 
 
 def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
     """Values of the shortest and the longest darks, and how often each should occur."""
-    axes.set_title("Dark values and the fitted mass function")
-    if not calibration.histograms:
-        _nothing(axes, "no gain, no mass function")
-        return
     for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
         seen = histogram.count > 0
         label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"
@@ -196,12 +209,8 @@ def _span(calibration: NoiseCalibration) -> tuple[float, float]:
 
 def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
     """Amplitude spectrum of the rows and of the columns of the offset map: a peak is a fixed pattern with a period."""
-    axes.set_title("Spectrogram of the offset (DSNU)")
     offset = np.asarray(calibration.maps.offset_dn, np.float64)
     usable = ~calibration.maps.unusable
-    if not np.ptp(offset):
-        _nothing(axes, "no offset per pixel")
-        return
     mean = float(offset.mean(where=usable))
     deviation = np.where(usable, offset - mean, 0.0)
     for axis, label, colour in ((1, "along rows (horizontal)", _SECOND), (0, "along columns (vertical)", _INK)):
@@ -214,12 +223,6 @@ def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.set_xlabel("spatial frequency [cycles/px]")
     axes.set_ylabel("amplitude [DN]")
     axes.legend(fontsize=8)
-
-
-def _nothing(axes: Axes, why: str) -> None:
-    """Say why a panel is empty."""
-    axes.axis("off")
-    axes.text(0.5, 0.5, why, ha="center", va="center", color="0.4", transform=axes.transAxes)
 
 
 def _column(points: list[TransferPoint], name: str) -> NDArray[np.float64]:

@@ -22,6 +22,11 @@ MOST_RELATIVE_SE = 0.1
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
+_ONE_REPEATED = (
+    "only one exposure has more than one dark, so that the growth of the noise cannot be seen; record at least 2 darks "
+    "each of 2 exposures, better 10 each of 4 up to 60 s"
+)
+_NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
 
 
@@ -41,7 +46,7 @@ def estimate_all(
     """
     fit, darks = fitted.fit, fitted.darks
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
-    why_no_gain = _why_no_gain(fit, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+    why_no_gain = _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
     why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
         "offset_dn": None,
@@ -51,8 +56,8 @@ def estimate_all(
     }
     estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fit, gain, why_no_gain, quantile)
-    estimates |= _shared_noise(fit, darks, quantile) | _profiles(fit, darks, quantile)
+    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
+    estimates |= _shared_noise(fitted, quantile) | _profiles(fit, darks, quantile)
     return estimates | _from_flats(fitted, gain, response, quantile), covariance
 
 
@@ -107,10 +112,10 @@ def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
     }
 
 
-def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
+def _why_no_gain(fit: Fit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
     """Return why gain and read noise in electrons cannot be told, None if they can."""
     if "log_gain" not in fit.values:
-        return f"{_ONE_EXPOSURE}, or flats"
+        return f"{_why_no_growth(moments)}, or flats"
     relative = fit.standard_error("log_gain")
     if from_darks and not holds:
         return f"without flats it rests on the darks, which contradict the model (see the warnings); {_FLATS_REMEDY}"
@@ -123,6 +128,11 @@ def _why_no_gain(fit: Fit, *, from_darks: bool, holds: bool) -> str | None:
     return None
 
 
+def _why_no_growth(moments: Moments) -> str:
+    """Return why the darks do not tell how noise and pattern grow with exposure time."""
+    return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
+
+
 def _why_no_current(
     fit: Fit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
 ) -> str | None:
@@ -133,19 +143,22 @@ def _why_no_current(
         return f"dark current in electrons needs the gain: {why_no_gain}"
     if not levels_hold:
         return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
-    signal, se = fit.values["dark_signal_dn_per_s"], fit.standard_error("dark_signal_dn_per_s")
+    signal, half_width = fit.values["dark_signal_dn_per_s"], quantile * fit.standard_error("dark_signal_dn_per_s")
+    # Where few frames tell the jitter, that of the normal law with the same interval: the formal one flatters.
+    se = half_width / float(stats.norm.ppf(0.975))
     gain = float(np.exp(fit.values["log_gain"]))
     noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
     longest = float(moments.darks.exposure_s.max())
-    if signal + quantile * se < 0:
+    if signal + half_width < 0:
         return (
             f"the dark level falls with exposure time ({signal:.2g} DN/s), which dark current cannot do: the black "
             "level drifted; record the exposures in turn, the camera settled"
         )
     if se > MOST_RELATIVE_SE * abs(signal) and se * longest / gain > MOST_RELATIVE_SE * noise_e2:
+        rise = "" if signal > 0 else f"the dark level does not rise with exposure time ({signal:.2g} DN/s); "
         return (
-            f"its standard error would be {se / gain:.2g} e-/s, which over {longest:g} s is more than a tenth of the "
-            "read noise variance; record more darks of more and longer exposures, the camera settled"
+            f"{rise}its standard error would be {se / gain:.2g} e-/s, which over {longest:g} s is more than a tenth of "
+            "the read noise variance; record more darks of more and longer exposures, the camera settled"
         )
     return None
 
@@ -159,9 +172,22 @@ def _interval(value: float, se: float, quantile: float, *, positive: bool = Fals
 
 
 def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
-    """Return the root of a variance that may be zero, times a scale."""
+    """Return the root of a variance that may be zero, times a scale; none where it is significantly negative."""
+    if not se:
+        return Estimate(None, why=_NO_SPREAD)
+    if variance + quantile * se <= 0:
+        return Estimate(None, why=_negative(-variance / se))
     low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
     return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
+
+
+def _negative(errors: float) -> str:
+    """Return why a variance so many standard errors below zero is no spread of zero."""
+    return (
+        f"there is less scatter than the pixels' noise alone makes (by {errors:.2g} standard errors), so that a spread "
+        "would be hidden: pickup whose phase turns from frame to frame does that; record more frames, away from what "
+        "may disturb them"
+    )
 
 
 def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
@@ -175,22 +201,24 @@ def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estim
     return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
 
 
-def _spreads(fit: Fit, gain: Estimate, why_no_gain: str | None, quantile: float) -> dict[str, Estimate]:
+def _spreads(fitted: Fitted, gain: Estimate, quantile: float) -> dict[str, Estimate]:
     """Return the pixels' own spreads: DSNU and DCNU."""
+    fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
     spreads = {"dsnu_dn": _root(dsnu2, se, quantile)}
     if gain.value is None:
-        return spreads | {name: Estimate(None, why=why_no_gain) for name in ("dsnu_e", "dcnu_e_per_s")}
+        return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
     spreads["dsnu_e"] = _root(dsnu2, se, quantile, 1 / gain.value)
-    spreads["dcnu_e_per_s"] = Estimate(None, why=_ONE_EXPOSURE)
+    spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
     if "dcnu_dn2_per_s2" in fit.values:
         dcnu2, se = fit.values["dcnu_dn2_per_s2"], fit.standard_error("dcnu_dn2_per_s2")
         spreads["dcnu_e_per_s"] = _root(dcnu2, se, quantile, 1 / gain.value)
     return spreads
 
 
-def _shared_noise(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+def _shared_noise(fitted: Fitted, quantile: float) -> dict[str, Estimate]:
     """Return the noise that the pixels of a frame, a row or a column share."""
+    fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
     if "jitter_dn2" not in fit.values:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
         return dict.fromkeys(("frame_jitter_dn", "row_noise_dn", "column_noise_dn"), unknown)
@@ -203,8 +231,11 @@ def _shared_noise(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[st
         se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
         return _root(excess, se, quantile)
 
+    # A fit at its bound of zero has no curvature to take an error from: that of the levels' scatter without jitter.
+    chance = float(np.average(noise, weights=freedom) / pixels * np.sqrt(2 / freedom.sum()))
+    jitter_se = fit.standard_error("jitter_dn2") or chance
     return {
-        "frame_jitter_dn": _root(fit.values["jitter_dn2"], fit.standard_error("jitter_dn2"), quantile),
+        "frame_jitter_dn": _root(fit.values["jitter_dn2"], jitter_se, quantile),
         "row_noise_dn": shared([one.row_noise_dn2 for one in darks], columns, rows),
         "column_noise_dn": shared([one.column_noise_dn2 for one in darks], rows, columns),
     }

@@ -63,7 +63,9 @@ def compare_histogram(
     offset = np.arange(-reach * per_dn, reach * per_dn + 1) / per_dn
     prior = np.exp(-0.5 * (offset / spread_dn) ** 2)
     prior /= prior.sum()
-    u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - fitted["offset_dn"]
+    # A black level that drifts down takes the values along, but makes no charge; see `dark_variances_dn2`.
+    level_dn = fitted["offset_dn"] + min(fitted.get("dark_signal_dn_per_s", 0.0), 0.0) * exposure_s
+    u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - level_dn
     mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in _logs(u, exposure_s, fitted))
     if floor_dn == lowest:
         mass[0] = tail[0]
@@ -74,7 +76,7 @@ def compare_histogram(
 def _logs(
     u_dn: NDArray[np.float64], exposure_s: float, fitted: Mapping[str, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return ln of the mass at each u = value − offset, and of all below it."""
+    """Return ln of the mass at each u = value − level without charge, and of all below it."""
     slope = max(fitted.get("dark_signal_dn_per_s", 0.0), 1e-9)
     log_gain = fitted["log_gain"]
     charge = float(slope / np.exp(log_gain)) * exposure_s

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import tifffile
 
+from calib.noise import Conditions, calibrate, measure_series
 from pipelines.cli import run
 from pipelines.elemental_set import Camera, ElementalSet, View, load_set, write_set
 from pipelines.errors import BadValue
@@ -17,7 +18,8 @@ from pipelines.fitted_noise import read_fitted_noise
 from pipelines.frames import Frame, exif_exposure_s
 from pipelines.image_files import write_frame
 from pipelines.noise import noise
-from tests.calib.noise.darkroom import specimen
+from pipelines.noise_page import draw_page, page_panels
+from tests.calib.noise.darkroom import darks, specimen
 from tests.pipelines.noise_sets import take_set, write_frames
 
 DATA = os.environ.get("FAINTFIELD_DATA")
@@ -58,6 +60,28 @@ def test_numbers_maps_and_page_are_written(tmp_path: Path, capfd: pytest.Capture
         "vignetting",
     }
     assert shapes == dict.fromkeys(floats, ((64, 64), "float32")) | {"mask": ((64, 64), "bool")}
+
+
+def test_the_page_leaves_out_what_it_could_not_show() -> None:
+    chip, rng = specimen(17, dsnu_e=0.0)
+    series = [measure_series(frames, Conditions("dark", t)) for t, frames in darks(chip, [0.1], 4, rng).items()]
+    short = calibrate(series)
+    shown = [panel.title for panel in page_panels(short) if panel.missing is None]
+    assert shown[:3] == ["Photon transfer", "Dark signal against exposure time", "Results, 95 % intervals"]
+    missing = {panel.title: panel.missing for panel in page_panels(short) if panel.missing}
+    assert (
+        missing["Dark current [e⁻/s]"] == missing["Relative response to light"] == "not identifiable from these frames"
+    )
+    assert "no gain" in missing["Dark values and the fitted mass function"]
+    series = [
+        measure_series(frames, Conditions("dark", t)) for t, frames in darks(chip, (0.1, 10.0, 60.0), 4, rng).items()
+    ]
+    longer = calibrate(series)
+    assert len([panel for panel in page_panels(longer) if panel.missing is None]) > 6
+    # A PNG's header states its width and height after 16 bytes.
+    lower, higher = (np.frombuffer(draw_page(one, "")[16:24], ">u4") for one in (short, longer))
+    assert lower[0] == higher[0]
+    assert lower[1] < higher[1]
 
 
 def test_the_result_is_what_reconstruction_reads(tmp_path: Path) -> None:
@@ -238,6 +262,26 @@ def test_a_real_ccd_comes_out_as_published(tmp_path: Path) -> None:
     assert 1 / result["gain_dn_per_e"]["value"] == pytest.approx(2.529, rel=0.002)
     assert result["read_noise_dn"]["value"] == pytest.approx(4.03, rel=0.005)
     assert "black level drifted" in result["dark_current_e_per_s"]["why"]
+
+
+@needs_data
+def test_a_real_ccd_whose_black_level_fell_is_not_told_more_than_it_shows(tmp_path: Path) -> None:
+    source = Path(str(DATA)) / "ccd-frames"
+    exposures_s = {"led_dark_a": 1.0, "led_dark_b": 1.0, "dark_2s": 2.0, "dark_12s": 12.0, "led_a": 1.0, "led_b": 1.0}
+    frames = [
+        (tifffile.imread(source / f"{name}.tiff"), {"kind": "dark" if "dark" in name else "flat", "exposure_s": t})
+        for name, t in exposures_s.items()
+    ]
+    result = noise(write_frames(tmp_path, frames, region={"rows": [8, 520], "columns": [50, 1074]}))
+    whys = {
+        "dark_current_e_per_s": "does not rise with exposure time",
+        "dcnu_e_per_s": "only one exposure has more than one dark",
+        "dsnu_e": "less scatter than the pixels' noise",
+        "column_noise_dn": "less scatter than the pixels' noise",
+    }
+    for name, why in whys.items():
+        assert result[name]["value"] is None, name
+        assert why in result[name]["why"], name
 
 
 @needs_data

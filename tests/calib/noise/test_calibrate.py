@@ -56,6 +56,17 @@ def test_one_exposure_tells_neither_gain_nor_dark_current_but_with_flats_the_gai
     assert "one exposure" in str(result.estimates["dark_current_e_per_s"].why)
 
 
+def test_several_exposures_of_which_one_has_two_frames_are_not_called_one_exposure() -> None:
+    chip, rng = specimen(16)
+    series = [*take(chip, rng, (1.0,), 2), *take(chip, rng, (2.0, 12.0), 1)]
+    without, with_flats = calibrate(series), calibrate([*series, light(chip, rng, 8000.0, 10)])
+    for why in (without.estimates["gain_dn_per_e"].why, with_flats.estimates["dcnu_e_per_s"].why):
+        assert "only one exposure has more than one dark" in str(why)
+        assert "all darks" not in str(why)
+    alone = calibrate([*take(chip, rng, (1.0,), 2), light(chip, rng, 8000.0, 10)])
+    assert "all darks have one exposure" in str(alone.estimates["dcnu_e_per_s"].why)
+
+
 def test_a_camera_without_dark_current_gets_an_interval_around_zero() -> None:
     chip, rng = specimen(2, dark_current_e_per_s=0.0)
     result = calibrate([*take(chip, rng), light(chip, rng, 8000.0, 10)])
@@ -63,6 +74,60 @@ def test_a_camera_without_dark_current_gets_an_interval_around_zero() -> None:
     assert interval is not None
     assert interval[0] <= 0 <= interval[1] < 0.01
     assert calibrate(take(chip, rng)).estimates["gain_dn_per_e"].value is None
+
+
+def test_levels_that_do_not_rise_and_that_two_frames_tell_give_no_dark_current() -> None:
+    chip, rng = specimen(17, dark_current_e_per_s=0.0)
+    drift_dn: dict[float, tuple[int, ...]] = {1.0: (4, 3), 2.0: (2,), 12.0: (0,)}
+    series = [
+        measure_series([(f"{t}_{k}", expose(chip, t, rng) + d) for k, d in enumerate(drifts)], Conditions("dark", t))
+        for t, drifts in drift_dn.items()
+    ]
+    result = calibrate([*series, light(chip, rng, 8000.0, 10)])
+    assert result.estimates["dark_current_e_per_s"].value is None
+    assert "does not rise with exposure time" in str(result.estimates["dark_current_e_per_s"].why)
+    assert result.maps.dark_current_e_per_s is None
+    assert result.covariance[0] == ("offset_dn", "gain_dn_per_e", "read_noise_e")
+
+
+def test_a_falling_dark_level_is_no_dark_current_and_the_mass_function_falls_with_it() -> None:
+    chip, rng = specimen(18, dark_current_e_per_s=0.0)
+    taken = darks(chip, (1.0, 10.0, 20.0), 6, rng)
+    series = [
+        measure_series([(name, frame - np.uint16(0.5 * t)) for name, frame in frames], Conditions("dark", t))
+        for t, frames in taken.items()
+    ]
+    result = calibrate([*series, light(chip, rng, 8000.0, 10)])
+    assert "the dark level falls with exposure time" in str(result.estimates["dark_current_e_per_s"].why)
+    longest = result.histograms[-1]
+    assert longest.exposure_s == 20
+    seen, fitted = (np.average(longest.value_dn, weights=w) for w in (longest.count, longest.expected))
+    assert fitted == pytest.approx(seen, abs=0.3)
+    assert fitted == pytest.approx(result.points[2].model_mean_dn, abs=0.3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("read_noise_e", "dsnu_e"), [(0.3, 1.5), (12**0.5, 0.0)])
+def test_what_is_not_seen_is_not_certainly_zero(seed: int, read_noise_e: float, dsnu_e: float) -> None:
+    chip, rng = specimen(seed, dsnu_e=dsnu_e, dark_current_e_per_s=0.5, read_noise_e=read_noise_e, shape=(32, 32))
+    for name, estimate in calibrate(take(chip, rng)).estimates.items():
+        assert estimate.se is None or estimate.se > 0, name
+        assert estimate.ci95 is None or estimate.ci95[0] < estimate.ci95[1], name
+        assert (estimate.value is None) == (estimate.why is not None), name
+
+
+def test_pickup_that_hides_the_spread_leaves_it_unknown() -> None:
+    chip, rng = specimen(19, dsnu_e=0.0)
+    pickup = rng.integers(-5, 6, chip.sensor.shape)
+    series = []
+    for t, frames in darks(chip, EXPOSURES_S, 2, rng).items():
+        turned = [(name, (frame + pickup * (-1) ** k).astype(np.uint16)) for k, (name, frame) in enumerate(frames)]
+        series.append(measure_series(turned, Conditions("dark", t)))
+    result = calibrate([*series, light(chip, rng, 8000.0, 10)])
+    for name in ("dsnu_dn", "dsnu_e"):
+        estimate = result.estimates[name]
+        assert (estimate.value, estimate.se, estimate.ci95) == (None, None, None)
+        assert "less scatter than the pixels' noise" in str(estimate.why)
 
 
 def test_hot_pixels_are_found_and_kept_out() -> None:
