@@ -1,0 +1,202 @@
+"""`faintfield stage`: bring up a stage by hand, with the driver that captures with it."""
+
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from cyclopts import App, Parameter
+from rich.table import Table
+
+from pipelines.console import console, say
+from pipelines.errors import BadValue, MissingFile, UnknownKey
+from rig.opening import open_stage
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.simulation.controller.server import serving
+from rig.stages.conformance import Check, conformance
+from rig.stages.gantry import Gantry
+from rig.stages.protocol import Identity, Position
+from rig.stages.settings import StageSettings
+
+app = App(name="stage", help="Bring up a stage: ask it, home it, move it, try it.")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Connection:
+    """Which stage to talk to: a port, or the stage of a rig.toml.
+
+    Parameters
+    ----------
+    port
+        Serial device, pyserial URL, or simulated:grbl, simulated:marlin.
+    protocol
+        What the controller speaks.
+    baud
+        Bits per second.
+    rig
+        Take the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
+    """
+
+    port: str | None = None
+    protocol: Literal["grbl", "marlin"] = "grbl"
+    baud: int = 115200
+    rig: Path | None = None
+
+    def settings(self) -> StageSettings:
+        """Return the settings of the stage that is meant."""
+        if self.rig is not None:
+            return stage_table(self.rig)
+        if self.port is None:
+            raise BadValue("no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml")
+        return StageSettings(protocol=self.protocol, port=self.port, baud=self.baud)
+
+
+def stage_table(path: Path) -> StageSettings:
+    """Return the `[stage]` table of a rig.toml.
+
+    Raises
+    ------
+    MissingFile, BadValue, UnknownKey
+        With the file's name and what is wrong in it.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8")).get("stage", {})
+        return msgspec.convert(table, StageSettings)
+    except OSError as failure:
+        raise MissingFile(f"{path}: {failure.strerror}; name the rig.toml to use") from failure
+    except msgspec.ValidationError as failure:
+        kind = UnknownKey if "unknown field" in str(failure) else BadValue
+        raise kind(f"{path}: [stage]: {failure}; correct it in the file") from failure
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, ValueError) as failure:
+        raise BadValue(f"{path}: {failure}; correct it in the file") from failure
+
+
+@app.command
+def info(connection: Connection = Connection()) -> Identity:
+    """Say who the controller is and how it is set; nothing moves."""
+    with _connected(connection) as stage:
+        identity = stage.identify()
+        say(f"{identity.firmware}, travel {stage.travel()}")
+        rates = " and ".join(f"{60.0 * rate:g}" for rate in identity.motion.rate_mm_per_s)
+        say(f"rates {rates} mm/min; a position counts as reached within {max(identity.tolerance_mm):.4f} mm")
+        return identity
+
+
+@app.command
+def home(connection: Connection = Connection()) -> Position:
+    """Find the switches."""
+    with _connected(connection) as stage:
+        homing = stage.home()
+        say(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
+        return homing.position
+
+
+@app.command
+def goto(
+    x_mm: float,
+    y_mm: float,
+    *,
+    home: Annotated[bool, Parameter(negative=())] = False,
+    connection: Connection = Connection(),
+) -> Position:
+    """Go to a position in machine coordinates, and verify it.
+
+    Parameters
+    ----------
+    x_mm
+        Position along the first axis.
+    y_mm
+        Position along the second axis.
+    home
+        Home first. Needed, since opening the port restarts most controllers.
+    """
+    with _connected(connection) as stage:
+        if home:
+            stage.home()
+        position = stage.move_to(x_mm, y_mm)
+        say(f"arrived at {position.point}")
+        return position
+
+
+@app.command
+def jog(
+    dx_mm: float,
+    dy_mm: float,
+    *,
+    unlock: Annotated[bool, Parameter(negative=())] = False,
+    connection: Connection = Connection(),
+) -> Position:
+    """Move by at most 10 mm without homing, to find out which way the axes go.
+
+    Parameters
+    ----------
+    dx_mm
+        Distance along the first axis.
+    dy_mm
+        Distance along the second axis.
+    unlock
+        Clear the lock that GRBL keeps until it is homed.
+    """
+    with _connected(connection) as stage:
+        position = stage.jog(dx_mm, dy_mm, unlock=unlock)
+        say(f"reported at {position.point}; not homed, so this says nothing of where it is")
+        return position
+
+
+@app.command(name="test")
+def conform(connection: Connection = Connection()) -> list[Check]:
+    """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves."""
+    with _connected(connection) as stage:
+        checks = []
+        for check in conformance(stage):
+            say(f"{'passed' if check.passed else 'FAILED'}: {check.name}")
+            checks.append(check)
+    console.print(_table(checks))
+    return checks
+
+
+@app.command
+def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
+    """Serve a simulated controller on a port, for other programs, until Ctrl-C.
+
+    Parameters
+    ----------
+    protocol
+        What it speaks.
+    speed
+        How many simulated seconds pass in a real one.
+    """
+    with serving(SimulatedGrbl if protocol == "grbl" else SimulatedMarlin) as server:
+        say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
+        server.run(speed)
+
+
+@contextmanager
+def _connected(connection: Connection) -> Iterator[Gantry]:
+    """Connect to a stage, say what should be changed in it, and give the port back in the end."""
+    try:
+        settings = connection.settings()
+    except ValueError as failure:
+        raise BadValue(f"{failure}") from failure
+    stage = open_stage(settings)
+    stage.connect()
+    try:
+        for warning in stage.identify().warnings:
+            say(f"warning: {warning}")
+        yield stage
+    finally:
+        stage.close()
+
+
+def _table(checks: list[Check]) -> Table:
+    """Return the checks as a table for people."""
+    table = Table("", "check", "measured", "limit")
+    for check in checks:
+        mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
+        table.add_row(mark, check.name, check.measured, check.limit)
+    return table

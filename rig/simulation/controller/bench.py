@@ -1,0 +1,117 @@
+"""A simulated controller on the bench: firmware, mechanics, wire and clock, with a port for the driver."""
+
+from collections.abc import Callable
+
+from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.link import DirectLink, Link
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.simulation.controller.wire import Wire
+from rig.stages.gantry import Gantry
+from rig.stages.opening import stage_from
+from rig.stages.protocol import Point
+from rig.stages.settings import StageSettings
+from rig.stages.transport import NoTrafficLog, Port, TrafficLog
+
+type Firmware = SimulatedGrbl | SimulatedMarlin
+
+
+class Bench:
+    """A stage to try things on, without hardware and without waiting.
+
+    Driver and controller run in turns on one clock: when the driver waits for bytes, the simulated world goes on until
+    there are some or the wait is over. The bytes themselves go through `link`.
+
+    Parameters
+    ----------
+    firmware : callable
+        Makes the controller from a clock and a wire: `SimulatedGrbl`, `SimulatedMarlin`, or either with settings.
+    link : Link, optional
+        The cable; without it, one within the program.
+    resets_on_open : bool
+        Whether opening the port restarts the controller, as it does on most boards.
+    """
+
+    def __init__(
+        self,
+        firmware: Callable[[SimulatedClock, Wire], Firmware],
+        link: Link | None = None,
+        *,
+        resets_on_open: bool = True,
+    ) -> None:
+        self.clock = SimulatedClock()
+        self.wire = Wire(self.clock)
+        self.firmware = firmware(self.clock, self.wire)
+        self.link = link or DirectLink()
+        self.resets_on_open = resets_on_open
+
+    def open_port(self) -> Port:
+        """Open the host's end of the cable."""
+        port = self.link.open()
+        if self.resets_on_open:
+            self.firmware.restart()
+        self.wire.clear()
+        return SteppedPort(port, self)
+
+    def stage(self, settings: StageSettings | None = None, traffic: TrafficLog | None = None) -> Gantry:
+        """Return the driver for this controller, not yet connected.
+
+        Parameters
+        ----------
+        settings : StageSettings, optional
+            What to make of the stage; its protocol has to be the firmware's for anything to work.
+        traffic : TrafficLog, optional
+            Where every byte is recorded.
+        """
+        settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
+        return stage_from(settings, self.clock, traffic or NoTrafficLog(), self.open_port)
+
+    def true_position(self) -> Point:
+        """Return where the carriages really are, whatever the controller reports."""
+        return Point(*self.firmware.mechanics.true_mm())
+
+    def plug(self) -> None:
+        """Put the cable in; a controller powered by it starts."""
+        self.link.plug()
+        self.wire.connected = True
+        self.firmware.restart()
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        self.link.unplug()
+        self.wire.connected = False
+        self.wire.clear()
+
+
+class SteppedPort:
+    """A port on which time passes only while somebody waits for bytes."""
+
+    def __init__(self, port: Port, bench: Bench) -> None:
+        self._port = port
+        self._bench = bench
+
+    def write(self, data: bytes) -> None:
+        """Send `data` through the cable and let the controller have what arrives."""
+        self._port.write(data)
+        arrived = self._bench.link.receive(len(data))
+        self._bench.firmware.receive(self._bench.wire.to_controller(arrived))
+
+    def read(self, timeout_s: float) -> bytes:
+        """Let the world go on until bytes arrive through the cable, or `timeout_s` is over."""
+        bench = self._bench
+        deadline_s = bench.clock.now_s() + timeout_s
+        while not bench.wire.arrived():
+            if not bench.wire.connected:
+                return self._port.read(0.0)
+            if not bench.clock.step(deadline_s):
+                return b""
+        data = bench.wire.take()
+        bench.link.send(data)
+        received = b""
+        while len(received) < len(data):
+            received += self._port.read(1.0)
+        return received
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()

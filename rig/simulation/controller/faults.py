@@ -1,0 +1,239 @@
+"""Faults to order: what goes wrong with stages, each as a function that makes it happen on a bench, now.
+
+A fault strikes once and leaves the world as it would be: a byte is lost, a cable is out, an axis is stuck.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.simulation.controller.wire import Spoil
+from rig.stages.settings import ProtocolName
+
+type Nature = Literal["wire", "controller", "mechanics"]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that can go wrong.
+
+    Parameters
+    ----------
+    name : str
+        What to call it.
+    nature : str
+        Where it strikes. Faults of the mechanics show in no report: only a drift check finds them.
+    strike : callable
+        Makes it happen on a bench.
+    protocols : tuple of str
+        Controllers that know it.
+    """
+
+    name: str
+    nature: Nature
+    strike: Callable[[Bench], None]
+    protocols: tuple[ProtocolName, ...] = ("grbl", "marlin")
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def _drop(data: bytes) -> bytes:
+    return data[: len(data) // 2] + data[len(data) // 2 + 1 :]
+
+
+def _double(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[: middle + 1] + data[middle:]
+
+
+def _flip(data: bytes) -> bytes:
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 0x04]) + data[middle + 1 :] if data else data
+
+
+def _next_only(spoils: list[Spoil], spoil: Spoil, applies: Callable[[bytes], bool] = bool) -> None:
+    """Spoil the next bytes that `applies` holds for, and no others."""
+
+    def once(data: bytes) -> bytes:
+        if not applies(data):
+            return data
+        spoils.remove(once)
+        return spoil(data)
+
+    spoils.append(once)
+
+
+def _for_a_while(bench: Bench, spoils: list[Spoil], duration_s: float) -> None:
+    """Lose everything for `duration_s`."""
+
+    def nothing(data: bytes) -> bytes:
+        return b""
+
+    spoils.append(nothing)
+    bench.clock.after(duration_s, lambda: spoils.remove(nothing))
+
+
+def _to_controller(spoil: Spoil) -> Callable[[Bench], None]:
+    return lambda bench: _next_only(bench.wire.spoil_to_controller, spoil)
+
+
+def _to_host(spoil: Spoil) -> Callable[[Bench], None]:
+    return lambda bench: _next_only(bench.wire.spoil_to_host, spoil)
+
+
+def _lose_ok(bench: Bench) -> None:
+    _next_only(bench.wire.spoil_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
+
+
+def _mute(bench: Bench) -> None:
+    bench.wire.spoil_to_host.append(lambda data: b"")
+
+
+def _deaf(bench: Bench) -> None:
+    bench.wire.spoil_to_controller.append(lambda data: b"")
+
+
+def _babble(bench: Bench) -> None:
+    """Talk nonsense a hundred times a second for a minute."""
+    for line in range(6000):
+        bench.clock.after(0.01 * line, lambda: bench.firmware.say("<Jog|MPos:0.0"))
+
+
+def _answer_late(bench: Bench) -> None:
+    bench.wire.hold_up(1.0)
+
+
+def _restart_unseen(bench: Bench) -> None:
+    bench.firmware.restart()
+    _for_a_while(bench, bench.wire.spoil_to_host, bench.firmware.boot_s + 0.1)
+
+
+def _unplug_and_return(bench: Bench) -> None:
+    bench.unplug()
+    bench.clock.after(0.3, bench.plug)
+
+
+def _stick(bench: Bench) -> None:
+    bench.true_position()
+    bench.firmware.mechanics.axes[0].stuck = True
+
+
+def _stick_briefly(bench: Bench) -> None:
+    _stick(bench)
+
+    def free() -> None:
+        bench.true_position()
+        bench.firmware.mechanics.axes[0].stuck = False
+
+    bench.clock.after(2.0, free)
+
+
+def _lose_steps(axis: int, by_mm: float) -> Callable[[Bench], None]:
+    def strike(bench: Bench) -> None:
+        bench.true_position()
+        bench.firmware.mechanics.axes[axis].slip_mm += by_mm
+
+    return strike
+
+
+def _slow_homing(bench: Bench) -> None:
+    bench.firmware.homing_slowdown = 40.0
+
+
+def _never_end(bench: Bench) -> None:
+    bench.firmware.mechanics.endless = True
+
+
+def _push_by_pendant(bench: Bench) -> None:
+    """Somebody moves the stage by another control."""
+    x, y = bench.firmware.mechanics.commanded_mm()
+    inward = -3.0 if isinstance(bench.firmware, SimulatedGrbl) else 3.0
+    bench.firmware.mechanics.queue((x + inward, y + inward), 20.0, 500.0)
+
+
+def _grbl(act: Callable[[SimulatedGrbl], None]) -> Callable[[Bench], None]:
+    def strike(bench: Bench) -> None:
+        assert isinstance(bench.firmware, SimulatedGrbl)
+        act(bench.firmware)
+
+    return strike
+
+
+def _marlin(act: Callable[[SimulatedMarlin], None]) -> Callable[[Bench], None]:
+    def strike(bench: Bench) -> None:
+        assert isinstance(bench.firmware, SimulatedMarlin)
+        act(bench.firmware)
+
+    return strike
+
+
+def _alarm(code: int) -> Callable[[Bench], None]:
+    return _grbl(lambda firmware: firmware.alarm(code))
+
+
+def _early_idle(bench: Bench) -> None:
+    """One report says idle while the stage moves."""
+    _next_only(bench.wire.spoil_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
+
+
+def _lose_settings(firmware: SimulatedGrbl) -> None:
+    firmware.settings.update({130: "200.000", 131: "200.000", 22: "0"})
+    firmware.restart()
+
+
+def _damage_every_line(bench: Bench) -> None:
+    bench.wire.spoil_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
+
+
+_COMMON = (
+    Fault("byte to the controller lost", "wire", _to_controller(_drop)),
+    Fault("byte to the controller doubled", "wire", _to_controller(_double)),
+    Fault("bit to the controller flipped", "wire", _to_controller(_flip)),
+    Fault("byte to the host lost", "wire", _to_host(_drop)),
+    Fault("byte to the host doubled", "wire", _to_host(_double)),
+    Fault("bit to the host flipped", "wire", _to_host(_flip)),
+    Fault("line to the host doubled", "wire", _to_host(lambda data: data + data)),
+    Fault("ok lost", "wire", _lose_ok),
+    Fault("ok too many", "wire", lambda bench: bench.firmware.say("ok")),
+    Fault("noise", "wire", lambda bench: bench.wire.to_host(bytes(range(128, 256)) + b"\x00ok\x00\n")),
+    Fault("controller mute", "wire", _mute),
+    Fault("controller deaf", "wire", _deaf),
+    Fault("silence for a moment", "wire", lambda bench: _for_a_while(bench, bench.wire.spoil_to_host, 0.5)),
+    Fault("answers late", "wire", _answer_late),
+    Fault("babble", "wire", _babble),
+    Fault("every line damaged", "wire", _damage_every_line),
+    Fault("unplugged", "wire", Bench.unplug),
+    Fault("unplugged and back", "wire", _unplug_and_return),
+    Fault("restart", "controller", lambda bench: bench.firmware.restart()),
+    Fault("restart unseen", "controller", _restart_unseen),
+    Fault("busy for ever", "controller", _never_end),
+    Fault("slow homing", "controller", _slow_homing),
+    Fault("moved by pendant", "controller", _push_by_pendant),
+    Fault("axis stuck", "mechanics", _stick),
+    Fault("axis stuck for a moment", "mechanics", _stick_briefly),
+    Fault("steps lost towards the switch", "mechanics", _lose_steps(0, 0.8)),
+    Fault("steps lost the other way", "mechanics", _lose_steps(1, -0.8)),
+)
+_GRBL = (
+    *(Fault(f"alarm {code}", "controller", _alarm(code), ("grbl",)) for code in range(1, 10)),
+    Fault("hold button", "controller", _grbl(SimulatedGrbl.pause), ("grbl",)),
+    Fault("door open", "controller", _grbl(SimulatedGrbl.open_door), ("grbl",)),
+    Fault("idle told too early", "wire", _early_idle, ("grbl",)),
+    Fault("settings lost", "controller", _grbl(_lose_settings), ("grbl",)),
+)
+_MARLIN = (
+    Fault("killed", "controller", _marlin(lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)),
+    Fault("motors released", "mechanics", _marlin(SimulatedMarlin.release_motors), ("marlin",)),
+)
+
+FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
+"""Everything that can be made to go wrong."""
+
+
+def faults_of(protocol: ProtocolName) -> tuple[Fault, ...]:
+    """Return the faults that a controller of `protocol` can have."""
+    return tuple(fault for fault in FAULTS if protocol in fault.protocols)

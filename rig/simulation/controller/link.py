@@ -1,0 +1,212 @@
+"""What lies between the driver and the simulated controller: nothing, a pseudo-terminal, or a socket.
+
+The last two pass every byte through pyserial and the operating system, as with real hardware.
+"""
+
+import os
+import socket
+import tempfile
+import tty
+from pathlib import Path
+from typing import Protocol
+
+from rig.errors import StageLost
+from rig.stages.transport import Port, SerialPort
+
+_REAL_BOUND_S = 10.0
+
+
+class Link(Protocol):
+    """A cable from the host's port to the controller's."""
+
+    @property
+    def url(self) -> str:
+        """What the driver opens."""
+        ...
+
+    def open(self) -> Port:
+        """Open the host's end."""
+        ...
+
+    def receive(self, count: int) -> bytes:
+        """Return `count` bytes that the host has written."""
+        ...
+
+    def send(self, data: bytes) -> None:
+        """Write bytes for the host to read."""
+        ...
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        ...
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        ...
+
+
+class DirectLink:
+    """A cable within the program, for simulations that need no operating system."""
+
+    url = "simulated:"
+
+    def __init__(self) -> None:
+        self._plugged = True
+        self._written, self._readable = bytearray(), bytearray()
+
+    def open(self) -> Port:
+        """Return this end of the cable."""
+        self._require_plug()
+        self._written.clear()
+        self._readable.clear()
+        return self
+
+    def write(self, data: bytes) -> None:
+        """Send `data` to the controller."""
+        self._require_plug()
+        self._written += data
+
+    def read(self, timeout_s: float) -> bytes:
+        """Return what the controller has sent."""
+        self._require_plug()
+        data = bytes(self._readable)
+        self._readable.clear()
+        return data
+
+    def close(self) -> None:
+        """Give this end back."""
+
+    def receive(self, count: int) -> bytes:
+        """Return `count` bytes that the host has written."""
+        data = bytes(self._written[:count])
+        del self._written[:count]
+        return data
+
+    def send(self, data: bytes) -> None:
+        """Write bytes for the host to read."""
+        self._readable += data
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        self._plugged = True
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        self._plugged = False
+
+    def _require_plug(self) -> None:
+        """Fail as a port does whose cable is out."""
+        if not self._plugged:
+            raise StageLost("simulated: the connection is gone (unplugged); check cable and power")
+
+
+class PtyLink:
+    """A pseudo-terminal: to the driver, a serial port like any other.
+
+    The name of the port is a symbolic link, so that it stays the same when the cable is put in again.
+    """
+
+    def __init__(self) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="faintfield-stage-")
+        self.url = str(Path(self._folder.name) / "tty")
+        self._far = -1
+        self.plug()
+
+    def open(self) -> Port:
+        """Open the host's end with pyserial."""
+        return SerialPort(self.url, 115200)
+
+    def receive(self, count: int) -> bytes:
+        """Return `count` bytes that the host has written."""
+        data = b""
+        while len(data) < count:
+            data += os.read(self._far, count - len(data))
+        return data
+
+    def send(self, data: bytes) -> None:
+        """Write bytes for the host to read."""
+        os.write(self._far, data)
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        if self._far >= 0:
+            return
+        self._far, near = os.openpty()
+        tty.setraw(near)
+        Path(self.url).unlink(missing_ok=True)
+        Path(self.url).symlink_to(os.ttyname(near))
+        os.close(near)
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        if self._far >= 0:
+            os.close(self._far)
+            self._far = -1
+            Path(self.url).unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Remove the port."""
+        self.unplug()
+        self._folder.cleanup()
+
+
+class SocketLink:
+    """A TCP connection on this computer, which pyserial opens by `socket://`, as to a serial device server."""
+
+    def __init__(self) -> None:
+        self._listener: socket.socket | None = None
+        self._far: socket.socket | None = None
+        self._address = ("127.0.0.1", 0)
+        self.plug()
+
+    @property
+    def url(self) -> str:
+        """What the driver opens."""
+        host, port = self._address
+        return f"socket://{host}:{port}"
+
+    def open(self) -> Port:
+        """Open the host's end with pyserial."""
+        port = SerialPort(self.url, 115200)
+        if self._listener is not None:
+            self._hang_up()
+            self._far, _ = self._listener.accept()
+            self._far.settimeout(_REAL_BOUND_S)
+            self._far.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return port
+
+    def receive(self, count: int) -> bytes:
+        """Return `count` bytes that the host has written."""
+        data = b""
+        while self._far is not None and len(data) < count:
+            data += self._far.recv(count - len(data))
+        return data
+
+    def send(self, data: bytes) -> None:
+        """Write bytes for the host to read."""
+        if self._far is not None:
+            self._far.sendall(data)
+
+    def plug(self) -> None:
+        """Put the cable in."""
+        if self._listener is None:
+            self._listener = socket.create_server(self._address, reuse_port=True)
+            self._listener.settimeout(_REAL_BOUND_S)
+            self._address = self._listener.getsockname()[:2]
+
+    def unplug(self) -> None:
+        """Pull the cable out."""
+        self._hang_up()
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.unplug()
+
+    def _hang_up(self) -> None:
+        """End the connection there is."""
+        if self._far is not None:
+            self._far.close()
+            self._far = None

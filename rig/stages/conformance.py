@@ -1,0 +1,137 @@
+"""What a stage must show before it is trusted with a capture, tried on the stage itself."""
+
+import math
+from collections.abc import Iterator
+
+from msgspec import Struct
+
+from rig.errors import OutsideTravel, PlanRefused, PositionDrifted
+from rig.stages.drift import DriftWatch
+from rig.stages.gantry import Gantry
+from rig.stages.motion import path_duration_s
+from rig.stages.protocol import Point
+
+_SLOWEST_REPORTS_PER_S = 4.0
+_REPORTS = 10
+
+
+class Check(Struct, frozen=True):
+    """One thing that was tried.
+
+    Parameters
+    ----------
+    name : str
+        What was tried.
+    passed : bool
+        Whether it came out as it must.
+    measured, limit : str
+        What was found and what is asked for, with units.
+    """
+
+    name: str
+    passed: bool
+    measured: str
+    limit: str
+
+
+def conformance(stage: Gantry) -> Iterator[Check]:
+    """Try a connected stage, and yield each check as it is done.
+
+    The stage homes and moves within 40 % of its travel around the middle.
+
+    Raises
+    ------
+    StageError
+        The stage failed in a way that leaves nothing to try.
+    """
+    yield _settings(stage)
+    yield _homing(stage)
+    yield _limits(stage)
+    yield _speed(stage)
+    yield _arrival(stage)
+    yield _report_rate(stage)
+    yield _repeatability(stage)
+
+
+def _settings(stage: Gantry) -> Check:
+    """Check that no setting should be changed."""
+    warnings = stage.identify().warnings
+    return Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
+
+
+def _homing(stage: Gantry) -> Check:
+    """Check that homing ends well within its bound."""
+    bound_s = stage.identify().homing_bound_s
+    taken_s = stage.home().duration_s
+    return Check("homing", taken_s < bound_s / 1.5, f"{taken_s:.1f} s", f"< {bound_s / 1.5:.0f} s")
+
+
+def _limits(stage: Gantry) -> Check:
+    """Check that a position outside the travel is refused and nothing moves."""
+    travel, before = stage.travel(), stage.position()
+    try:
+        stage.move_to(travel.x_mm[1] + 10.0, travel.y_mm[1] + 10.0)
+    except OutsideTravel:
+        stayed = stage.verify_at(*before.point) == before
+        return Check("limits", stayed, "refused, nothing moved" if stayed else "refused, but moved", "refused")
+    return Check("limits", False, "went outside the travel", "refused")
+
+
+def _speed(stage: Gantry) -> Check:
+    """Check that a long motion takes as long as the controller's own settings say."""
+    low, high = _corners(stage)
+    stage.move_to(*low)
+    predicted_s = path_duration_s((low, high), stage.identify().motion, stage.feed_mm_per_s())
+    started_s = stage.clock.now_s()
+    stage.move_to(*high)
+    taken_s = stage.clock.now_s() - started_s
+    limit_s = 1.25 * predicted_s + 0.5
+    return Check(
+        "speed", taken_s <= limit_s, f"{math.dist(low, high):.0f} mm in {taken_s:.2f} s", f"<= {limit_s:.2f} s"
+    )
+
+
+def _arrival(stage: Gantry) -> Check:
+    """Check that one place is reached alike from all sides."""
+    low, high = _corners(stage)
+    middle = Point(0.5 * (low.x_mm + high.x_mm), 0.5 * (low.y_mm + high.y_mm))
+    reports = []
+    for corner in (low, high, Point(low.x_mm, high.y_mm), Point(high.x_mm, low.y_mm)):
+        stage.move_to(*corner)
+        reports.append(stage.move_to(*middle).point)
+    spread_mm = max(math.dist(a, b) for a in reports for b in reports)
+    limit_mm = max(stage.identify().tolerance_mm)
+    return Check("arrival", spread_mm <= limit_mm, f"{spread_mm:.4f} mm spread", f"<= {limit_mm:.4f} mm")
+
+
+def _report_rate(stage: Gantry) -> Check:
+    """Check that positions are told often enough to watch a motion."""
+    started_s = stage.clock.now_s()
+    for _ in range(_REPORTS):
+        stage.position()
+    rate = _REPORTS / (stage.clock.now_s() - started_s)
+    return Check("report rate", rate >= _SLOWEST_REPORTS_PER_S, f"{rate:.1f} /s", f">= {_SLOWEST_REPORTS_PER_S:.0f} /s")
+
+
+def _repeatability(stage: Gantry) -> Check:
+    """Check by homing again that the way from the switches and back loses no steps."""
+    watch = DriftWatch(stage)
+    try:
+        watch.begin()
+        for corner in _corners(stage):
+            watch.visited(stage.move_to(*corner))
+        drift = watch.check()
+    except (PositionDrifted, PlanRefused) as failure:
+        return Check("repeatability", False, str(failure), "no drift")
+    worst_mm = max(map(abs, drift.away_mm))
+    return Check("repeatability", True, f"{worst_mm:.2f} mm", f"<= {drift.limit_mm:g} mm")
+
+
+def _corners(stage: Gantry) -> tuple[Point, Point]:
+    """Return the lower and upper corner of the middle 40 % of the travel."""
+    travel = stage.travel()
+    low, high = (
+        Point(*(a + share * (b - a) for a, b in (travel.x_mm, travel.y_mm)))  # the same share of each axis
+        for share in (0.3, 0.7)
+    )
+    return low, high

@@ -1,0 +1,63 @@
+"""How long motions take, and the way to a position that is always reached from the same side."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+from rig.stages.protocol import MotionLimits, Point
+
+
+def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
+    """Return the time of a straight motion from rest to rest.
+
+    The speed along the line is the highest that keeps every axis within its own rate, likewise the acceleration. A
+    motion of length d at speed v and acceleration a takes d/v + v/a, or 2 sqrt(d/a) when it is too short to reach v.
+
+    Parameters
+    ----------
+    start, end : Point
+        Where the motion begins and ends.
+    motion : MotionLimits
+        Rates and accelerations of the axes.
+    feed_mm_per_s : float
+        Speed asked for along the line.
+    """
+    length_mm = math.dist(start, end)
+    if length_mm == 0.0:
+        return 0.0
+    direction = [abs(b - a) / length_mm for a, b in zip(start, end, strict=True)]
+    speed = min(feed_mm_per_s, _along(direction, motion.rate_mm_per_s))
+    acceleration = _along(direction, motion.acceleration_mm_per_s2)
+    if length_mm < speed**2 / acceleration:
+        return 2.0 * math.sqrt(length_mm / acceleration)
+    return length_mm / speed + speed / acceleration
+
+
+def path_duration_s(path: Sequence[Point], motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
+    """Return the time along `path`, with a stop at each of its points."""
+    return sum(duration_s(start, end, motion, feed_mm_per_s) for start, end in pairwise(path))
+
+
+def one_sided(start: Point, target: Point, approach_mm: float) -> tuple[Point, ...]:
+    """Return the points to go through so that no axis reaches `target` downwards.
+
+    Screws and belts have play: the carriage stops at a different place when it comes from the other side. An axis
+    that would arrive from above goes `approach_mm` past its target first and comes back up.
+
+    Returns
+    -------
+    tuple of Point
+        `target` alone, or a turning point and `target`.
+    """
+    turn = Point(*(b - approach_mm if b < a else b for a, b in zip(start, target, strict=True)))
+    return (target,) if turn == target else (turn, target)
+
+
+def bound_s(predicted_s: float) -> float:
+    """Return how long to wait for something that should take `predicted_s`, before it counts as failed."""
+    return 1.5 * predicted_s + 2.0
+
+
+def _along(direction: Sequence[float], limits: tuple[float, float]) -> float:
+    """Return the largest rate along `direction` that keeps each axis within its limit."""
+    return min(limit / share for limit, share in zip(limits, direction, strict=True) if share > 0.0)

@@ -1,0 +1,52 @@
+"""The `[stage]` table of rig.toml, and the stage that it describes."""
+
+from typing import Literal
+
+from msgspec import Struct
+
+from rig.stages.protocol import Box
+
+type ProtocolName = Literal["grbl", "marlin", "simulated"]
+
+
+class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """How the stage is connected and what it may do.
+
+    Parameters
+    ----------
+    protocol : str
+        What its controller speaks; `simulated` needs no port and no hardware.
+    port : str
+        Serial device or pyserial URL, such as `socket://127.0.0.1:7000`.
+    baud : int
+        Bits per second.
+    axes : (str, str)
+        The controller's letters for the two axes of the grid, columns first.
+    feed_mm_per_min : float, optional
+        Speed of motions; without it, the slower axis's own highest rate.
+    approach_mm : float
+        How far past a position an axis goes before it arrives from below. More than the play of the drive.
+    travel_mm : Box, optional
+        Where the stage may go, if that is less than the controller allows, or the controller does not know.
+    keep_out : tuple of Box
+        What the stage must neither reach nor cross.
+    """
+
+    protocol: ProtocolName
+    port: str = ""
+    baud: int = 115200
+    axes: tuple[str, str] = ("X", "Y")
+    feed_mm_per_min: float | None = None
+    approach_mm: float = 2.0
+    travel_mm: Box | None = None
+    keep_out: tuple[Box, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.port and self.protocol != "simulated":
+            raise ValueError("stage.port is missing; give the serial device, such as /dev/ttyUSB0")
+        if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
+            raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
+        if self.approach_mm < 0.0:
+            raise ValueError(f"stage.approach_mm must not be negative; got {self.approach_mm:g}")
+        if self.feed_mm_per_min is not None and not self.feed_mm_per_min > 0.0:
+            raise ValueError(f"stage.feed_mm_per_min must be positive; got {self.feed_mm_per_min:g}")

@@ -1,0 +1,139 @@
+"""`faintfield stage` on simulated stages: results on standard output, words on standard error, exit codes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines import cli
+
+RIG = """
+[stage]
+protocol = "grbl"
+port = "simulated:grbl"
+[stage.travel_mm]
+x_mm = [-300, 0]
+y_mm = [-300, 0]
+[[stage.keep_out]]
+x_mm = [-110, -90]
+y_mm = [-110, -90]
+[camera]
+backend = "simulated"
+"""
+
+
+class Shell:
+    """Runs commands and keeps what they printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+        self.words = ""
+
+    def run(self, *arguments: str) -> int:
+        code = cli.run(["stage", *arguments])
+        self.output, self.words = self._capsys.readouterr()
+        return code
+
+    def result(self, *arguments: str) -> Any:
+        assert self.run(*arguments, "--json") == 0
+        return json.loads(self.output)
+
+
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str]) -> Shell:
+    return Shell(capsys)
+
+
+@pytest.mark.parametrize("stage", ["grbl", "marlin"])
+def test_info(shell: Shell, stage: str) -> None:
+    identity = shell.result("info", "--port", f"simulated:{stage}")
+    assert stage in identity["firmware"].lower()
+    assert identity["settings"]
+    assert shell.run("info", "--port", f"simulated:{stage}") == 0
+    assert shell.output == ""
+    assert "travel [" in shell.words
+
+
+@pytest.mark.parametrize("stage", ["grbl", "marlin"])
+def test_home(shell: Shell, stage: str) -> None:
+    assert shell.result("home", "--port", f"simulated:{stage}")["trusted"] is True
+
+
+def test_goto_needs_homing(shell: Shell) -> None:
+    assert shell.run("goto", "-100", "-100", "--port", "simulated:grbl") == 1
+    assert "NotHomed" in shell.words
+    position = shell.result("goto", "-100", "-120.5", "--home", "--port", "simulated:grbl")
+    assert position["point"] == [-100.0, -120.5]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("goto", "5", "5", "--home"), "OutsideTravel"),
+        (("jog", "1", "1"), "StageAlarm"),
+        (("jog", "50", "0", "--unlock"), "OutsideTravel"),
+        (("home", "--port", "/dev/no-such-port"), "StageLost"),
+        (("home", "--port", "simulated:plotter"), "PlanRefused"),
+        (("home", "--rig", "no-such.toml"), "MissingFile"),
+    ],
+)
+def test_failures_are_one_line_with_a_name(shell: Shell, arguments: tuple[str, ...], named: str) -> None:
+    port = () if {"--port", "--rig"} & set(arguments) else ("--port", "simulated:grbl")
+    assert shell.run(*arguments, *port) == 1
+    assert shell.words.count("\n") == 1
+    assert shell.words.startswith(f"faintfield: {named}: ")
+    assert "; " in shell.words
+
+
+def test_a_stage_has_to_be_named(shell: Shell) -> None:
+    assert shell.run("info") == 1
+    assert "give --port" in shell.words
+
+
+def test_wrong_usage(shell: Shell) -> None:
+    assert shell.run("goto", "far", "away", "--port", "simulated:grbl") == 2
+    assert shell.run("info", "--protocol", "klipper", "--port", "x") == 2
+
+
+def test_jog(shell: Shell) -> None:
+    position = shell.result("jog", "-1", "-2", "--unlock", "--port", "simulated:grbl")
+    assert position["point"] == [-1.0, -2.0]
+    assert position["trusted"] is False
+
+
+@pytest.mark.parametrize("stage", ["grbl", "marlin"])
+def test_the_conformance_list(shell: Shell, stage: str) -> None:
+    checks = shell.result("test", "--port", f"simulated:{stage}")
+    assert [check["name"] for check in checks] == [
+        "settings", "homing", "limits", "speed", "arrival", "report rate", "repeatability",
+    ]  # fmt: skip
+    assert all(check["passed"] for check in checks)
+    assert "repeatability" in shell.words
+
+
+def test_a_rig_file_brings_its_limits(shell: Shell, tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text(RIG)
+    assert shell.run("goto", "-350", "-50", "--home", "--rig", str(rig)) == 1
+    assert "OutsideTravel" in shell.words
+    assert shell.run("goto", "-150", "-150", "--home", "--rig", str(rig)) == 1
+    assert "KeepOutCrossed" in shell.words
+    assert shell.run("goto", "-50", "-150", "--home", "--rig", str(rig)) == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("port =", "prot =", "UnknownKey"),
+        ('"grbl"\n', '"klipper"\n', "BadValue"),
+        ("[-300, 0]", "[0, -300]", "BadValue"),
+        ("[stage]", "[stage", "BadValue"),
+    ],
+)
+def test_mistakes_in_a_rig_file_are_named(shell: Shell, tmp_path: Path, old: str, new: str, named: str) -> None:
+    rig = tmp_path / "rig.toml"
+    rig.write_text(RIG.replace(old, new, 1))
+    assert shell.run("info", "--rig", str(rig)) == 1
+    assert named in shell.words
+    assert str(rig) in shell.words

@@ -1,0 +1,168 @@
+"""The simulated controllers answer as the real ones do: tests of the tester, line by line."""
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.simulation.controller.server import serving
+from rig.simulation.controller.wire import Wire
+from rig.stages.transport import SerialPort
+
+
+class Terminal:
+    """A person at the keyboard."""
+
+    def __init__(self, firmware: type[SimulatedGrbl] | type[SimulatedMarlin], **options: Any) -> None:
+        self.clock = SimulatedClock()
+        self.wire = Wire(self.clock)
+        self.firmware = firmware(self.clock, self.wire, **options)
+        self.greeting = self.wait(2.0)
+
+    def wait(self, duration_s: float) -> list[str]:
+        self.clock.sleep_s(duration_s)
+        return self.wire.take().decode().split("\n")[:-1]
+
+    def type(self, data: bytes, wait_s: float = 0.1) -> list[str]:
+        self.firmware.receive(data)
+        return [line.strip() for line in self.wait(wait_s)]
+
+
+def homed_grbl() -> Terminal:
+    terminal = Terminal(SimulatedGrbl)
+    assert terminal.type(b"$H\n", 120.0) == ["ok"]
+    return terminal
+
+
+def test_grbl_starts_locked() -> None:
+    terminal = Terminal(SimulatedGrbl)
+    assert [line.strip() for line in terminal.greeting] == ["Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
+    assert terminal.type(b"$J=G91X1F100\n") == ["error:9"]
+    assert terminal.type(b"?")[0].startswith("<Alarm|MPos:0.000,0.000,0.000")
+    assert terminal.type(b"$X\n") == ["[MSG:Caution: Unlocked]", "ok"]
+
+
+def test_grbl_ok_means_parsed_not_moved() -> None:
+    terminal = homed_grbl()
+    assert terminal.type(b"$J=G90X-100F6000\n") == ["ok"]
+    assert terminal.type(b"?")[0].startswith("<Jog|MPos:")
+    terminal.wait(3.0)
+    assert terminal.type(b"?")[0].startswith("<Idle|MPos:-100.000,-1.000,0.000")
+
+
+def test_grbl_answers_nothing_while_homing() -> None:
+    terminal = Terminal(SimulatedGrbl)
+    assert terminal.type(b"$H\n", 1.0) == []
+    assert terminal.type(b"?") == []
+    assert terminal.wait(120.0) == ["ok\r"]
+
+
+@pytest.mark.parametrize(
+    ("line", "answer"),
+    [
+        (b"$J=X1F100\n", "error:15"),
+        (b"$J=X-10\n", "error:22"),
+        (b"$J=X-10F100M3\n", "error:16"),
+        (b"$J=F100\n", "error:16"),
+        (b"$Z\n", "error:3"),
+        (b"G4P1\n", "error:20"),
+        (b"x" * 81 + b"\n", "error:11"),
+        (b"\n", "ok"),
+    ],
+)
+def test_grbl_refuses(line: bytes, answer: str) -> None:
+    assert homed_grbl().type(line) == [answer]
+
+
+def test_grbl_after_a_critical_alarm_hears_only_a_reset_that_is_not_too_early() -> None:
+    terminal = homed_grbl()
+    terminal.firmware.receive(b"G53G0X10\n")
+    terminal.firmware.receive(b"\x18")  # too early
+    assert [line.strip() for line in terminal.wait(1.0)][:2] == ["ALARM:2", "ok"]
+    assert terminal.type(b"?") == []
+    assert terminal.type(b"$$\n") == []
+    assert terminal.type(b"\x18") == ["Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
+
+
+def test_grbl_reset_in_motion_is_alarm_3_and_at_rest_is_none() -> None:
+    terminal = homed_grbl()
+    assert terminal.type(b"\x18") == ["Grbl 1.1h ['$' for help]"]
+    terminal.type(b"$J=G90X-300F6000\n", 0.5)
+    assert terminal.type(b"\x18")[0] == "ALARM:3"
+
+
+def test_grbl_tells_the_work_offset_now_and_then() -> None:
+    terminal = Terminal(SimulatedGrbl, settings={10: "0"})
+    terminal.type(b"$H\n", 120.0)
+    reports = [terminal.type(b"?")[0] for _ in range(30)]
+    with_offset = [index for index, report in enumerate(reports) if "WCO" in report]
+    assert 2 <= len(with_offset) <= 4
+    assert all("WPos" in report for report in reports)
+
+
+def test_grbl_keeps_its_settings_through_a_restart() -> None:
+    terminal = homed_grbl()
+    terminal.type(b"$110=1234\n")
+    terminal.firmware.restart()
+    terminal.wait(2.0)
+    assert "$110=1234" in terminal.type(b"$$\n", 1.0)
+
+
+def test_marlin_asks_again_for_damaged_lines() -> None:
+    terminal = Terminal(SimulatedMarlin)
+    assert terminal.greeting[0] == "start"
+    assert terminal.type(b"N0 M110 N0*125\n") == ["ok"]
+    assert terminal.type(b"N1 G21*26\n") == ["Error:checksum mismatch, Last Line: 0", "Resend: 1", "ok"]
+    assert terminal.type(b"N1 G21*27\n") == ["ok"]
+    assert terminal.type(b"N1 G21*27\n")[0] == "Error:Line Number is not Last Line Number+1, Last Line: 1"
+    assert terminal.type(b"N2 G21\n")[1] == "Resend: 2"
+
+
+def test_marlin_is_busy_while_it_waits_and_projects_positions() -> None:
+    terminal = Terminal(SimulatedMarlin)
+    assert terminal.type(b"G28\n", 60.0)[-1] == "ok"
+    assert terminal.type(b"G1 X300 F3000\n") == ["ok"]
+    assert terminal.type(b"M114\n")[0].startswith("X:300.00")
+    assert not terminal.type(b"M114 R\n")[0].startswith("X:300.00")
+    assert terminal.type(b"M400\n", 10.0) == ["echo:busy: processing", "echo:busy: processing", "ok"]
+
+
+def test_marlin_clips_targets_and_lets_its_motors_go() -> None:
+    terminal = Terminal(SimulatedMarlin)
+    terminal.type(b"G28\n", 60.0)
+    terminal.type(b"G1 X900 F6000\n", 20.0)
+    assert terminal.firmware.mechanics.true_mm()[0] == 400.0
+    terminal.wait(119.0)
+    assert terminal.firmware.mechanics.true_mm() == (401.0, 1.0)
+
+
+@settings(deadline=None, max_examples=200)
+@given(st.lists(st.binary(max_size=40), max_size=8))
+@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
+def test_no_bytes_crash_a_controller(firmware: type[SimulatedGrbl] | type[SimulatedMarlin], typed: list[bytes]) -> None:
+    terminal = Terminal(firmware)
+    for data in typed:
+        terminal.type(data)
+
+
+@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
+def test_a_served_controller_answers_whoever_opens_its_port(
+    firmware: type[SimulatedGrbl] | type[SimulatedMarlin],
+) -> None:
+    with serving(firmware) as server:
+        port = SerialPort(server.port, 115200)
+        heard = b""
+        for turn in range(10_000):
+            if turn == 200:
+                port.write(b"?\nM115\n")
+            server.turn(0.01 * turn)
+            heard += port.read(0.0)
+            if b"FIRMWARE_NAME" in heard or b"<Alarm|" in heard:
+                break
+        else:
+            pytest.fail(f"heard only {heard!r}")
+        port.close()

@@ -1,0 +1,111 @@
+"""The simulated mechanics obey their own physics: tests of the tester."""
+
+import pytest
+
+from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.controller.kinematics import Axis, Mechanics
+
+
+def mechanics(clock: SimulatedClock, play_mm: float = 0.0) -> Mechanics:
+    axes = (Axis(-2.0, 405.0, 0.0, play_mm), Axis(-2.0, 405.0, 0.0, play_mm))
+    return Mechanics(clock, axes, 0.0125, (0.0, 0.0), switch_at_high_end=False)
+
+
+def test_the_clock_jumps_from_event_to_event() -> None:
+    clock = SimulatedClock()
+    seen: list[tuple[str, float]] = []
+    clock.after(2.0, lambda: seen.append(("late", clock.now_s())))
+    clock.after(1.0, lambda: seen.append(("early", clock.now_s())))
+    clock.after(1.5, lambda: seen.append(("never", clock.now_s()))).cancel()
+    assert clock.next_event_s() == 1.0
+    clock.sleep_s(1.2)
+    assert clock.now_s() == 1.2
+    clock.sleep_s(5.0)
+    assert seen == [("early", 1.0), ("late", 2.0)]
+    assert clock.next_event_s() is None
+
+
+def test_half_way_a_motion_is_half_done_and_at_full_speed() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((50.0, 0.0), 100.0, 500.0)
+    clock.sleep_s(0.35)
+    assert stage.commanded_mm() == pytest.approx((25.0, 0.0))
+    assert stage.moving
+    clock.sleep_s(0.36)
+    assert stage.true_mm() == (50.0, 0.0)
+    assert not stage.moving
+
+
+def test_braking_takes_the_way_that_physics_says() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((300.0, 0.0), 100.0, 500.0)
+    clock.sleep_s(1.0)
+    here = stage.commanded_mm()[0]
+    stage.brake()
+    clock.sleep_s(0.19)
+    assert stage.moving
+    clock.sleep_s(0.02)
+    assert not stage.moving
+    assert stage.true_mm()[0] == pytest.approx(here + 100.0**2 / (2 * 500.0), abs=0.0125)
+
+
+def test_positions_are_whole_steps() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((33.3333, 7.77), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    x, y = stage.true_mm()
+    assert (x / 0.0125, y / 0.0125) == pytest.approx((round(x / 0.0125), round(y / 0.0125)))
+    assert (x, y) == pytest.approx((33.3333, 7.77), abs=0.00626)
+
+
+def test_play_leaves_the_carriage_behind_on_the_way_down() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock, play_mm=0.3)
+    for target, true in ((50.0, 50.0), (30.0, 30.3), (30.2, 30.3), (31.0, 31.0)):
+        stage.queue((target, 0.0), 100.0, 500.0)
+        clock.sleep_s(5.0)
+        assert stage.true_mm()[0] == pytest.approx(true, abs=0.0126)
+
+
+def test_a_carriage_cannot_leave_its_travel_and_loses_steps_instead() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((410.0, 0.0), 100.0, 500.0)
+    clock.sleep_s(10.0)
+    assert stage.true_mm()[0] == 405.0
+    stage.queue((400.0, 0.0), 100.0, 500.0)
+    clock.sleep_s(10.0)
+    assert stage.true_mm()[0] == pytest.approx(395.0)
+
+
+def test_a_switch_is_met_when_the_carriage_is_there() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((50.0, 50.0), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    met: list[float] = []
+    stage.on_switch = lambda: met.append(stage.true_mm()[0])
+    assert stage.switches() == (False, False)
+    stage.axes[0].slip_mm = -20.0
+    stage.queue((10.0, 50.0), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    assert met == [pytest.approx(0.0, abs=1e-6)]
+
+
+def test_a_stuck_axis_keeps_its_place_and_goes_on_from_there() -> None:
+    clock = SimulatedClock()
+    stage = mechanics(clock)
+    stage.queue((50.0, 50.0), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    stage.axes[0].stuck = True
+    stage.queue((80.0, 80.0), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    assert stage.true_mm() == (50.0, 80.0)
+    assert stage.commanded_mm() == (80.0, 80.0)
+    stage.axes[0].stuck = False
+    stage.queue((90.0, 80.0), 100.0, 500.0)
+    clock.sleep_s(5.0)
+    assert stage.true_mm()[0] == pytest.approx(60.0)

@@ -1,0 +1,151 @@
+"""Lost steps are found by homing again, and what was visited before stays doubtful."""
+
+from functools import partial
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from rig.errors import NotHomed, PlanRefused, PositionDrifted, StageAlarm
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.stages.drift import DriftWatch
+from rig.stages.gantry import Gantry
+from rig.stages.recovery import recover
+
+type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
+
+CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
+
+
+def watched(bench: Bench, limit_mm: float = 0.5) -> tuple[Gantry, DriftWatch]:
+    stage = bench.stage()
+    stage.connect()
+    watch = DriftWatch(stage, limit_mm=limit_mm)
+    watch.begin()
+    return stage, watch
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_good_stage_passes_again_and_again(controller: Controller) -> None:
+    stage, watch = watched(Bench(controller))
+    for number in range(3):
+        stage.move_to(*_middle(stage))
+        watch.visited(number)
+        assert watch.check().passed
+        assert watch.unchecked == ()
+    assert watch.doubtful == ()
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 1), st.floats(-8.0, 8.0))
+def test_any_drift_beyond_the_limit_is_found_and_none_within(controller: Controller, axis: int, by_mm: float) -> None:
+    assume(not 0.45 < abs(by_mm) < 0.55)
+    bench = Bench(controller)
+    stage, watch = watched(bench)
+    stage.move_to(*_middle(stage))
+    watch.visited("frame")
+    bench.firmware.mechanics.axes[axis].slip_mm += by_mm
+    if abs(by_mm) < 0.5:
+        watch.check()
+        return
+    with pytest.raises(PositionDrifted) as caught:
+        watch.check()
+    assert caught.value.suspect == ("frame",)
+    assert watch.doubtful == ("frame",)
+    assert watch.unchecked == ()
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_only_what_came_after_the_last_good_check_is_doubtful(controller: Controller) -> None:
+    bench = Bench(controller)
+    stage, watch = watched(bench)
+    watch.visited("early")
+    watch.check()
+    watch.visited("late")
+    bench.firmware.mechanics.axes[0].slip_mm += 2.0
+    with pytest.raises(PositionDrifted):
+        watch.check()
+    assert watch.doubtful == ("late",)
+    stage.recover()
+    stage.home()
+    watch.begin()
+    watch.visited("again")
+    watch.check()
+    assert watch.doubtful == ("late",)
+
+
+def test_without_a_beginning_nothing_is_vouched_for() -> None:
+    stage = Bench(SimulatedGrbl).stage()
+    stage.connect()
+    stage.home()
+    watch = DriftWatch(stage)
+    watch.visited("frame")
+    with pytest.raises(PlanRefused, match="begin the watch first"):
+        watch.check()
+    assert watch.unchecked == ("frame",)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_disturbance_while_homing_was_timed_is_found_at_once(controller: Controller) -> None:
+    bench = Bench(controller)
+    stage = bench.stage()
+    stage.connect()
+    stage.home()
+    homings: list[bool] = []
+
+    def late_on_the_third(data: bytes) -> bytes:
+        if b"$H" in data or b"G28" in data:
+            homings.append(True)
+            if len(homings) == 3:
+                bench.clock.after(1.0, lambda: bench.wire.hold_up(8.0))
+        return data
+
+    bench.wire.spoil_to_controller.append(late_on_the_third)
+    with pytest.raises(PositionDrifted):
+        DriftWatch(stage).begin()
+
+
+def test_limits_that_cannot_be_kept_are_refused() -> None:
+    with pytest.raises(PlanRefused, match=r"resolves 0\.40 mm"):
+        watched(Bench(SimulatedMarlin), limit_mm=0.1)
+    with pytest.raises(PlanRefused, match="pull off farther"):
+        watched(Bench(SimulatedGrbl), limit_mm=1.0)
+    with pytest.raises(PlanRefused, match="resolves"):
+        watched(Bench(partial(SimulatedGrbl, settings={25: "6000.000"})))
+
+
+def test_recovery_homes_only_when_agreed_to_and_leaves_the_unchecked_doubtful() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage, watch = watched(bench)
+    watch.visited("frame")
+    assert isinstance(bench.firmware, SimulatedGrbl)
+    bench.firmware.alarm(3)
+    with pytest.raises(StageAlarm):
+        stage.position()
+    before = bench.true_position()
+    with pytest.raises(NotHomed, match="declined"):
+        recover(stage, lambda question: False, watch)
+    assert bench.true_position() == before
+    assert watch.unchecked == ("frame",)
+    recover(stage, lambda question: "Home it now?" in question, watch)
+    assert stage.trusted
+    assert watch.doubtful == ("frame",)
+
+
+def test_recovery_that_keeps_the_position_asks_nothing() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage, watch = watched(bench)
+    watch.visited("frame")
+    bench.firmware.receive(b"G53 G0 X10\n")
+    with pytest.raises(StageAlarm, match="ALARM:2"):
+        stage.position()
+    recover(stage, lambda question: pytest.fail("asked"), watch)
+    assert watch.unchecked == ("frame",)
+
+
+def _middle(stage: Gantry) -> tuple[float, float]:
+    travel = stage.travel()
+    return 0.5 * sum(travel.x_mm), 0.5 * sum(travel.y_mm)

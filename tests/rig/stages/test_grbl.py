@@ -1,0 +1,396 @@
+"""What is peculiar to GRBL, on a simulated controller: each trap of the protocol, and the driver's way around it."""
+
+from functools import partial
+from itertools import pairwise
+
+import pytest
+
+from rig.errors import (
+    NotHomed,
+    OutsideTravel,
+    StageAlarm,
+    StageLost,
+    StageRejected,
+    StageTimeout,
+    WrongFirmware,
+)
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.stages.gantry import Gantry
+from rig.stages.protocol import Box, Point
+from rig.stages.settings import StageSettings
+
+
+class Traffic:
+    """Keeps what passes on the wire."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[float, str, bytes]] = []
+
+    def record(self, at_s: float, direction: str, data: bytes) -> None:
+        self.entries.append((at_s, direction, data))
+
+    def sent(self) -> list[bytes]:
+        return [data for _, direction, data in self.entries if direction == "sent"]
+
+
+def homed(bench: Bench, traffic: Traffic | None = None, settings: StageSettings | None = None) -> Gantry:
+    stage = bench.stage(settings, traffic)
+    stage.connect()
+    stage.home()
+    return stage
+
+
+def grbl(bench: Bench) -> SimulatedGrbl:
+    assert isinstance(bench.firmware, SimulatedGrbl)
+    return bench.firmware
+
+
+def test_positions_are_machine_positions_whatever_the_work_offset_and_report() -> None:
+    for report in ("0", "1", "3"):
+        bench = Bench(partial(SimulatedGrbl, settings={10: report}))
+        stage = homed(bench)
+        stage.move_to(-100.0, -100.0)
+        bench.firmware.receive(b"G92 X0 Y0\n")
+        bench.clock.sleep_s(0.1)
+        for _ in range(12):  # the new offset is told within ten idle reports
+            bench.firmware.receive(b"?")
+        stage.move_to(-150.0, -120.0)
+        assert bench.true_position() == pytest.approx((-150.0, -120.0), abs=0.01)
+        assert stage.position().is_at(Point(-150.0, -120.0))
+
+
+def test_status_is_asked_for_at_most_five_times_a_second() -> None:
+    traffic = Traffic()
+    stage = homed(Bench(SimulatedGrbl), traffic)
+    stage.move_to(-200.0, -200.0)
+    for _ in range(5):
+        stage.position()
+    polls = [at_s for at_s, _, data in traffic.entries if data == b"?"]
+    assert len(polls) > 8
+    assert min(b - a for a, b in pairwise(polls)) >= 0.2 - 1e-9
+
+
+def test_motion_is_by_jogs_and_never_by_unlocking() -> None:
+    traffic = Traffic()
+    stage = homed(Bench(SimulatedGrbl), traffic)
+    stage.move_to(-200.0, -200.0)
+    moves = [data for data in traffic.sent() if b"X" in data]
+    assert moves
+    assert all(data.startswith(b"$J=G90 G21 G53 ") and len(data) < 80 for data in moves)
+    assert b"$X\n" not in traffic.sent()
+
+
+def test_alarm_2_keeps_the_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-100.0, -100.0)
+    bench.firmware.receive(b"G53 G0 X10\n")
+    with pytest.raises(StageAlarm, match="ALARM:2") as caught:
+        stage.position()
+    assert caught.value.position_kept
+    stage.recover()
+    assert stage.trusted
+    assert stage.verify_at(-100.0, -100.0).trusted
+
+
+@pytest.mark.parametrize("code", [1, 3, 4, 5, 6, 7, 8, 9])
+def test_other_alarms_lose_it_and_stay_locked_until_homed(code: int) -> None:
+    bench = Bench(SimulatedGrbl)
+    traffic = Traffic()
+    stage = homed(bench, traffic)
+    grbl(bench).alarm(code)
+    with pytest.raises(StageAlarm, match=f"ALARM:{code}:") as caught:
+        stage.move_to(-100.0, -100.0)
+    assert caught.value.code == code
+    stage.recover()
+    assert not stage.trusted
+    assert grbl(bench).state == "Alarm"
+    assert b"$X\n" not in traffic.sent()
+    with pytest.raises(NotHomed):
+        stage.move_to(-100.0, -100.0)
+    stage.home()
+    assert stage.move_to(-100.0, -100.0).trusted
+
+
+def test_a_hard_limit_stops_the_stage_and_the_reset_is_repeated_until_taken() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-50.0, -50.0)
+    bench.firmware.mechanics.axes[0].slip_mm = 49.5  # the switch is nearer than the count says
+    with pytest.raises(StageAlarm, match="ALARM:1"):
+        stage.move_to(-10.0, -50.0)
+    stage.recover()
+    assert not stage.trusted
+
+
+def test_failed_homing_is_not_taken_for_done_although_it_answers_ok() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    bench.firmware.mechanics.axes[1].stuck = True
+    with pytest.raises(StageAlarm, match="ALARM:9"):
+        stage.home()
+    assert not stage.trusted
+
+
+def test_homing_is_given_four_minutes_and_no_more() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    bench.firmware.homing_slowdown = 20.0
+    stage.home()
+    bench.firmware.homing_slowdown = 2000.0
+    started_s = bench.clock.now_s()
+    with pytest.raises(StageTimeout, match="within 240 s"):
+        stage.home()
+    assert bench.clock.now_s() - started_s == pytest.approx(240.0, abs=2.0)
+    assert not stage.trusted
+    stage.recover()
+    bench.firmware.homing_slowdown = 1.0
+    stage.home()
+    assert stage.trusted
+
+
+def test_ctrl_c_stops_the_motion_and_the_trust() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    bench.clock.after(0.5, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        stage.move_to(-300.0, -300.0)
+    bench.clock.sleep_s(1.0)
+    stopped = bench.true_position()
+    assert -200.0 < stopped.x_mm < -10.0
+    assert not bench.firmware.mechanics.moving
+    assert not stage.trusted
+    stage.recover()
+    stage.home()
+
+
+def test_ctrl_c_breaks_off_homing() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+
+    def interrupt() -> None:
+        raise KeyboardInterrupt
+
+    bench.clock.after(2.0, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        stage.home()
+    bench.clock.sleep_s(0.1)
+    assert grbl(bench).state == "Alarm"
+    stage.recover()
+    stage.home()
+    assert stage.trusted
+
+
+def test_hold_keeps_the_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-100.0, -100.0)
+    bench.firmware.receive(b"$J=G91 G21 X-50 F600\n")
+    bench.clock.sleep_s(1.0)
+    stage.hold()
+    assert stage.trusted
+    assert not bench.firmware.mechanics.moving
+    position = stage.position().point
+    assert -115.0 < position.x_mm < -105.0
+    assert bench.true_position() == pytest.approx(position, abs=0.01)
+
+
+def test_a_held_stage_recovers_with_its_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.clock.after(0.5, grbl(bench).pause)
+    with pytest.raises(StageAlarm, match="on hold") as caught:
+        stage.move_to(-200.0, -200.0)
+    assert caught.value.position_kept
+    stage.recover()
+    assert stage.trusted
+    target = Point(-200.0, -200.0)
+    assert stage.move_to(*target).is_at(target)
+    assert bench.true_position() == pytest.approx(target, abs=0.01)
+
+
+def test_a_restart_during_an_exposure_is_noticed() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-100.0, -100.0)
+    bench.clock.after(0.5, bench.firmware.restart)
+    bench.clock.sleep_s(2.0)
+    with pytest.raises(StageLost, match="restarted"):
+        stage.verify_at(-100.0, -100.0)
+    assert not stage.trusted
+
+
+def test_one_idle_report_does_not_end_a_wait() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    told: list[bytes] = []
+
+    def idle_while_it_moves(data: bytes) -> bytes:
+        if b"<Jog" in data and not told:
+            told.append(data)
+            return data.replace(b"<Jog", b"<Idle")
+        return data
+
+    bench.wire.spoil_to_host.append(idle_while_it_moves)
+    grbl(bench).settings[110] = "3000.000"  # slower than the driver was told, so that it polls too soon
+    assert stage.move_to(-350.0, -350.0).is_at(Point(-350.0, -350.0))
+    assert told
+
+
+def test_settings_are_read_anew_on_recovery() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    grbl(bench).settings[130] = "200.000"
+    bench.firmware.restart()
+    bench.clock.sleep_s(2.0)
+    with pytest.raises(StageLost):
+        stage.position()
+    stage.recover()
+    assert stage.travel().x_mm == (-200.0, 0.0)
+
+
+def test_an_alarm_that_somebody_else_cleared_still_loses_the_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.firmware.receive(b"$J=G91 G21 X-100 F600\n")
+    bench.clock.sleep_s(1.0)
+    bench.firmware.receive(b"\x18")
+    bench.firmware.receive(b"$X\n")
+    stage.recover()
+    assert not stage.trusted
+
+
+def test_what_is_left_of_a_damaged_line_does_not_spoil_the_recovery() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.firmware.receive(b";")
+    stage.recover()
+    stage.home()
+    assert stage.trusted
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({22: "0"}, r"\$22=0.*set \$22=1"),
+        ({13: "1"}, r"\$13=1.*set \$13=0"),
+        ({100: "0.000"}, r"\$100=0.000"),
+        ({110: "0.000"}, r"\$110"),
+    ],
+)
+def test_settings_that_cannot_be_driven_are_refused_before_motion(settings: dict[int, str], message: str) -> None:
+    bench = Bench(SimulatedGrbl)
+    grbl(bench).settings.update(settings)
+    with pytest.raises(WrongFirmware, match=message):
+        bench.stage().connect()
+
+
+def test_settings_that_should_be_changed_are_told() -> None:
+    stage = Bench(partial(SimulatedGrbl, settings={20: "0", 1: "25"})).stage()
+    stage.connect()
+    assert [warning.split(":")[0] for warning in stage.identify().warnings] == ["$20=0", "$1=25"]
+
+
+def test_the_wrong_firmware_is_refused() -> None:
+    bench = Bench(SimulatedGrbl)
+    for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
+        bench.wire.spoil_to_host[:] = [partial(_replace, b"[VER:1.1h.20190830:]", version)]
+        with pytest.raises(WrongFirmware, match=r"1\.1 or grblHAL is needed"):
+            bench.stage().connect()
+    bench.wire.spoil_to_host.clear()
+    marlin = bench.stage(StageSettings(protocol="marlin", port="simulated"))
+    with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):
+        marlin.connect()
+
+
+def test_travel_follows_the_homing_direction_where_the_switch_is_the_origin() -> None:
+    bench = Bench(partial(SimulatedGrbl, settings={23: "1"}))
+    bench.wire.spoil_to_host.append(lambda data: data.replace(b"[OPT:V,", b"[OPT:VZ,"))
+    stage = bench.stage()
+    stage.connect()
+    assert stage.travel() == Box((0.0, 400.0), (-400.0, 0.0))
+
+
+def test_configured_limits_narrow_the_travel() -> None:
+    def stage_within(box: Box) -> Gantry:
+        return Bench(SimulatedGrbl).stage(StageSettings(protocol="grbl", port="simulated", travel_mm=box))
+
+    narrow = stage_within(Box((-300.0, 50.0), (-200.0, -100.0)))
+    narrow.connect()
+    assert narrow.travel() == Box((-300.0, 0.0), (-200.0, -100.0))
+    with pytest.raises(OutsideTravel, match=r"correct stage\.travel_mm"):
+        stage_within(Box((10.0, 20.0), (10.0, 20.0))).connect()
+
+
+def test_a_keep_out_on_the_way_is_refused_before_motion() -> None:
+    bench = Bench(SimulatedGrbl)
+    box = Box((-120.0, -100.0), (-120.0, -100.0))
+    stage = homed(bench, settings=StageSettings(protocol="grbl", port="simulated", keep_out=(box,)))
+    before = bench.true_position()
+    with pytest.raises(Exception, match="meets the keep-out box"):
+        stage.move_to(-200.0, -200.0)
+    assert bench.true_position() == before
+    stage.move_to(-200.0, -50.0)
+    stage.move_to(-200.0, -200.0)
+
+
+def test_a_locked_stage_jogs_only_when_asked_to_unlock() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    with pytest.raises(StageAlarm, match="locked"):
+        stage.jog(-1.0, 0.0)
+    before = bench.true_position()
+    assert not stage.jog(-1.0, -2.0, unlock=True).trusted
+    moved = bench.true_position()
+    assert (moved.x_mm - before.x_mm, moved.y_mm - before.y_mm) == pytest.approx((-1.0, -2.0), abs=0.01)
+    with pytest.raises(OutsideTravel, match="longer than 10 mm"):
+        stage.jog(-11.0, 0.0)
+    with pytest.raises(StageRejected, match="error:15"):
+        stage.jog(5.0, 5.0)
+    stage.home()
+    assert stage.jog(-50.0, -50.0).is_at(Point(-51.0, -51.0))
+    with pytest.raises(OutsideTravel):
+        stage.jog(60.0, 0.0)
+
+
+def test_settings_that_change_while_read_are_not_believed() -> None:
+    bench = Bench(SimulatedGrbl)
+    seen: list[bytes] = []
+
+    def double_a_digit_once(data: bytes) -> bytes:
+        if data.startswith(b"$130=400") and not seen:
+            seen.append(data)
+            return b"$130=4400.000\r\n"
+        return data
+
+    bench.wire.spoil_to_host.append(double_a_digit_once)
+    with pytest.raises(StageLost, match=r"\$130 read differently"):
+        bench.stage().connect()
+
+
+def test_play_in_the_drive_does_not_matter() -> None:
+    bench = Bench(partial(SimulatedGrbl, play_mm=0.3))
+    stage = homed(bench)
+    target = Point(-150.0, -150.0)
+    places = []
+    for start in (Point(-200.0, -200.0), Point(-100.0, -100.0), Point(-200.0, -100.0), Point(-150.0, -140.0)):
+        stage.move_to(*start)
+        stage.move_to(*target)
+        places.append(bench.true_position())
+    assert all(place == pytest.approx(places[0], abs=1e-6) for place in places)
+    bench.firmware.receive(b"$J=G53 G90 G21 X-100 Y-100 F6000\n$J=G53 G90 G21 X-150 Y-150 F6000\n")
+    bench.clock.sleep_s(5.0)
+    assert bench.true_position().x_mm == pytest.approx(places[0].x_mm + 0.3), "the play is really there"
+
+
+def _replace(old: bytes, new: bytes, data: bytes) -> bytes:
+    return data.replace(old, new)

@@ -1,0 +1,181 @@
+"""What is peculiar to Marlin, on a simulated controller: each trap of the protocol, and the driver's way around it."""
+
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.stages.gantry import Gantry
+from rig.stages.protocol import Box, Point
+from rig.stages.settings import StageSettings
+
+
+def homed(bench: Bench) -> Gantry:
+    stage = bench.stage()
+    stage.connect()
+    stage.home()
+    return stage
+
+
+def without(*starts: bytes) -> Callable[[bytes], bytes]:
+    """Return what keeps lines with these beginnings from the host."""
+    return lambda data: b"" if data.startswith(starts) else data
+
+
+def test_motors_do_not_let_go_however_long_nothing_moves() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    stage.move_to(100.0, 100.0)
+    bench.clock.sleep_s(3600.0)
+    stage.verify_at(100.0, 100.0)
+    assert bench.true_position() == pytest.approx((100.0, 100.0), abs=0.01)
+
+
+def test_damaged_lines_are_sent_again_and_executed_once() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    sent = 0
+
+    def damage_every_third(data: bytes) -> bytes:
+        nonlocal sent
+        sent += 1
+        return data.replace(b"1", b"7", 1) if sent % 3 == 0 else data
+
+    bench.wire.spoil_to_controller.append(damage_every_third)
+    for target in (Point(100.0, 100.0), Point(50.0, 150.0), Point(11.0, 11.0)):
+        assert stage.move_to(*target).is_at(target)
+        assert bench.true_position() == pytest.approx(target, abs=0.01)
+
+
+def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.firmware.restart()
+    bench.clock.sleep_s(5.0)
+    with pytest.raises(StageLost, match="waits for line 1 "):
+        stage.position()
+    assert not stage.trusted
+    stage.recover()
+    with pytest.raises(NotHomed):
+        stage.move_to(10.0, 10.0)
+    stage.home()
+    assert stage.trusted
+
+
+def test_a_position_is_not_taken_from_an_answer_that_has_none() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.wire.spoil_to_host.append(without(b"X:"))
+    with pytest.raises(StageTimeout, match="without a position"):
+        stage.position()
+    assert not stage.trusted
+
+
+def test_firmware_that_tells_only_projected_positions_is_waited_for() -> None:
+    bench = Bench(partial(SimulatedMarlin, realtime_position=False))
+    stage = homed(bench)
+    stage.move_to(200.0, 200.0)
+    assert bench.true_position() == pytest.approx((200.0, 200.0), abs=0.01)
+
+
+def test_a_killed_controller_is_restarted_and_has_to_be_homed() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    assert isinstance(bench.firmware, SimulatedMarlin)
+    bench.firmware.kill("Heating failed")
+    with pytest.raises(StageAlarm, match="Heating failed"):
+        stage.move_to(10.0, 10.0)
+    stage.recover()
+    assert not stage.trusted
+    stage.home()
+    assert stage.trusted
+
+
+def test_failed_homing_is_an_alarm() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = bench.stage()
+    stage.connect()
+    bench.firmware.mechanics.axes[0].stuck = True
+    with pytest.raises(StageAlarm, match="Homing Failed"):
+        stage.home()
+
+
+def test_hold_stops_dead_and_so_loses_the_position() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.firmware.receive(b"G1 X300 F600\n")
+    bench.clock.sleep_s(1.0)
+    stage.hold()
+    assert not bench.firmware.mechanics.moving
+    assert bench.true_position().x_mm < 15.0
+    assert not stage.trusted
+
+
+def test_one_axis_can_be_homed_alone() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = bench.stage()
+    stage.connect()
+    stage.home(0)
+    assert not stage.trusted, "the other axis is still unknown"
+    stage.home()
+    stage.move_to(50.0, 50.0)
+    assert stage.home(1).position.point == Point(50.0, 0.0)
+    assert stage.trusted
+
+
+def test_travel_is_what_all_sources_allow() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = bench.stage()
+    stage.connect()
+    assert stage.travel() == Box((0.0, 400.0), (0.0, 400.0))
+    bench.wire.spoil_to_host.append(lambda data: data.replace(b"Max:  X400.00", b"Max:  X350.00"))
+    stage.connect()
+    assert stage.travel() == Box((0.0, 350.0), (0.0, 400.0))
+
+
+def test_travel_that_is_not_told_has_to_be_configured() -> None:
+    bench = Bench(SimulatedMarlin)
+    bench.wire.spoil_to_host.append(without(b"area:", b"echo:Soft"))
+    with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
+        bench.stage().connect()
+    travel = Box((0.0, 300.0), (0.0, 300.0))
+    stage = bench.stage(StageSettings(protocol="marlin", port="simulated", travel_mm=travel))
+    stage.connect()
+    assert stage.travel() == travel
+
+
+def test_settings_that_change_while_read_are_not_believed() -> None:
+    bench = Bench(SimulatedMarlin)
+    seen: list[bytes] = []
+
+    def lose_a_digit_once(data: bytes) -> bytes:
+        if data.startswith(b"echo: M92") and not seen:
+            seen.append(data)
+            return data.replace(b"X80", b"X8")
+        return data
+
+    bench.wire.spoil_to_host.append(lose_a_digit_once)
+    with pytest.raises(StageLost, match="read differently"):
+        bench.stage().connect()
+
+
+@pytest.mark.parametrize("line", [b"FIRMWARE_NAME", b"echo: M92", b"echo: M203", b"echo: M201", b"echo: M204"])
+def test_firmware_that_does_not_tell_what_is_needed_is_refused(line: bytes) -> None:
+    bench = Bench(SimulatedMarlin)
+    bench.wire.spoil_to_host.append(without(line))
+    with pytest.raises(WrongFirmware):
+        bench.stage().connect()
+
+
+def test_the_wrong_firmware_is_refused() -> None:
+    grbl = Bench(SimulatedMarlin).stage(StageSettings(protocol="grbl", port="simulated"))
+    with pytest.raises(WrongFirmware, match="use protocol 'marlin'"):
+        grbl.connect()
+    kept_running = Bench(SimulatedMarlin, resets_on_open=False)
+    kept_running.clock.sleep_s(5.0)
+    with pytest.raises(WrongFirmware, match="use protocol 'marlin'"):
+        kept_running.stage(StageSettings(protocol="grbl", port="simulated")).connect()

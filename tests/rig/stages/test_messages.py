@@ -1,0 +1,143 @@
+"""Lines from controllers are read strictly: whatever comes, nothing crashes and nothing false passes for an answer."""
+
+import re
+from functools import reduce
+from operator import xor
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.stages import grbl_messages as grbl
+from rig.stages import marlin_messages as marlin
+
+GRBL_LINES = [
+    "ok",
+    "error:15",
+    "ALARM:1",
+    "<Idle|MPos:-1.000,-2.000,0.000|FS:0,0|WCO:0.000,0.000,0.000>",
+    "<Hold:0|WPos:1.000,2.000,0.000|Bf:15,128|Pn:XY>",
+    "$130=400.000",
+    "[MSG:Reset to continue]",
+    "[VER:1.1h.20190830:]",
+    "Grbl 1.1h ['$' for help]",
+]
+MARLIN_LINES = [
+    "ok",
+    "ok N12 P15 B3",
+    "ok X:0.00 Y:0.00 Z:0.00 E:0.00 Count: A:0 B:0 C:0",
+    "X:10.00 Y:20.50 Z:0.00 E:0.00 Count X:800 Y:1640 Z:0",
+    "Resend: 7",
+    "Error:checksum mismatch, Last Line: 6",
+    "Error:Printer halted. kill() called!",
+    "echo:busy: processing",
+    "start",
+    "Cap:EMERGENCY_PARSER:1",
+    "echo: M92 X80.00 Y80.00 Z400.00",
+    "echo:Soft endstops: On  Min:  X0.00 Y0.00 Z0.00   Max:  X400.00 Y400.00 Z100.00",
+    "area:{full:{min:{x:0,y:0,z:0},max:{x:400,y:400,z:100}},work:{min:{x:1,y:2,z:0},max:{x:399,y:398,z:100}}}",
+    "x_min: TRIGGERED",
+    "FIRMWARE_NAME:Marlin 2.1.2.4 (Jun  1 2024 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin",
+]
+
+
+def test_grbl_lines_are_read() -> None:
+    kinds = [type(grbl.parse(line)).__name__ for line in GRBL_LINES]
+    assert kinds == ["Ok", "Error", "Alarm", "Report", "Report", "Setting", "Feedback", "Feedback", "Banner"]
+    assert grbl.parse(GRBL_LINES[4]) == grbl.Report("Hold", 0, (1.0, 2.0, 0.0), False, None, "XY")
+    assert grbl.parse(GRBL_LINES[3]) == grbl.Report(
+        "Idle", None, (-1.0, -2.0, 0.0), True, offset=(0.0, 0.0, 0.0), pins=""
+    )
+
+
+def test_marlin_lines_are_read() -> None:
+    assert [type(marlin.parse(line)).__name__ for line in MARLIN_LINES] == [
+        "Ok", "Ok", "PositionReport", "PositionReport", "Resend", "Error", "Error", "Busy", "Start", "Capability",
+        "Setting", "Limits", "Limits", "Switch", "Firmware",
+    ]  # fmt: skip
+    assert marlin.parse(MARLIN_LINES[3]) == marlin.PositionReport({"X": 10.0, "Y": 20.5, "Z": 0.0}, is_ok=False)
+    assert marlin.parse(MARLIN_LINES[12]) == marlin.Limits((1.0, 399.0), (2.0, 398.0), is_area=True)
+    assert marlin.parse(MARLIN_LINES[14]) == marlin.Firmware("Marlin 2.1.2.4 (Jun  1 2024 12:00:00)")
+    assert marlin.parse("Error:checksum mismatch, Last Line: 6") == marlin.Error(
+        "checksum mismatch, Last Line: 6", in_transmission=True
+    )
+
+
+@given(st.tuples(*[st.floats(-999.0, 999.0)] * 3), st.sampled_from(["Idle", "Jog", "Alarm", "Home"]))
+@settings(deadline=None)
+def test_a_report_tells_what_was_written(position: tuple[float, float, float], state: str) -> None:
+    written = ",".join(f"{value:.3f}" for value in position)
+    report = grbl.parse(f"<{state}|MPos:{written}|FS:0,0>")
+    assert isinstance(report, grbl.Report)
+    assert report.state == state
+    assert report.position == pytest.approx(position, abs=0.0005)
+
+
+@given(st.integers(0, 10**6), st.text(st.characters(min_codepoint=32, max_codepoint=126), max_size=60))
+@settings(deadline=None)
+def test_a_numbered_line_carries_the_xor_of_its_bytes(number: int, command: str) -> None:
+    line, _, checksum = marlin.numbered(number, command).rstrip(b"\n").rpartition(b"*")
+    assert line == f"N{number} {command}".encode()
+    assert int(checksum) == reduce(xor, line)
+
+
+@pytest.mark.parametrize(
+    "line", ["okk", "o", "k", "OK", "ok.", " ok", "ok ok", "nok", "ok\x00", "\ufffdok", ">G54:ok", "error", "error:"]
+)
+def test_damaged_and_similar_lines_are_no_answers(line: str) -> None:
+    assert isinstance(grbl.parse(line), grbl.Unknown)
+    assert isinstance(marlin.parse(line), marlin.Unknown)
+
+
+@settings(deadline=None, max_examples=500)
+@given(st.data())
+def test_one_damaged_character_never_makes_another_answer(data: st.DataObject) -> None:
+    """A damaged line is unknown, or of its own kind, or pushed: it never becomes an ok."""
+    line = data.draw(st.sampled_from([line for line in GRBL_LINES + MARLIN_LINES if not line.startswith("ok")]))
+    place = data.draw(st.integers(0, len(line) - 1))
+    new = data.draw(st.characters(max_codepoint=255))
+    for damaged in (line[:place] + new + line[place + 1 :], line[:place] + line[place + 1 :], line[:place] + line):
+        assert not isinstance(grbl.parse(damaged), grbl.Ok)
+        assert not isinstance(marlin.parse(damaged), marlin.Ok)
+
+
+def test_a_million_random_lines() -> None:
+    """Half of them are noise, half are real lines with a few bytes changed."""
+    generator = np.random.default_rng(31)
+    lines = [*_noise(generator, 500_000), *_damaged(generator, 500_000)]
+    assert len(lines) == 1_000_000
+    marlin_ok = re.compile(r"ok( [NPB]\d+)*")
+    for line in lines:
+        if isinstance(grbl.parse(line), grbl.Ok):
+            assert line == "ok"
+        message = marlin.parse(line)
+        if isinstance(message, marlin.Ok):
+            assert marlin_ok.fullmatch(line)
+        if isinstance(message, marlin.PositionReport) and message.is_ok:
+            assert line.startswith("ok X:")
+
+
+def _noise(generator: np.random.Generator, count: int) -> list[str]:
+    """Return lines of random bytes, biased to those that messages are made of."""
+    alphabet = np.frombuffer(b"ok:.,|<>[]$=-0123456789 XYMPosIdleJgAarmErn*N\xff\x00", dtype=np.uint8)
+    lengths = generator.integers(1, 24, size=count)
+    data = alphabet[generator.integers(0, alphabet.size, size=int(lengths.sum()))].tobytes().decode("latin-1")
+    ends = np.cumsum(lengths)
+    return [data[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+
+
+def _damaged(generator: np.random.Generator, count: int) -> list[str]:
+    """Return real lines with one character changed, dropped or doubled."""
+    originals = GRBL_LINES + MARLIN_LINES
+    which = generator.integers(0, len(originals), size=count)
+    where = generator.random(size=count)
+    what = generator.integers(0, 256, size=count)
+    how = generator.integers(0, 3, size=count)
+    lines = []
+    for index, share, byte, kind in zip(which, where, what, how, strict=True):
+        line = originals[index]
+        place = int(share * len(line))
+        replacement = (chr(byte), "", line[place] * 2)[kind]
+        lines.append(line[:place] + replacement + line[place + 1 :])
+    return lines

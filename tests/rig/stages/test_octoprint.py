@@ -1,0 +1,90 @@
+"""The Marlin driver against an implementation by others: the virtual printer of OctoPrint, in its own process."""
+
+import json
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rig.errors import StageAlarm, StageLost, StageTimeout
+from rig.opening import open_stage
+from rig.stages.gantry import Gantry
+from rig.stages.protocol import Point
+from rig.stages.settings import StageSettings
+from tests.rig.stages.contract import check_stage
+
+PYTHON = Path(__file__).parents[3] / "build" / "octoprint" / "bin" / "python"
+SERVER = Path(__file__).with_name("octoprint_server.py")
+
+pytestmark = pytest.mark.skipif(
+    not PYTHON.exists(), reason=f"OctoPrint is not installed in {PYTHON.parents[1]}; .ci/run does it"
+)
+
+type Command = Callable[[str], None]
+
+
+@pytest.fixture
+def printer(request: pytest.FixtureRequest) -> Iterator[tuple[Gantry, Command]]:
+    """A stage connected to a virtual printer, and a way to give the printer commands from outside."""
+    changes = getattr(request, "param", {})
+    with subprocess.Popen(
+        [PYTHON, SERVER, json.dumps(changes)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        port = int(process.stdout.readline())
+        stage = open_stage(StageSettings(protocol="marlin", port=f"socket://127.0.0.1:{port}"))
+
+        def command(text: str) -> None:
+            assert process.stdin is not None
+            process.stdin.write(text + "\n")
+            process.stdin.flush()
+
+        yield stage, command
+        stage.close()
+        process.kill()
+
+
+def test_contract(printer: tuple[Gantry, Command]) -> None:
+    check_stage(printer[0])
+
+
+@pytest.mark.parametrize("printer", [{}, {"simulated_errors": ["20:resend", "30:checksum_mismatch"]}], indirect=True)
+def test_a_grid_of_7_by_7(printer: tuple[Gantry, Command]) -> None:
+    stage, _ = printer
+    stage.connect()
+    stage.home()
+    for row in range(7):
+        for column in range(7) if row % 2 == 0 else reversed(range(7)):
+            target = Point(20.0 + 50.0 * column, 20.0 + 50.0 * row)
+            assert stage.move_to(*target).is_at(target)
+
+
+@pytest.mark.parametrize(
+    ("fault", "failure"),
+    [
+        ("trigger_fatal_error_marlin", StageAlarm),
+        ("reset", StageLost),
+        ("drop_connection", StageLost),
+        ("dont_answer", StageTimeout),
+    ],
+)
+def test_faults(printer: tuple[Gantry, Command], fault: str, failure: type[Exception]) -> None:
+    stage, command = printer
+    stage.connect()
+    stage.home()
+    command(f"!!DEBUG:{fault}")
+    with pytest.raises(failure):
+        _wander(stage)
+    assert not stage.trusted
+    stage.recover()
+    stage.home()
+    assert stage.move_to(30.0, 30.0).trusted
+
+
+def _wander(stage: Gantry) -> None:
+    """Move about until something happens; the printer's process takes its command in its own time."""
+    while True:
+        for x_mm in range(10, 200, 10):
+            stage.move_to(x_mm, 20.0)

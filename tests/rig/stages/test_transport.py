@@ -1,0 +1,178 @@
+"""Lines over pyserial: bounded waits, every byte in the log, and dead connections named."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from rig.errors import StageLost, StageTimeout
+from rig.opening import open_stage
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
+from rig.stages.settings import StageSettings
+from rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
+
+
+class Traffic:
+    """Keeps what passes on the wire."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[float, str, bytes]] = []
+
+    def record(self, at_s: float, direction: str, data: bytes) -> None:
+        self.entries.append((at_s, direction, data))
+
+    def all(self, direction: str) -> bytes:
+        return b"".join(data for _, way, data in self.entries if way == direction)
+
+
+@pytest.fixture
+def pty() -> Iterator[PtyLink]:
+    link = PtyLink()
+    yield link
+    link.close()
+
+
+def line_over(link: DirectLink) -> LineTransport:
+    return LineTransport(link.open, SimulatedClock(), NoTrafficLog())
+
+
+@pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x", ""])
+def test_a_port_that_cannot_be_opened_is_named_in_one_line_with_those_that_exist(url: str) -> None:
+    with pytest.raises(StageLost, match=r"cannot be opened .*; serial ports here: .*; check the cable") as caught:
+        SerialPort(url, 115200)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_port_is_taken_alone(pty: PtyLink) -> None:
+    first = pty.open()
+    with pytest.raises(StageLost, match="no other program"):
+        pty.open()
+    first.close()
+    pty.open().close()
+
+
+def test_bytes_pass_and_an_unplugged_port_is_lost(pty: PtyLink) -> None:
+    port = pty.open()
+    port.write(b"?")
+    assert pty.receive(1) == b"?"
+    pty.send(b"ok\r\n")
+    data = b""
+    while len(data) < 4:
+        data += port.read(1.0)
+    assert data == b"ok\r\n"
+    assert port.read(0.0) == b""
+    pty.unplug()
+    with pytest.raises(StageLost, match="connection is gone"):
+        port.read(1.0)
+    with pytest.raises(StageLost, match="connection is gone"):
+        port.write(b"?")
+    port.close()
+
+
+def test_lines_are_cut_stripped_and_decoded_without_fail() -> None:
+    link = DirectLink()
+    line = line_over(link)
+    line.open()
+    link.send(b"\r\nok\r\n\n  <Idle|\xff\x00>  \nhalf")
+    assert line.next_line(0.0) == "ok"
+    assert line.next_line(0.0) == "<Idle|\ufffd\x00>"
+    assert line.next_line(0.0) is None
+    link.send(b" a line\n")
+    assert line.next_line(0.0) == "half a line"
+
+
+def test_noise_without_an_end_does_not_grow_for_ever() -> None:
+    link = DirectLink()
+    line = line_over(link)
+    line.open()
+    for _ in range(100):
+        link.send(b"x" * 1000)
+        assert line.next_line(0.0) is None
+    link.send(b"\nok\n")
+    first = line.next_line(0.0)
+    assert first is not None
+    assert len(first) <= 2024
+    assert line.next_line(0.0) == "ok"
+
+
+def test_a_closed_line_says_so_and_forgets_what_it_held() -> None:
+    link = DirectLink()
+    line = line_over(link)
+    with pytest.raises(StageLost, match="not connected"):
+        line.send(b"?")
+    line.open()
+    link.send(b"half")
+    assert line.next_line(0.0) is None
+    link.unplug()
+    with pytest.raises(StageLost):
+        line.next_line(0.0)
+    assert not line.is_open
+    link.plug()
+    line.open()
+    link.send(b"ok\n")
+    assert line.next_line(0.0) == "ok"
+
+
+def test_every_byte_and_its_time_is_in_the_log(pty: PtyLink) -> None:
+    bench = Bench(SimulatedGrbl, pty)
+    traffic = Traffic()
+    on_the_wire: dict[str, bytes] = {"sent": b"", "received": b""}
+
+    def watch(way: str, data: bytes) -> bytes:
+        on_the_wire[way] += data
+        return data
+
+    stage = bench.stage(traffic=traffic)
+    bench.wire.spoil_to_controller.append(lambda data: watch("sent", data))
+    bench.wire.spoil_to_host.append(lambda data: watch("received", data))
+    stage.connect()
+    stage.home()
+    stage.move_to(-100.0, -100.0)
+    assert traffic.all("sent") == on_the_wire["sent"]
+    assert traffic.all("received") == on_the_wire["received"]
+    times = [at_s for at_s, _, _ in traffic.entries]
+    assert times == sorted(times)
+    assert times[-1] == bench.clock.now_s()
+
+
+@pytest.mark.parametrize("link", [PtyLink, SocketLink])
+def test_an_unplugged_stage_comes_back_by_the_same_name(link: type[PtyLink] | type[SocketLink]) -> None:
+    made = link()
+    bench = Bench(SimulatedGrbl, made)
+    stage = bench.stage()
+    stage.connect()
+    stage.home()
+    bench.unplug()
+    with pytest.raises(StageLost):
+        stage.move_to(-100.0, -100.0)
+    with pytest.raises(StageLost):
+        stage.recover()
+    bench.plug()
+    stage.recover()
+    assert not stage.trusted
+    stage.home()
+    assert stage.move_to(-100.0, -100.0).trusted
+    stage.close()
+    made.close()
+
+
+def test_a_mute_controller_does_not_hang_the_connection() -> None:
+    bench = Bench(SimulatedGrbl)
+    bench.wire.spoil_to_host.append(lambda data: b"")
+    with pytest.raises(StageTimeout, match="no answer"):
+        bench.stage().connect()
+    assert bench.clock.now_s() < 10.0
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(ValueError, match=r"stage\.port is missing"):
+        StageSettings(protocol="grbl")
+    with pytest.raises(ValueError, match=r"stage\.axes"):
+        StageSettings(protocol="grbl", port="x", axes=("X", "X"))
+    with pytest.raises(ValueError, match=r"stage\.approach_mm"):
+        StageSettings(protocol="grbl", port="x", approach_mm=-1.0)
+    with pytest.raises(ValueError, match=r"stage\.feed_mm_per_min"):
+        StageSettings(protocol="grbl", port="x", feed_mm_per_min=0.0)
+    assert open_stage(StageSettings(protocol="simulated")).settings.protocol == "grbl"

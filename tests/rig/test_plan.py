@@ -1,0 +1,116 @@
+"""The plan of a capture: order, times, room on disk, and what is refused before anything moves."""
+
+from itertools import pairwise
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.errors import KeepOutCrossed, OutsideTravel
+from rig.plan import CapturePlan, Grid, Step
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.stages.protocol import Box, MotionLimits, Point
+from rig.stages.workspace import Workspace
+
+GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
+STEPS = (
+    Step("charuco", (0.1,)),
+    Step("dark_scene", (0.1,)),
+    Step("dark", (0.1, 0.2), frames_per_node=20, at="centre"),
+)
+TRAVEL = Box((0.0, 400.0), (0.0, 400.0))
+MOTION = MotionLimits((100.0, 100.0), (500.0, 500.0))
+
+
+def plan_of(grid: Grid = GRID, steps: tuple[Step, ...] = STEPS) -> CapturePlan:
+    return CapturePlan.of(grid, steps, approach_mm=2.0, frame_bytes=24_000_000, settle_s=0.5, readout_s=0.4)
+
+
+@settings(deadline=None)
+@given(st.integers(1, 9), st.integers(1, 9), st.sampled_from(["serpentine", "raster"]))
+def test_every_node_is_visited_once(rows: int, columns: int, order: str) -> None:
+    grid = Grid(rows, columns, 10.0, Point(0.0, 0.0), msgspec.convert(order, type(GRID).__annotations__["order"]))
+    stops = grid.stops()
+    assert sorted(stop.node for stop in stops) == [(r, c) for r in range(rows) for c in range(columns)]
+    assert all(stop.target == (10.0 * stop.node[1], 10.0 * stop.node[0]) for stop in stops)
+
+
+def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
+    serpentine = [stop.node for stop in Grid(2, 3, 1.0, Point(0.0, 0.0)).stops()]
+    raster = [stop.node for stop in Grid(2, 3, 1.0, Point(0.0, 0.0), "raster").stops()]
+    assert serpentine == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0)]
+    assert raster == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
+    assert Grid(7, 7, 50.0, Point(0.0, 0.0)).centre().node == (3, 3)
+
+
+def test_frames_and_room() -> None:
+    plan = plan_of()
+    assert plan.frames() == 49 + 49 + 40
+    assert plan.disk_bytes() == plan.frames() * 24_000_000
+
+
+def test_the_path_reaches_every_stop_from_below() -> None:
+    path = plan_of().path(Point(200.0, 200.0))
+    targets = [stop.target for stop in (*GRID.stops(), *GRID.stops(), GRID.centre())]
+    remaining = iter(path)
+    assert all(target in remaining for target in targets), "in order"
+    for before, after in pairwise(path):
+        if after in targets:
+            assert before.x_mm <= after.x_mm
+            assert before.y_mm <= after.y_mm
+
+
+def test_a_plan_outside_or_through_a_keep_out_is_refused() -> None:
+    plan_of().check(Workspace(TRAVEL))
+    with pytest.raises(OutsideTravel):
+        plan_of().check(Workspace(Box((0.0, 300.0), (0.0, 400.0))))
+    with pytest.raises(OutsideTravel):  # a node at the edge leaves no room to come from below
+        plan_of(Grid(7, 7, 50.0, Point(0.0, 0.0))).check(Workspace(TRAVEL))
+    with pytest.raises(KeepOutCrossed):
+        plan_of().check(Workspace(TRAVEL, (Box((30.0, 35.0), (5.0, 15.0)),)))
+
+
+@pytest.mark.parametrize(("controller", "origin"), [(SimulatedGrbl, -350.0), (SimulatedMarlin, 10.0)])
+def test_the_predicted_time_is_the_time_it_takes(
+    controller: type[SimulatedGrbl] | type[SimulatedMarlin], origin: float
+) -> None:
+    bench = Bench(controller)
+    stage = bench.stage()
+    stage.connect()
+    start = stage.home().position.point
+    plan = plan_of(Grid(7, 7, 50.0, Point(origin, origin)), (Step("dark_scene", (0.1,)),))
+    plan.check(stage.workspace(), start)
+    predicted_s = plan.duration_s(stage.identify().motion, stage.feed_mm_per_s(), start)
+    started_s = bench.clock.now_s()
+    for stop in plan.stops:
+        stage.move_to(*stop.target)
+        bench.clock.sleep_s(plan.settle_s + 0.1 + plan.readout_s)
+    assert bench.clock.now_s() - started_s == pytest.approx(predicted_s, rel=0.15)
+
+
+def test_a_plan_is_frozen_and_survives_a_file() -> None:
+    plan = plan_of()
+    with pytest.raises(AttributeError):
+        plan.approach_mm = 1.0  # type: ignore[misc]  # that it cannot be assigned is what is tested
+    again = msgspec.json.decode(msgspec.json.encode(plan), type=CapturePlan)
+    assert again == plan
+    assert again.fingerprint() == plan.fingerprint()
+    assert plan_of(Grid(7, 7, 50.0, Point(10.0, 10.0), "raster")).fingerprint() != plan.fingerprint()
+
+
+def test_wrong_values() -> None:
+    with pytest.raises(ValueError, match="at least one row"):
+        Grid(0, 7, 50.0, Point(0.0, 0.0))
+    with pytest.raises(ValueError, match="exposure times above 0"):
+        Step("dark", ())
+    with pytest.raises(msgspec.ValidationError, match="unknown field"):
+        msgspec.json.decode(b'{"rows":1,"columns":1,"pitch_mm":1,"origin_mm":[0,0],"pich":2}', type=Grid)
+
+
+def test_an_empty_plan_goes_nowhere() -> None:
+    plan = plan_of(steps=())
+    assert plan.path() == ()
+    assert plan.duration_s(MOTION, 100.0) == 0.0
