@@ -2,7 +2,7 @@
 
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -162,7 +162,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
 
 @app.command
 def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
-    """Serve a simulated controller on a port, for other programs, until Ctrl-C.
+    """Serve a simulated controller on a port, for other programs, until Ctrl-C ends it.
 
     Parameters
     ----------
@@ -173,7 +173,8 @@ def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0
     """
     with serving(SimulatedGrbl if protocol == "grbl" else SimulatedMarlin) as server:
         say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
-        server.run(speed)
+        with suppress(KeyboardInterrupt):
+            server.run(speed)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from rig.clock import Clock
-from rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost, StageRejected
+from rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
 from rig.stages.motion import duration_s, one_sided, path_duration_s
 from rig.stages.protocol import AxisIndex, Box, Homing, Identity, Point, Position
 from rig.stages.settings import StageSettings
@@ -56,8 +56,8 @@ class Controller(Protocol):
         """Stop moving, wait until it stands, and return whether the position is kept."""
         ...
 
-    def abort(self) -> None:
-        """Send what stops the motion, without waiting and without fail."""
+    def abort(self) -> bool:
+        """Send what stops any motion, without waiting for it and without fail; return whether it keeps the position."""
         ...
 
     def recover(self) -> bool:
@@ -314,8 +314,6 @@ class Gantry:
         try:
             with self._judged():
                 yield
-        except StageRejected:
-            raise
         except BaseException:
-            self._controller.abort()
+            self._trusted &= self._controller.abort()
             raise

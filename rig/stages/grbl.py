@@ -7,12 +7,13 @@ whatever work offset is stored in the controller.
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 
 from rig.errors import StageLost, StageTimeout, WrongFirmware
 from rig.stages import grbl_messages as grbl
 from rig.stages.grbl_failures import LOCKED, alarm_failure, refusal, state_failure
 from rig.stages.grbl_settings import GrblSettings
-from rig.stages.motion import bound_s
+from rig.stages.motion import patience_s
 from rig.stages.protocol import AxisIndex, Identity, Point
 from rig.stages.transport import LineTransport
 
@@ -41,12 +42,15 @@ class Grbl:
         self._index = tuple("XYZ".index(axis) for axis in axes)
         self._offset: tuple[float, ...] | None = None
         self._alarm: int | None = None
+        self._count_lost = False
         self._homing = False
+        self._braking_s = 0.0
         self._next_poll_s = 0.0
 
     def connect(self) -> None:
         """Open the connection; most boards restart when it opens, so wait for the banner."""
         self._offset = self._alarm = None
+        self._count_lost = True
         self._line.open()
         if self._await_banner(_BOOT_S):
             return
@@ -73,18 +77,19 @@ class Grbl:
             )
             raise StageLost(f"{differing} read differently twice in a row: the line is disturbed; try a shorter cable")
         identity = GrblSettings(first, build).identity(self._index)
+        motion = identity.motion
+        ratios = zip(motion.rate_mm_per_s, motion.acceleration_mm_per_s2, strict=True)
+        self._braking_s = max(rate / acceleration for rate, acceleration in ratios)
         self._await_offset()
         return identity
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> float:
         """Home with a bound of its own: GRBL answers nothing until the switches are found."""
         started_s = self._clock.now_s()
-        self._alarm = None
-        self._homing = True
         self._command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
-        self._homing = False
         taken_s = self._clock.now_s() - started_s
         self._wait_until_still(0.0)
+        self._alarm, self._count_lost = None, False
         return taken_s
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
@@ -115,16 +120,14 @@ class Grbl:
     def stop(self) -> bool:
         """Cancel the jog: GRBL slows down within its acceleration and keeps count."""
         self._line.send(_CANCEL_JOG)
-        self._wait_until_still(0.0)
+        self._wait_until_still(self._braking_s)
         return True
 
-    def abort(self) -> None:
+    def abort(self) -> bool:
         """Cancel the jog, or break off homing, which nothing but a reset can."""
-        try:
+        with suppress(StageLost):  # what cannot be reached cannot be stopped
             self._line.send(_RESET if self._homing else _CANCEL_JOG)
-        except StageLost:
-            pass  # what cannot be reached cannot be stopped, and the failure that led here is already on its way
-        self._homing = False
+        return not self._homing
 
     def recover(self) -> bool:
         """Bring GRBL back to listening, by the kind of its state; a lock stays unless the position was kept."""
@@ -139,9 +142,9 @@ class Grbl:
                 # After alarms 1 and 2 GRBL answers nothing but a reset, and drops one that comes too early.
                 self._reset()
             elif report.state == "Idle":
-                return self._alarm in (None, 2)
+                return not self._count_lost
             elif report.state == "Alarm":
-                return self._unlock_if_kept()
+                return self._unlock_if_kept(self._machine_point(report))
             else:
                 self._leave(report)
         raise StageTimeout(
@@ -166,9 +169,10 @@ class Grbl:
             case _:
                 self._reset()
 
-    def _unlock_if_kept(self) -> bool:
+    def _unlock_if_kept(self, here: Point) -> bool:
         """Clear the lock after an alarm that keeps the position, and only then; return whether it was one."""
-        if self._alarm != 2:
+        # A controller that has restarted unseen counts from zero again.
+        if self._alarm != 2 or self._count_lost or here == (0.0, 0.0):
             return False
         self._alarm = None
         self._command("$X")
@@ -182,6 +186,7 @@ class Grbl:
     def _command(self, text: str, bound_s: float = 2.0) -> list[grbl.Message]:
         """Send one command, wait for its response, and return what was said in between."""
         self._raise_pending()
+        self._homing = text.startswith("$H")
         self._line.send(text.encode("ascii") + b"\n")
         deadline_s = self._clock.now_s() + bound_s
         said: list[grbl.Message] = []
@@ -203,14 +208,22 @@ class Grbl:
         if text is None:
             return None
         message = grbl.parse(text)
+        self._note(message)
         if isinstance(message, grbl.Alarm):
-            self._alarm = message.code
             raise alarm_failure(message.code)
         if isinstance(message, grbl.Banner):
             raise StageLost("the controller has restarted, and its position is lost; check its power, then home it")
+        return message
+
+    def _note(self, message: grbl.Message) -> None:
+        """Remember what outlasts a message: the work offset, the last alarm, and whether the count was lost."""
         if isinstance(message, grbl.Report) and message.offset is not None:
             self._offset = message.offset
-        return message
+        elif isinstance(message, grbl.Banner):
+            self._count_lost = True
+        elif isinstance(message, grbl.Alarm):
+            self._alarm = message.code
+            self._count_lost = self._count_lost or message.code != 2
 
     def _raise_pending(self) -> None:
         """Take what has arrived unasked, so that nothing old is mistaken for an answer to what is sent next."""
@@ -222,12 +235,12 @@ class Grbl:
         self._raise_pending()
         self._wait_for_turn()
         self._line.send(_POLL)
-        deadline_s = self._clock.now_s() + bound_s(0.0)
+        deadline_s = self._clock.now_s() + patience_s(0.0)
         while (message := self._receive(deadline_s)) is not None:
             if isinstance(message, grbl.Report):
                 return message
         raise StageTimeout(
-            f"no status report within {bound_s(0.0):g} s; check cable and power, then recover and home the stage"
+            f"no status report within {patience_s(0.0):g} s; check cable and power, then recover and home the stage"
         )
 
     def _wait_for_turn(self) -> None:
@@ -245,7 +258,7 @@ class Grbl:
         while self._receive(started_s + predicted_s) is not None:
             pass
         last: grbl.Report | None = None
-        while self._clock.now_s() < started_s + bound_s(predicted_s):
+        while self._clock.now_s() < started_s + patience_s(predicted_s):
             report = self._poll()
             if report.state == "Idle":
                 point = self._machine_point(report)
@@ -257,7 +270,7 @@ class Grbl:
             else:
                 raise state_failure(report, self._alarm)
         raise StageTimeout(
-            f"the stage still moves after {bound_s(predicted_s):.1f} s, where {predicted_s:.1f} s were expected; "
+            f"the stage still moves after {patience_s(predicted_s):.1f} s, where {predicted_s:.1f} s were expected; "
             "it was told to stop: recover and home it"
         )
 
@@ -284,10 +297,9 @@ class Grbl:
         for text in self._line.lines_until(self._clock.now_s() + within_s):
             _refuse_other_firmware(text)
             message = grbl.parse(text)
-            if isinstance(message, grbl.Alarm):
-                self._alarm = message.code
             if isinstance(message, grbl.Banner):
                 return True
+            self._note(message)
         return False
 
     def _poll_anything(self) -> grbl.Report | None:
@@ -297,9 +309,8 @@ class Grbl:
         newest: grbl.Report | None = None
         for text in self._line.lines_until(self._next_poll_s):
             message = grbl.parse(text)
-            if isinstance(message, grbl.Alarm):
-                self._alarm = message.code
-            elif isinstance(message, grbl.Report):
+            self._note(message)
+            if isinstance(message, grbl.Report):
                 newest = message
         return newest
 

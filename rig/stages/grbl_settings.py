@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 
 from rig.errors import WrongFirmware
-from rig.stages.motion import bound_s
+from rig.stages.motion import patience_s
 from rig.stages.protocol import Box, Identity, MotionLimits
 
 # Reports and commands carry three decimals: each rounds by half a micrometre.
@@ -95,7 +95,7 @@ class GrblSettings:
         """Return a bound for homing: across the travel at the seek rate, and twice the slow search."""
         seek_s = 60.0 * max(self._number(130 + axis) for axis in axes) / self._number(25)
         locate_s = 4.0 * 60.0 * self._number(27) / self._number(24)
-        return max(_SHORTEST_HOMING_BOUND_S, bound_s(seek_s + locate_s))
+        return max(_SHORTEST_HOMING_BOUND_S, patience_s(seek_s + locate_s))
 
     def _options(self) -> str:
         """Return the letters of the compile-time options."""

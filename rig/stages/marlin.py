@@ -6,17 +6,18 @@ gives itself away at the next command, whatever it was.
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 
 from rig.errors import RigError, StageAlarm, StageError, StageLost, StageRejected, StageTimeout, WrongFirmware
 from rig.stages import marlin_messages as marlin
 from rig.stages.marlin_settings import MarlinSettings
-from rig.stages.motion import bound_s
+from rig.stages.motion import patience_s
 from rig.stages.protocol import AxisIndex, Box, Identity, Point
 from rig.stages.transport import LineTransport
 
 _BOOT_S = 3.0
 _QUIET_S = 0.2
-_ANSWER_S = bound_s(0.0)
+_ANSWER_S = patience_s(0.0)
 _RESENDS = 5
 
 
@@ -68,7 +69,7 @@ class Marlin:
         x, y = self._axes
         for point in path:
             self._command(f"G1 {x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}")
-        self._command("M400", bound_s(predicted_s))
+        self._command("M400", patience_s(predicted_s))
         return self.read_position()
 
     def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
@@ -97,14 +98,13 @@ class Marlin:
         self._command("M400")
         return False
 
-    def abort(self) -> None:
+    def abort(self) -> bool:
         """Send the emergency stop of motion, which firmware with an emergency parser obeys at once."""
-        try:
+        with suppress(StageLost):  # what cannot be reached cannot be stopped
             self._line.send(b"M410\n")
             # Its own ok, which answers no numbered line, must not be taken for the next answer.
             self._ignore_for(0.1)
-        except StageLost:
-            pass  # what cannot be reached cannot be stopped, and the failure that led here is already on its way
+        return False
 
     def recover(self) -> bool:
         """Get Marlin to answer again; a controller that was killed has to restart, by opening the port anew."""

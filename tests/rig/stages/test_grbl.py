@@ -268,6 +268,49 @@ def test_an_alarm_that_somebody_else_cleared_still_loses_the_position() -> None:
     assert not stage.trusted
 
 
+@pytest.mark.parametrize("seen", [True, False])
+def test_a_restart_after_alarm_2_loses_the_position_whether_it_was_seen_or_not(seen: bool) -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-100.0, -100.0)
+    bench.firmware.receive(b"G53 G0 X10\n")
+    with pytest.raises(StageAlarm, match="ALARM:2"):
+        stage.position()
+    assert stage.trusted
+    if not seen:
+        bench.wire.spoil_to_host.append(lambda data: b"" if b"Grbl" in data else data)
+    bench.firmware.restart()
+    bench.clock.sleep_s(2.0)
+    stage.recover()
+    assert not stage.trusted
+
+
+def test_hold_waits_as_long_as_slow_brakes_need() -> None:
+    bench = Bench(partial(SimulatedGrbl, settings={120: "20.000", 121: "20.000"}))
+    stage = homed(bench)
+    bench.firmware.receive(b"$J=G90 G53 G21 X-390 F6000\n")
+    bench.clock.sleep_s(4.0)
+    stage.hold()
+    assert stage.trusted
+    assert not bench.firmware.mechanics.moving
+
+
+def test_a_path_of_which_the_second_part_is_refused_is_not_followed() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    bench.wire.spoil_to_controller.append(lambda data: data.replace(b"$J=G90 G21 G53 X-300.000", b"$Q"))
+    with pytest.raises(StageRejected, match=r"refused .* nothing moved by it"):
+        stage.move_to(-300.0, -300.0)
+    bench.wire.spoil_to_controller.clear()
+    bench.clock.sleep_s(1.0)
+    assert not bench.firmware.mechanics.moving
+    assert bench.true_position().x_mm > -50.0
+    assert stage.trusted
+    target = Point(-50.0, -50.0)
+    assert stage.move_to(*target).is_at(target)
+    assert bench.true_position() == pytest.approx(target, abs=0.01)
+
+
 def test_what_is_left_of_a_damaged_line_does_not_spoil_the_recovery() -> None:
     bench = Bench(SimulatedGrbl)
     stage = homed(bench)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from rig.errors import KeepOutCrossed, OutsideTravel
 from rig.simulation.controller.kinematics import Profile
-from rig.stages.motion import bound_s, duration_s, one_sided, path_duration_s
+from rig.stages.motion import duration_s, one_sided, path_duration_s, patience_s
 from rig.stages.protocol import Box, MotionLimits, Point
 from rig.stages.workspace import Workspace, segment_meets
 
@@ -24,7 +24,7 @@ def test_a_long_and_a_short_motion() -> None:
     assert duration_s(start, Point(0.0, 2.0), LIMITS) == pytest.approx(0.2)
     assert duration_s(start, Point(50.0, 0.0), LIMITS, feed_mm_per_s=10.0) == pytest.approx(5.02)
     assert duration_s(start, start, LIMITS) == 0.0
-    assert bound_s(10.0) == 17.0
+    assert patience_s(10.0) == 17.0
 
 
 @settings(deadline=None)
