@@ -23,8 +23,8 @@ RigError
 └── CaptureStopped
 
 A `StageError` happened to the stage, a `CameraError` to the camera; a `PlanRefused` was found before anything moved. A
-`SessionError` is about the files of a capture, and `CaptureStopped` ends one that the operator has stopped. Every message says what is
-wrong, the value found, the limit it broke, and what to do, in one line.
+`SessionError` is about the files of a capture, and `CaptureStopped` ends one that the operator has stopped. Every
+message says what is wrong, the value found, the limit it broke, and what to do, in one line.
 """
 
 
