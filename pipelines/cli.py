@@ -38,6 +38,8 @@ for _command in ("simulate:simulate", "darken:darken", "reconstruct:reconstruct"
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
 
+for _command in ("init:init", "check:check", "capture:capture", "verify:verify"):
+    app.command(f"pipelines.{_command}")
 app.command("pipelines.stage:app", name="stage")
 
 

@@ -214,8 +214,8 @@ class Capture:
         self._journal.event("settling", frame=frame.number, **msgspec.to_builtins(found))
         if not found.settled:
             self._warn(
-                f"the rig still swings after {self._settings.settle.longest_s:g} s; "
-                "stiffen it, lower its acceleration, or raise settle.longest_s"
+                f"no rest was seen within {self._settings.settle.longest_s:g} s, which is waited from now on; light the "
+                "scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
             )
         return found.wait_s
 

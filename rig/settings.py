@@ -17,6 +17,8 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Find it once per session, from short frames after a long move.
     exposure_s : float
         Of these short frames.
+    limit_px : float
+        Which shift of the picture does no harm.
     longest_s : float
         How long to look; a rig that still swings then is reported.
     wait_s : float
@@ -25,12 +27,13 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     measure: bool = True
     exposure_s: float = 0.01
+    limit_px: float = 0.1
     longest_s: float = 3.0
     wait_s: float = 0.5
 
     def __post_init__(self) -> None:
-        if min(self.exposure_s, self.longest_s) <= 0.0 or self.wait_s < 0.0:
-            raise ValueError(f"settle times must be positive; got {self}")
+        if min(self.exposure_s, self.longest_s, self.limit_px) <= 0.0 or self.wait_s < 0.0:
+            raise ValueError(f"settle times and limits must be positive; got {self}")
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):

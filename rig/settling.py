@@ -2,15 +2,15 @@
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from rig.cameras.protocol import Pixels
 from rig.clock import Clock
 from rig.settings import SettleSettings
 
-# Frames at rest differ from one another by noise; those that differ by this much more show a swing.
-_EXCESS = 1.5
 _LEAST_FRAMES = 6
 
 
@@ -22,21 +22,24 @@ class Settling(Struct, frozen=True):
     wait_s : float
         How long to rest before an exposure.
     settled : bool
-        Whether the rig came to rest while it was watched.
+        Whether the rig was seen to come to rest.
+    scatter_px : float
+        Of the shifts at rest: what noise alone makes.
     curve : tuple of (float, float)
-        Time after the stop, and the rms difference from the rig at rest in units of the noise.
+        Time after the stop, and the shift from the picture at rest in pixels.
     """
 
     wait_s: float
     settled: bool
+    scatter_px: float
     curve: tuple[tuple[float, float], ...]
 
 
 def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: SettleSettings) -> Settling:
     """Watch the rig right after a move.
 
-    The last third of the frames stands for the rig at rest. A frame taken earlier shows a swing when it differs from
-    their mean by more than they do themselves.
+    The mean of the last third of the frames is the picture r at rest. A small shift d changes a frame by ∇r · d, so d
+    is the least-squares solution of ∇r · d = frame − r over all pixels.
 
     Parameters
     ----------
@@ -45,23 +48,39 @@ def measure_settling(expose: Callable[[float], Pixels], clock: Clock, settings: 
     clock : Clock
         The rig's time.
     settings : SettleSettings
-        For how long to watch, and with which exposure.
+        For how long to watch, with which exposure, and which shift does no harm.
     """
     begun_s = clock.now_s()
     times_s: list[float] = []
     frames: list[Pixels] = []
     while clock.now_s() - begun_s < settings.longest_s or len(frames) < _LEAST_FRAMES:
         times_s.append(clock.now_s() - begun_s)
-        frames.append(np.asarray(expose(settings.exposure_s), np.float32))
+        frames.append(_smooth(expose(settings.exposure_s)))
     at_rest = len(frames) - len(frames) // 3
-    rest = np.mean(frames[at_rest:], axis=0)
-    differences = np.array([np.sqrt(np.mean(np.square(frame - rest))) for frame in frames])
-    noise = max(float(np.median(differences[at_rest:])), 1e-6)
-    swinging = np.flatnonzero(differences > _EXCESS * noise)
+    shifts_px = _shifts_px(frames, np.mean(frames[at_rest:], axis=0))
+    scatter_px = float(np.median(shifts_px[at_rest:]))
+    swinging = np.flatnonzero(shifts_px > max(settings.limit_px, 4.0 * scatter_px))
     first_still = int(swinging[-1]) + 1 if len(swinging) else 0
-    settled = first_still <= at_rest
+    # In the dark shifts are noise, and a rig that swings to the end has no picture at rest
+    settled = first_still <= at_rest and scatter_px <= settings.limit_px
     return Settling(
         wait_s=times_s[first_still] if settled else settings.longest_s,
         settled=settled,
-        curve=tuple((round(t, 4), round(float(d) / noise, 3)) for t, d in zip(times_s, differences, strict=True)),
+        scatter_px=round(scatter_px, 5),
+        curve=tuple((round(t, 4), round(float(shift), 4)) for t, shift in zip(times_s, shifts_px, strict=True)),
     )
+
+
+def _smooth(pixels: Pixels) -> NDArray[np.float32]:
+    """Return a frame in grey without its finest detail: noise has no gradient worth following."""
+    grey = pixels if pixels.ndim == 2 else pixels.mean(axis=2)
+    return np.asarray(cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), 1.5), np.float32)
+
+
+def _shifts_px(frames: list[Pixels], rest: Pixels) -> NDArray[np.float64]:
+    """Return how far each frame is shifted from the picture at rest."""
+    along_rows, along_columns = np.gradient(np.asarray(rest, float))
+    gradients = np.stack([along_columns.ravel(), along_rows.ravel()])
+    normal = gradients @ gradients.T + 1e-9 * np.eye(2)
+    changes = np.stack([gradients @ (frame - rest).ravel() for frame in frames])
+    return np.asarray(np.linalg.norm(np.linalg.solve(normal, changes.T), axis=0))
