@@ -25,7 +25,8 @@ def verify(session: Path, /) -> dict[str, Any]:
         say(f"problem: {problem}")
     if verdict.problems:
         raise SessionCorrupt(
-            f"{session}: {len(verdict.problems)} problems, the first: {verdict.problems[0]}; restore files from a copy, or run capture again if the session is not complete"
+            f"{session}: {len(verdict.problems)} problems, the first: {verdict.problems[0]}; "
+            f"restore files from a copy, or run capture again if the session is not complete"
         )
     state = "complete" if verdict.sealed else f"{len(verdict.missing)} still to be taken"
     say(f"{session}: {verdict.present} of {verdict.planned} frames present and whole, {state}")

@@ -214,8 +214,8 @@ class Capture:
         self._journal.event("settling", frame=frame.number, **msgspec.to_builtins(found))
         if not found.settled:
             self._warn(
-                f"no rest was seen within {self._settings.settle.longest_s:g} s, which is waited from now on; light the "
-                "scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
+                f"no rest was seen within {self._settings.settle.longest_s:g} s, which is waited from now on; "
+                "light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
             )
         return found.wait_s
 

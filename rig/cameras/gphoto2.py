@@ -7,7 +7,7 @@ from typing import Any
 from rig.cameras.bounded import call_within
 from rig.cameras.protocol import CameraReport, Exposure
 from rig.cameras.settings import GPhoto2Settings
-from rig.errors import CameraError, MissingExtra
+from rig.errors import CameraError, CameraTimeout, MissingExtra
 
 _SHUTTER_NAMES = ("shutterspeed", "shutterspeed2", "exposuretime")
 _RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focusmode", "batterylevel", "cameramodel")
@@ -80,7 +80,7 @@ class GPhoto2Camera:
             raise CameraError("the camera is not connected; open it first")
         try:
             return call_within(self._settings.answer_s + 2.0 * extra_s, call, what)
-        except CameraError:
+        except CameraTimeout:
             self._camera = None  # stuck, so not even to be asked to disconnect
             raise
         except self._gphoto2.GPhoto2Error as failure:

@@ -6,7 +6,7 @@ from typing import Any
 from rig.cameras.bounded import call_within
 from rig.cameras.protocol import CameraReport, Exposure
 from rig.cameras.settings import MicroManagerSettings
-from rig.errors import CameraError, MissingExtra
+from rig.errors import CameraError, CameraTimeout, MissingExtra
 
 
 class MicroManagerCamera:
@@ -69,7 +69,7 @@ class MicroManagerCamera:
             raise CameraError("the camera is not connected; open it first")
         try:
             return call_within(self._settings.answer_s + bound_s, call, what)
-        except CameraError:
+        except CameraTimeout:
             self._core = None  # stuck, so not even to be asked to disconnect
             raise
         except (RuntimeError, OSError) as failure:

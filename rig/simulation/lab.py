@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +10,12 @@ from numpy.typing import NDArray
 from rig.boards import Board
 from rig.plan import StepKind
 from rig.simulation.boards import standing_board
-from rig.simulation.experiment import paper_experiment
+from rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from rig.simulation.scene import TexturedPlane, render
 from rig.stages.protocol import Point
 
 # After a stop the carriage swings along both axes, as an undamped gantry does.
-_SWING_MM, _SWING_HZ, _SWING_DECAY_S = 0.3, 7.0, 0.12
+_SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
 
 
 class SimulatedLab:
@@ -54,13 +55,22 @@ class SimulatedLab:
         self._true_position = true_position
         self._still_s = still_s
         self._boards = boards
-        self._experiment = paper_experiment(*size_px).grey()
+        self._size_px = size_px
         self._lit, self._unlit = lit_photons_per_s, unlit_photons_per_s
         self._seed = seed
-        self._illumination = self._experiment.optics.relative_illumination()
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
+
+    @cached_property
+    def _experiment(self) -> SimulatedExperiment:
+        """The paper's objects and camera, drawn when they are first looked at."""
+        return paper_experiment(*self._size_px).grey()
+
+    @cached_property
+    def _illumination(self) -> NDArray[np.float32]:
+        """What the lens lets through."""
+        return self._experiment.optics.relative_illumination()
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
         """Do what the guide asks of a person: put things up or away, switch the light, cover the lens."""
