@@ -9,6 +9,7 @@ import msgspec
 
 from rig.errors import PlanRefused, SessionCorrupt
 from rig.session.disk import PART, in_words, locked, set_aside, sha256, sync_folder, write_new
+from rig.session.frames import PlannedFrame, planned_frames
 from rig.session.journal import Committed, Journal
 from rig.session.session import ASIDE, FRAMES, JOURNAL, PLAN, FrozenPlan, Session, is_sealed
 from rig.settings import RigSettings
@@ -38,6 +39,20 @@ def has_session(folder: Path) -> bool:
     return (folder / PLAN).exists()
 
 
+def taken_frames(folder: Path) -> list[tuple[PlannedFrame, Committed, Path]]:
+    """Return the frames that count, in the order of the plan, each with its record and its file: for all who read.
+
+    Raises
+    ------
+    SessionCorrupt
+        Plan or journal cannot be read.
+    """
+    frames = planned_frames(read_plan(folder).plan)
+    with Journal(folder / JOURNAL, read_only=True) as journal:
+        valid = {it.frame: it for it in journal.committed() if it.void is None}
+    return [(it, valid[it.number], folder / FRAMES / valid[it.number].file) for it in frames if it.number in valid]
+
+
 @contextmanager
 def opened(folder: Path, plan: FrozenPlan | None, progress: Progress = iter) -> Iterator[Session]:
     """Begin a session in `folder`, or go on with the one that is there, and close it in the end.
@@ -56,13 +71,15 @@ def opened(folder: Path, plan: FrozenPlan | None, progress: Progress = iter) -> 
     SessionBusy
         Another capture has it.
     SessionCorrupt
-        Plan and journal do not agree, or the folder holds other things.
+        Plan and journal do not agree, or the folder is complete, or holds other things.
     SessionUnwritable
         The folder cannot be written.
     """
     with in_words(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with locked(folder):
+        if is_sealed(folder):
+            raise SessionCorrupt(f"{folder}: is complete and is not written to any more; name another folder")
         if not has_session(folder):
             _begin(folder, plan)
         frozen = read_plan(folder)
@@ -135,6 +152,3 @@ def refuse_other_rig(frozen: FrozenPlan, now: RigSettings) -> None:
             raise PlanRefused(
                 f"[{name}] of the rig.toml is not what the session was begun with; restore it, or begin a new session"
             )
-
-
-__all__ = ["has_session", "is_sealed", "opened", "read_plan", "refuse_other_rig"]
