@@ -4,13 +4,17 @@ import json
 import os
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+# The protocol is spoken over descriptors 3 and 4; by way of 103 and 104, in case that these are what it is given.
+_LAUNCH = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 103); os.dup2(int(sys.argv[2]), 104); os.dup2(103, 3); "
+    "os.dup2(104, 4); os.execv(sys.argv[3], sys.argv[3:])"
 )
 _LONGEST_WAIT_MS = 30_000
 
@@ -103,15 +107,9 @@ def browsing(folder: Path) -> Iterator[Tab]:
     assert CHROMIUM is not None
     to_browser, send = os.pipe()
     receive, from_browser = os.pipe()
-    options = [
-        "--headless=new",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--remote-debugging-pipe",
-        f"--user-data-dir={folder}",
-    ]
-    # The protocol is spoken over descriptors 3 and 4
-    command = ["sh", "-c", f'exec "$0" "$@" 3<&{to_browser} 4>&{from_browser}', CHROMIUM, *options]
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe"]
+    launch = [sys.executable, "-c", _LAUNCH, str(to_browser), str(from_browser)]
+    command = [*launch, CHROMIUM, *options, f"--user-data-dir={folder}"]
     browser = subprocess.Popen(command, pass_fds=(to_browser, from_browser), stderr=subprocess.DEVNULL)
     os.close(to_browser)
     os.close(from_browser)

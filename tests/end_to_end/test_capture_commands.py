@@ -18,6 +18,9 @@ STEPS = [("charuco", 49), ("charuco", 49), ("bright", 49), ("dark_scene", 49), (
          ("flat", 20)]  # fmt: skip
 
 
+KEEP_OUT = "[[stage.keep_out]]\nx_mm = [-260, -240]\ny_mm = [-260, -240]"
+
+
 class Shell:
     """Runs commands and keeps what they printed."""
 

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from pipelines.capture_page import serving_page
@@ -130,9 +132,6 @@ def test_it_is_dark(running: Running, browser: Tab) -> None:
     browser.click("go")
     browser.wait_until("document.getElementById('title').textContent.includes('Bright set')")
     picture = base64.b64decode(browser.call("Page.captureScreenshot", format="png")["data"])
-    import cv2
-    import numpy as np
-
     blue, green, red = cv2.split(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR))
     assert max(blue.max(), green.max()) <= 60
     assert red.max() <= 230
