@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 
-from rig.errors import RigError, StageAlarm, StageError, StageLost, StageRejected, StageTimeout, WrongFirmware
+from rig.errors import RigError, StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from rig.stages import marlin_messages as marlin
 from rig.stages.marlin_settings import MarlinSettings
 from rig.stages.motion import patience_s
@@ -19,6 +19,8 @@ _BOOT_S = 3.0
 _QUIET_S = 0.2
 _ANSWER_S = patience_s(0.0)
 _RESENDS = 5
+_BEGINNINGS = 3
+_ECHO_S = 0.7
 
 
 class Marlin:
@@ -40,6 +42,7 @@ class Marlin:
         self._axes = axes
         self._travel_mm = travel_mm
         self._sent = 0
+        self._words = 0
 
     def connect(self) -> None:
         """Open the connection; most boards restart when it opens, so wait until they have said all."""
@@ -109,18 +112,11 @@ class Marlin:
     def recover(self) -> bool:
         """Get Marlin to answer again; a controller that was killed has to restart, by opening the port anew."""
         if self._line.is_open:
-            try:
-                self._ignore_for(0.1)
-                self._command("M114 R", _QUIET_S)
-            except StageLost:
-                if self._line.is_open:
-                    self._ignore_for(_QUIET_S)
-                    self._begin()
-                    return False
-            except StageError:
-                pass
-            else:
-                return True
+            self._ignore_for(0.1)
+            still_counts = self._still_counts()
+            if still_counts is not None:
+                self._begin()
+                return still_counts
         self.connect()
         return False
 
@@ -134,10 +130,42 @@ class Marlin:
             pass
 
     def _begin(self) -> None:
-        """Begin counting lines, and set what every motion relies on: millimetres, absolute, motors kept on."""
-        self._sent = -1
-        for command in ("M110 N0", "G21", "G90", "M84 S0"):
-            self._command(command)
+        """Begin counting lines, and set what every motion relies on: millimetres, absolute, motors kept on.
+
+        Answers to what was sent before may still be on their way. They end where the controller echoes a word of ours,
+        and the next `ok` is the first that counts.
+        """
+        for _ in range(_BEGINNINGS):
+            word = self._new_word()
+            self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {word}\n".encode("ascii"))
+            echoed = False
+            for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
+                if echoed and isinstance(marlin.parse(text), marlin.Ok):
+                    self._sent = 0
+                    for command in ("G21", "G90", "M84 S0"):
+                        self._command(command)
+                    return
+                echoed = echoed or word in text
+        raise StageTimeout(
+            f"no answer as from Marlin to {_BEGINNINGS} attempts; check power, baud rate and protocol of the controller"
+        )
+
+    def _still_counts(self) -> bool | None:
+        """Return whether the controller takes the next line number, as none does that has restarted; None if mute."""
+        word = self._new_word()
+        self._sent += 1
+        self._line.send(marlin.numbered(self._sent, f"M118 {word}"))
+        heard = None
+        for text in self._line.lines_until(self._clock.now_s() + _QUIET_S):
+            if word in text:
+                return True
+            heard = False
+        return heard
+
+    def _new_word(self) -> str:
+        """Return a word that was not said before, for the controller to echo."""
+        self._words += 1
+        return f"faintfield-{self._words}."
 
     def _await_start(self) -> None:
         """Wait until the controller has started and fallen silent, or has shown that it did not restart."""
@@ -200,7 +228,7 @@ class Marlin:
         failure: RigError | None = None
         if isinstance(message, marlin.Start):
             failure = StageLost("the controller has restarted, and its position is lost; check its power, then home it")
-        elif isinstance(message, marlin.Resend) and message.number != self._sent and self._sent > 0:
+        elif isinstance(message, marlin.Resend) and message.number != self._sent:
             failure = StageLost(
                 f"the controller waits for line {message.number} and was sent {self._sent}: it has restarted, "
                 "and its position is lost; recover and home it"

@@ -177,6 +177,7 @@ class SimulatedMarlin:
             "M84": lambda: self._release_after(words.get("S")),
             "M114": lambda: self._tell_position(real="R" in command),
             "M115": self._tell_capabilities,
+            "M118": lambda: self.say(command[5:]),
             "M119": self._tell_switches,
             "M211": self._tell_limits,
             "M503": self._tell_settings,

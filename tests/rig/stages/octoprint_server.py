@@ -3,7 +3,8 @@
     python octoprint_server.py '{"resend_ratio": 0}'
 
 The port's number is the first line on standard output. Every connection meets a printer that has just started. Lines
-on standard input go to the printer as if they had come over the connection: its `!!DEBUG:` commands.
+on standard input go to the printer as if they had come over the connection: its `!!DEBUG:` commands. Each is answered
+by a line on standard output when the printer has it.
 """
 
 import importlib
@@ -56,18 +57,20 @@ class Bench:
     def listen(self, connection: socket.socket, printer: Any) -> None:
         """Pass what arrives to the printer."""
         try:
-            while data := connection.recv(1024):
-                while data:
-                    data = data[printer.write(data) :]
+            # The printer takes one line per write, as OctoPrint itself sends them.
+            for line in connection.makefile("rb"):
+                while line:
+                    line = line[printer.write(line) :]
         except Exception as failure:
             sys.stderr.write(f"listening ended: {failure!r}\n")
         printer.outgoing = None
 
     def obey(self) -> None:
-        """Pass lines of standard input to the printer."""
+        """Pass lines of standard input to the printer, and say so."""
         for line in sys.stdin:
-            if self.printer is not None:
-                self.printer.write(line.encode("ascii"))
+            self.printer.write(line.encode("ascii"))
+            sys.stdout.write("passed on\n")
+            sys.stdout.flush()
 
 
 def main() -> None:

@@ -8,16 +8,9 @@ import pytest
 from rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.gantry import Gantry
 from rig.stages.protocol import Box, Point
 from rig.stages.settings import StageSettings
-
-
-def homed(bench: Bench) -> Gantry:
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
-    return stage
+from tests.rig.stages.benches import homed
 
 
 def without(*starts: bytes) -> Callable[[bytes], bytes]:
@@ -66,6 +59,18 @@ def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
     assert stage.trusted
 
 
+def test_recovery_notices_a_restart_that_nobody_saw() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    stage.recover()
+    assert stage.trusted
+    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.firmware.restart()
+    bench.clock.sleep_s(5.0)
+    stage.recover()
+    assert not stage.trusted
+
+
 def test_a_position_is_not_taken_from_an_answer_that_has_none() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
@@ -80,6 +85,21 @@ def test_firmware_that_tells_only_projected_positions_is_waited_for() -> None:
     stage = homed(bench)
     stage.move_to(200.0, 200.0)
     assert bench.true_position() == pytest.approx((200.0, 200.0), abs=0.01)
+
+
+def test_answers_that_come_late_do_not_put_the_recovery_out_of_step() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    for _ in range(3):
+        bench.firmware.say("ok")
+    bench.firmware.say("Resend: 99")
+    bench.wire.hold_up(0.25)
+    bench.firmware.say("ok")
+    stage.recover()
+    stage.home()
+    target = Point(100.0, 100.0)
+    assert stage.move_to(*target).is_at(target)
+    assert bench.true_position() == pytest.approx(target, abs=0.01)
 
 
 def test_a_killed_controller_is_restarted_and_has_to_be_homed() -> None:

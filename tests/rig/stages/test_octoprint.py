@@ -38,8 +38,10 @@ def printer(request: pytest.FixtureRequest) -> Iterator[tuple[Gantry, Command]]:
 
         def command(text: str) -> None:
             assert process.stdin is not None
+            assert process.stdout is not None
             process.stdin.write(text + "\n")
             process.stdin.flush()
+            assert process.stdout.readline() == "passed on\n"
 
         yield stage, command
         stage.close()
@@ -84,7 +86,6 @@ def test_faults(printer: tuple[Gantry, Command], fault: str, failure: type[Excep
 
 
 def _wander(stage: Gantry) -> None:
-    """Move about until something happens; the printer's process takes its command in its own time."""
-    while True:
-        for x_mm in range(10, 200, 10):
-            stage.move_to(x_mm, 20.0)
+    """Move about for a while."""
+    for x_mm in range(10, 200, 10):
+        stage.move_to(x_mm, 20.0)

@@ -12,19 +12,7 @@ from rig.simulation.controller.grbl import SimulatedGrbl
 from rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
 from rig.stages.settings import StageSettings
 from rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
-
-
-class Traffic:
-    """Keeps what passes on the wire."""
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[float, str, bytes]] = []
-
-    def record(self, at_s: float, direction: str, data: bytes) -> None:
-        self.entries.append((at_s, direction, data))
-
-    def all(self, direction: str) -> bytes:
-        return b"".join(data for _, way, data in self.entries if way == direction)
+from tests.rig.stages.benches import Traffic
 
 
 @pytest.fixture

@@ -1,0 +1,34 @@
+"""What the tests of drivers share: a stage that is ready, and an ear on the wire."""
+
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.stages.gantry import Gantry
+from rig.stages.settings import StageSettings
+
+
+class Traffic:
+    """A `TrafficLog` that keeps what passes on the wire."""
+
+    def __init__(self) -> None:
+        self.entries: list[tuple[float, str, bytes]] = []
+
+    def record(self, at_s: float, direction: str, data: bytes) -> None:
+        self.entries.append((at_s, direction, data))
+
+    def all(self, direction: str) -> bytes:
+        return b"".join(self.chunks(direction))
+
+    def chunks(self, direction: str) -> list[bytes]:
+        return [data for _, way, data in self.entries if way == direction]
+
+
+def homed(bench: Bench, traffic: Traffic | None = None, settings: StageSettings | None = None) -> Gantry:
+    stage = bench.stage(settings, traffic)
+    stage.connect()
+    stage.home()
+    return stage
+
+
+def grbl(bench: Bench) -> SimulatedGrbl:
+    assert isinstance(bench.firmware, SimulatedGrbl)
+    return bench.firmware
