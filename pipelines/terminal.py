@@ -64,6 +64,7 @@ class TerminalView:
         status, asked = self._panel.status, self._panel.asked
         if asked is not None and asked.number != self._asked:
             self._asked = asked.number
+            self._said.add(asked.prompt.title)
             for line in prompt_lines(asked.prompt):
                 say(line)
         if status is not None:

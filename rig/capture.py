@@ -104,6 +104,7 @@ class Capture:
         first = missing[0]
         frames = [frame for frame in missing if frame.step == first.step]
         duration_s = self._pace.to_go_s(frames, self._here, 0)
+        self._show_status(first, "waiting for your answer")
         answer = self._ask(step_prompt(first, first.step + 1, len(self._session.plan.steps), len(frames), duration_s))
         if answer == "skip":
             for frame in frames:

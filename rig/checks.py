@@ -85,11 +85,12 @@ def sharpness(grey: Pixels) -> float:
 
 
 def leak_dn(grey: Pixels) -> float:
-    """Return the brightness of the brightest part less that of the darkest, from the means of 8 x 8 parts."""
+    """Return by how much parts of a frame differ, beyond what noise makes of 8 x 8 means."""
     height, width = (length // _BLOCKS for length in grey.shape)
-    parts = np.asarray(grey[: height * _BLOCKS, : width * _BLOCKS], float)
-    means = parts.reshape(_BLOCKS, height, _BLOCKS, width).mean(axis=(1, 3))
-    return float(np.ptp(means))
+    parts = np.asarray(grey[: height * _BLOCKS, : width * _BLOCKS], float).reshape(_BLOCKS, height, _BLOCKS, width)
+    # The mean of 64 normal numbers' ranges is 4.7 of their standard deviations
+    noise = 4.7 * float(np.median(parts.std(axis=(1, 3)))) / np.sqrt(height * width)
+    return max(0.0, float(np.ptp(parts.mean(axis=(1, 3)))) - noise)
 
 
 def board_corners(grey: Pixels, boards: Sequence[Board]) -> int:

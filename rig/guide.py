@@ -16,7 +16,6 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
     "charuco": (
         "Put the boards in place, in view from every node, and let them stand still until this sweep is done.",
         "Turn the lights on.",
-        "For another sweep, move and turn the boards: nearer, farther, tilted the other way.",
     ),
     "bright": (
         "Take the boards away and put the objects in place.",
@@ -31,10 +30,14 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
         "Turn the faint light off: absolute dark.",
     ),
     "dark": ("Cover the lens. Cover the viewfinder too, if the camera has one.",),
-    "flat": (
-        "Uncover the lens and put an evenly lit diffuser right before it.",
-        "For another level, change the light so that the frames are clearly brighter or darker.",
+    "flat": ("Uncover the lens and put an evenly lit diffuser right before it.",),
+}
+_TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
+    "charuco": (
+        "Move and turn the boards: nearer or farther, tilted another way, still in view from every node.",
+        "Then let them stand still until this sweep is done.",
     ),
+    "flat": ("Change the light on the diffuser, so that the frames become clearly brighter or darker.",),
 }
 _CHECK: dict[StepKind, str] = {
     "charuco": "Check that the corners found are many and that no frame is saturated.",
@@ -164,11 +167,12 @@ def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duratio
         How many frames are to be taken, and how long that takes.
     """
     title = TITLES[frame.kind] + (f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else "")
+    to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
     will = f"Then {frames} frames follow, {spoken_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
         title=f"Step {step} of {steps}: {title}",
-        lines=(*_TO_DO[frame.kind], will, _CHECK[frame.kind]),
+        lines=(*to_do, will, _CHECK[frame.kind]),
         answers=("go", "skip", "stop"),
         unattended="go",
     )

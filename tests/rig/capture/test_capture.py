@@ -263,10 +263,10 @@ def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> 
         person.on_status = lambda status: told.append((rig.clock.now_s(), status.to_go_s))
         Capture(session, rig, person, lambda path: None).run()
         end_s = rig.clock.now_s()
-    # Two statuses for each frame: moving, exposing; of the first step's frames each is a node
-    for now_s, to_go_s in told[10 : len(told) - 10]:
+    # One status for the prompt and two for each frame, moving and exposing; in the first step each frame is a node
+    for now_s, to_go_s in told[11 : len(told) - 10]:
         assert to_go_s == pytest.approx(end_s - now_s, rel=0.1, abs=2.0)
-    now_s, to_go_s = told[10]
+    now_s, to_go_s = told[11]
     assert to_go_s == pytest.approx(end_s - now_s, rel=0.1)
 
 
