@@ -61,7 +61,7 @@ class Panel:
         self.status: Status | None = None
         self.shown: Shown | None = None
         self.on_change: list[Callable[[], None]] = []
-        self._unattended = unattended
+        self.unattended = unattended
         self._pressed: SimpleQueue[Pressed] = SimpleQueue()
         self._numbers = itertools.count(1)
 
@@ -71,7 +71,7 @@ class Panel:
 
     def ask(self, prompt: Prompt) -> Answer:
         """Wait for an answer to `prompt` from wherever it comes."""
-        if self._unattended:
+        if self.unattended:
             return prompt.unattended
         self.asked = Asked(next(self._numbers), prompt)
         self._changed()

@@ -64,11 +64,11 @@ class TerminalView:
         status, asked = self._panel.status, self._panel.asked
         if asked is not None and asked.number != self._asked:
             self._asked = asked.number
-            self._said.add(asked.prompt.title)
             for line in prompt_lines(asked.prompt):
                 say(line)
         if status is not None:
-            for line in (status.title, *(f"warning: {it}" for it in status.warnings)):
+            title = [status.title] if self._panel.unattended else []
+            for line in (*title, *(f"warning: {it}" for it in status.warnings)):
                 if line not in self._said:
                     self._said.add(line)
                     say(line)
@@ -106,9 +106,9 @@ def status_line(status: Status) -> str:
 
 
 def values_line(shown: Shown) -> str:
-    """Return the name of a frame, its histogram and what was measured in it."""
+    """Return the name of a frame and its histogram, and in a second line what was measured in it."""
     values = "  ".join(f"{name} {value:g}" for name, value in shown.values.items())
-    return f"{shown.frame.name}  {histogram_bars(shown.pixels)}  {values}"
+    return f"{shown.frame.name}  {histogram_bars(shown.pixels)}\n{values}"
 
 
 def histogram_bars(pixels: Pixels, bins: int = 24) -> str:

@@ -90,7 +90,7 @@ def leak_dn(grey: Pixels) -> float:
     parts = np.asarray(grey[: height * _BLOCKS, : width * _BLOCKS], float).reshape(_BLOCKS, height, _BLOCKS, width)
     # The mean of 64 normal numbers' ranges is 4.7 of their standard deviations
     noise = 4.7 * float(np.median(parts.std(axis=(1, 3)))) / np.sqrt(height * width)
-    return max(0.0, float(np.ptp(parts.mean(axis=(1, 3)))) - noise)
+    return max(0.0, float(np.ptp(parts.mean(axis=(1, 3))) - noise))
 
 
 def board_corners(grey: Pixels, boards: Sequence[Board]) -> int:

@@ -16,7 +16,7 @@ from rig.errors import SessionBusy, SessionUnwritable
 PART = ".part"
 
 
-def write_new(path: Path, content: bytes) -> None:
+def write_new(path: Path, content: bytes | memoryview) -> None:
     """Write `content` to `path`, which must not exist, such that it survives a power cut.
 
     The bytes go to `path` with `.part` behind it, are flushed, take their name, and the folder is flushed.
@@ -70,15 +70,15 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def file_of(exposure: Exposure) -> bytes:
-    """Return the bytes that are kept: the camera's own, or an array as a TIFF."""
+def file_of(exposure: Exposure) -> bytes | memoryview:
+    """Return what is kept: the camera's own bytes, or an array as a TIFF."""
     if exposure.content is not None:
         return exposure.content
     assert exposure.pixels is not None
     buffer = BytesIO()
     photometric = "rgb" if exposure.pixels.ndim == 3 else "minisblack"
     tifffile.imwrite(buffer, exposure.pixels, photometric=photometric)
-    return buffer.getvalue()
+    return buffer.getbuffer()  # no second copy of what may be a hundred megabytes
 
 
 @contextmanager

@@ -80,7 +80,6 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
 
 @needs_browser
 def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
-    browser.complaints.clear()
     browser.open(running.address)
     browser.wait_until("document.getElementById('title').textContent === 'Homing'")
     assert "The stage moves to its switches" in browser.text()
@@ -99,7 +98,8 @@ def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
     assert f"of {FRAMES} frames" in browser.text()
     assert browser.evaluate("document.querySelectorAll('#grid span').length") == 6
     assert browser.evaluate("document.querySelectorAll('#histogram path').length") == 1
-    assert browser.complaints == []
+    # Pages of other tests may complain that their capture has ended
+    assert [it for it in browser.complaints if running.address in it] == []
 
 
 @needs_browser
