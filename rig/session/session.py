@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -104,10 +105,11 @@ class Session:
         """Write the file of an exposure under a name that no other exposure has."""
         content = file_of(exposure)
         path = self.folder / FRAMES / f"{frame.name}_x{intent}{exposure.suffix}"
-        # Of the bytes in memory: what a disk gets wrong from here on, `verify` finds.
-        digest = hashlib.sha256(content).hexdigest()
-        write_new(path, content)
-        return Written(intent, path, digest, len(content))
+        # Of the bytes in memory, while they are written: what a disk gets wrong from here on, `verify` finds.
+        with ThreadPoolExecutor(1) as hashing:
+            digest = hashing.submit(hashlib.sha256, content)
+            write_new(path, content)
+        return Written(intent, path, digest.result().hexdigest(), len(content))
 
     def commit(self, frame: PlannedFrame, written: Written, detail: dict[str, Any]) -> Committed:
         """Record that a frame is there for good; an earlier take of it does not count any more."""
