@@ -26,10 +26,10 @@ lint: $(VENV)/installed ## style, types and import contracts
 bench: $(VENV)/installed ## speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
-lock: ## renew requirements.lock from pyproject.toml
+lock: ## renew requirements.lock from pyproject.toml; cameras are extras and not in it
 	$(PYTHON) -m venv .uv
 	.uv/bin/pip --disable-pip-version-check --quiet install uv
-	.uv/bin/uv pip compile pyproject.toml --all-extras --universal --upgrade --generate-hashes --no-annotate \
+	.uv/bin/uv pip compile pyproject.toml --extra dev --universal --upgrade --generate-hashes --no-annotate \
 	  --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
 
 clean: ## remove what the tasks made

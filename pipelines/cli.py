@@ -33,13 +33,24 @@ app = App(
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 
 
-for _name in ("demo", "simulate", "darken", "noise", "reconstruct", "report"):
+for _name in (
+    "demo",
+    "init",
+    "check",
+    "capture",
+    "verify",
+    "noise",
+    "geometry",
+    "simulate",
+    "darken",
+    "reconstruct",
+    "report",
+):
     app.command(f"pipelines.{_name}:{_name}")
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
 app["import"].command("pipelines.import_grid:import_grid", name="grid")
 app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
 app.command("pipelines.stage:app", name="stage")
-app.command("pipelines.geometry:geometry")
 app.command("pipelines.board_pdf:board")
 app["import"].command("pipelines.import_colmap:import_colmap", name="colmap")
 app["import"].command("pipelines.import_mrcal:import_mrcal", name="mrcal")

@@ -8,14 +8,23 @@ RigError
 │   ├── StageRejected
 │   └── PositionLost
 │       └── PositionDrifted
-└── PlanRefused
-    ├── OutsideTravel
-    ├── KeepOutCrossed
-    ├── NotHomed
-    └── WrongFirmware
+├── PlanRefused
+│   ├── OutsideTravel
+│   ├── KeepOutCrossed
+│   ├── NotHomed
+│   └── WrongFirmware
+├── CameraError
+│   ├── CameraTimeout
+│   └── MissingExtra
+├── SessionError
+│   ├── SessionCorrupt
+│   ├── SessionBusy
+│   └── SessionUnwritable
+└── CaptureStopped
 
-A `StageError` happened to the stage; a `PlanRefused` was found before anything moved. Every message says what is
-wrong, the value found, the limit it broke, and what to do, in one line.
+A `StageError` happened to the stage, a `CameraError` to the camera; a `PlanRefused` was found before anything moved. A
+`SessionError` is about the files of a capture, and `CaptureStopped` ends one that the operator has stopped. Every
+message says what is wrong, the value found, the limit it broke, and what to do, in one line.
 """
 
 
@@ -100,3 +109,35 @@ class NotHomed(PlanRefused):
 
 class WrongFirmware(PlanRefused):
     """The controller's firmware, or one of its settings, cannot be driven safely."""
+
+
+class CameraError(RigError):
+    """The camera did not take the frame that it was asked for."""
+
+
+class CameraTimeout(CameraError):
+    """The camera did not answer, or no file came, within the bound."""
+
+
+class MissingExtra(CameraError):
+    """The package that talks to this kind of camera is not installed."""
+
+
+class SessionError(RigError):
+    """The session's folder cannot be used."""
+
+
+class SessionCorrupt(SessionError):
+    """Plan, journal and frames do not agree, and it cannot be told from them which is right."""
+
+
+class SessionBusy(SessionError):
+    """Another capture has the session."""
+
+
+class SessionUnwritable(SessionError):
+    """A frame or an entry of the journal could not be written; what was committed before is safe."""
+
+
+class CaptureStopped(RigError):
+    """The operator has stopped the capture; running it again goes on."""

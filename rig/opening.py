@@ -1,14 +1,25 @@
 """From the configuration to the devices it names, real or simulated."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import msgspec
 
-from rig.clock import WallClock
+from rig.cameras.folder import FolderCamera
+from rig.cameras.gphoto2 import GPhoto2Camera
+from rig.cameras.micromanager import MicroManagerCamera
+from rig.cameras.protocol import Camera
+from rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
+from rig.cameras.simulated import SimulatedCamera
+from rig.clock import Clock, WallClock
 from rig.errors import PlanRefused
+from rig.plan import StepKind
+from rig.settings import RigSettings
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.grbl import SimulatedGrbl
 from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.simulation.lab import SimulatedLab
 from rig.stages.gantry import Gantry
 from rig.stages.opening import stage_from
 from rig.stages.settings import StageSettings
@@ -17,7 +28,54 @@ from rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
 _SIMULATED = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 
 
-def open_stage(settings: StageSettings, traffic: TrafficLog | None = None) -> Gantry:
+@dataclass(frozen=True)
+class Rig:
+    """The devices of a capture, not yet connected.
+
+    Parameters
+    ----------
+    stage, camera : Gantry, Camera
+        What moves and what sees.
+    clock : Clock
+        The time that both live in.
+    arrange : callable
+        Told at the beginning of each step, by its kind and sweep; a simulated lab then does what a person has done
+        in a real one.
+    """
+
+    stage: Gantry
+    camera: Camera
+    clock: Clock
+    arrange: Callable[[StepKind, int], None]
+
+
+def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
+    """Return the stage and the camera that a rig.toml describes.
+
+    Raises
+    ------
+    PlanRefused
+        A simulated camera needs a simulated stage: only there it is known where the camera truly is.
+    """
+    bench = _simulated_bench(settings.stage) if _is_simulated(settings.stage) else None
+    stage = open_stage(settings.stage, traffic, bench)
+    match settings.camera:
+        case GPhoto2Settings():
+            camera: Camera = GPhoto2Camera(settings.camera)
+        case MicroManagerSettings():
+            camera = MicroManagerCamera(settings.camera)
+        case FolderSettings():
+            camera = FolderCamera(settings.camera, WallClock())
+        case SimulatedSettings() if bench is not None:
+            lab = _lab(settings, settings.camera, bench)
+            camera = SimulatedCamera(settings.camera, stage.clock, lab.expose)
+            return Rig(stage, camera, stage.clock, lab.arrange)
+        case SimulatedSettings():
+            raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
+    return Rig(stage, camera, stage.clock, lambda kind, sweep: None)
+
+
+def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench: Bench | None = None) -> Gantry:
     """Return the stage that `settings` describe, not yet connected.
 
     Protocol `simulated`, or a port `simulated:grbl` or `simulated:marlin`, gives a simulated stage that keeps its own
@@ -29,6 +87,8 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None) -> Ga
         The `[stage]` table.
     traffic : TrafficLog, optional
         Where every byte is recorded.
+    bench : Bench, optional
+        The simulated world that a simulated stage shall stand in; one of its own without it.
 
     Raises
     ------
@@ -36,11 +96,16 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None) -> Ga
         No such stage is simulated.
     """
     traffic = traffic or NoTrafficLog()
-    if settings.protocol == "simulated" or settings.port.startswith("simulated:"):
-        bench = _simulated_bench(settings)
+    if _is_simulated(settings):
+        bench = bench or _simulated_bench(settings)
         port = settings.port or bench.link.url
         return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
     return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
+
+
+def _is_simulated(settings: StageSettings) -> bool:
+    """Return whether the stage that `settings` describe exists in the computer alone."""
+    return settings.protocol == "simulated" or settings.port.startswith("simulated:")
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:
@@ -49,3 +114,17 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     if name not in _SIMULATED:
         raise PlanRefused(f"{settings.port}: no such stage is simulated; there are {', '.join(_SIMULATED)}")
     return Bench(_SIMULATED[name])
+
+
+def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
+    """Return the simulated lab around the simulated stage."""
+    return SimulatedLab(
+        settings.grid.centre().target,
+        bench.true_position,
+        bench.still_s,
+        settings.board,
+        size_px=camera.size_px,
+        lit_photons_per_s=camera.lit_photons_per_s,
+        unlit_photons_per_s=camera.unlit_photons_per_s,
+        seed=camera.seed,
+    )

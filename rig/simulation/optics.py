@@ -5,6 +5,7 @@ against it.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,10 @@ class SimulatedOptics:
         With several samples per pixel and axis they lie evenly within each pixel, so that their mean over a pixel is
         the mean over its area.
         """
+        return _rays(self, samples_per_px)
+
+    def cast_rays(self, samples_per_px: int) -> NDArray[np.float32]:
+        """Compute what `rays` returns."""
         width, height = self.size_px
         inside = (np.arange(samples_per_px) + 0.5) / samples_per_px - 0.5
         columns = (np.arange(width)[:, np.newaxis] + inside).ravel()
@@ -59,6 +64,14 @@ class SimulatedOptics:
     def ideal(self) -> "SimulatedOptics":
         """Return the same view through a pinhole: no distortion, no vignetting."""
         return SimulatedOptics(self.size_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, (), vignetting=False)
+
+
+@lru_cache(maxsize=8)
+def _rays(optics: SimulatedOptics, samples_per_px: int) -> NDArray[np.float32]:
+    """Return the rays of a lens, computed once: a capture looks through the same one for hours."""
+    rays = optics.cast_rays(samples_per_px)
+    rays.flags.writeable = False
+    return rays
 
 
 def distort(x: Points, y: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:

@@ -70,6 +70,10 @@ class Bench:
         """Return where the carriages really are, whatever the controller reports."""
         return Point(*self.firmware.mechanics.true_mm())
 
+    def still_s(self) -> float:
+        """Return how long ago the last motion ended."""
+        return self.clock.now_s() - self.firmware.mechanics.still_since_s
+
     def plug(self) -> None:
         """Put the cable in; a controller powered by it starts."""
         self.link.plug()

@@ -138,6 +138,7 @@ class Mechanics:
     on_idle: Callable[[], None] = lambda: None
     on_switch: Callable[[], None] = lambda: None
     endless: bool = False
+    still_since_s: float = -math.inf
     _commanded: Vector = (0.0, 0.0)
     _queue: list[tuple[Vector, float, float]] = field(default_factory=list)
     _motion: Motion | None = None
@@ -268,6 +269,7 @@ class Mechanics:
         if self._queue:
             self._start_next()
         else:
+            self.still_since_s = self.clock.now_s()
             self.on_idle()
 
     def _end_motion(self) -> None:

@@ -1,0 +1,166 @@
+"""Tethered cameras through libgphoto2: the file that the camera made is kept byte for byte."""
+
+import re
+from pathlib import PurePath
+from typing import Any
+
+from rig.cameras.bounded import call_within
+from rig.cameras.protocol import CameraReport, Exposure
+from rig.cameras.settings import GPhoto2Settings
+from rig.errors import CameraError, CameraTimeout, MissingExtra
+
+_SHUTTER_NAMES = ("shutterspeed", "shutterspeed2", "exposuretime")
+_RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focusmode", "batterylevel", "cameramodel")
+
+
+class GPhoto2Camera:
+    """A `Camera` that libgphoto2 talks to.
+
+    Parameters
+    ----------
+    settings : GPhoto2Settings
+        The `[camera]` table.
+    """
+
+    def __init__(self, settings: GPhoto2Settings) -> None:
+        self._settings = settings
+        self._camera: Any = None
+        self._gphoto2: Any = None
+        self._shutter_s: float | None = None
+
+    def open(self) -> None:
+        """Connect, and set what `settings` ask for."""
+        try:
+            import gphoto2
+        except ImportError as failure:
+            raise MissingExtra(
+                "backend 'gphoto2' needs a package that is not installed; run: pip install 'faintfield[gphoto2]'"
+            ) from failure
+        self._gphoto2 = gphoto2
+        self.close()
+        self._camera = self._bounded(self._connect, "connecting")
+        for name, value in self._settings.settings.items():
+            self._set(name, value)
+
+    def report(self) -> CameraReport:
+        """Return model, serial number, exposure times and settings."""
+        values = self._bounded(self._read_settings, "reporting its settings")
+        name = " ".join(values.get(key, "") for key in ("manufacturer", "cameramodel", "serialnumber")).strip()
+        choices = self._bounded(self._shutter_choices, "listing its exposure times")
+        return CameraReport(
+            name=name or "camera without a name",
+            frame_bytes=round(self._settings.frame_mb * 1e6),
+            exposures_s=tuple(sorted(choices)),
+            readout_s=1.0,
+            settings={key: values[key] for key in _RECORDED if key in values},
+        )
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        """Release the shutter and fetch the file."""
+        if self._shutter_s != exposure_s:
+            self._bounded(lambda: self._set_shutter(exposure_s), "setting the exposure time")
+            self._shutter_s = exposure_s
+        content, name = self._bounded(self._release, f"an exposure of {exposure_s:g} s", exposure_s)
+        if not content:
+            raise CameraError(f"the camera sent {name} with 0 bytes; check its card and set it to record raw files")
+        return Exposure(PurePath(name).suffix.lower(), content=content, metadata={"camera_file": name})
+
+    def close(self) -> None:
+        """End the connection; a camera that is gone is let go in silence."""
+        camera, self._camera, self._shutter_s = self._camera, None, None
+        if camera is not None:
+            try:
+                call_within(self._settings.answer_s, camera.exit, "disconnecting")
+            except (CameraError, self._gphoto2.GPhoto2Error):
+                pass  # whatever is wrong with it was reported when it was used
+
+    def _bounded(self, call: Any, what: str, extra_s: float = 0.0) -> Any:
+        """Make a call within its bound, its failures in words."""
+        if self._camera is None and call != self._connect:
+            raise CameraError("the camera is not connected; open it first")
+        try:
+            return call_within(self._settings.answer_s + 2.0 * extra_s, call, what)
+        except CameraTimeout:
+            self._camera = None  # stuck, so not even to be asked to disconnect
+            raise
+        except self._gphoto2.GPhoto2Error as failure:
+            raise CameraError(
+                f"the camera failed at {what}: {failure.string} ({failure.code}); check cable, card, battery and that "
+                "no other program has it, then go on"
+            ) from failure
+
+    def _connect(self) -> Any:
+        """Find the camera and connect to it."""
+        camera = self._gphoto2.Camera()
+        if self._settings.port:
+            ports = self._gphoto2.PortInfoList()
+            ports.load()
+            camera.set_port_info(ports[ports.lookup_path(self._settings.port)])
+        camera.init()
+        return camera
+
+    def _read_settings(self) -> dict[str, str]:
+        """Return the value of every setting that has one."""
+        values: dict[str, str] = {}
+        pending = [self._camera.get_config()]
+        containers = (self._gphoto2.GP_WIDGET_WINDOW, self._gphoto2.GP_WIDGET_SECTION)
+        while pending:
+            widget = pending.pop()
+            pending.extend(widget.get_children())
+            if widget.get_type() not in containers and widget.get_name() not in values:
+                values[widget.get_name()] = str(widget.get_value())
+        return values
+
+    def _shutter(self) -> Any:
+        """Return the setting of the exposure time, by the first name that this camera knows."""
+        for name in _SHUTTER_NAMES:
+            try:
+                return self._camera.get_single_config(name)
+            except self._gphoto2.GPhoto2Error as failure:
+                if failure.code != self._gphoto2.GP_ERROR_BAD_PARAMETERS:
+                    raise
+        raise CameraError("the camera lets no program set its exposure time; turn its dial to M (manual)")
+
+    def _shutter_choices(self) -> dict[float, str]:
+        """Return the camera's words by exposure time in seconds."""
+        choices = ((choice, shutter_s(choice)) for choice in self._shutter().get_choices())
+        return {seconds: choice for choice, seconds in choices if seconds is not None}
+
+    def _set_shutter(self, exposure_s: float) -> None:
+        """Set the offered exposure time that is nearest, if it is near enough."""
+        choices = self._shutter_choices()
+        nearest = min(choices, key=lambda seconds: abs(seconds - exposure_s), default=None)
+        if nearest is None or abs(nearest - exposure_s) > 0.01 * nearest:
+            offered = ", ".join(f"{seconds:g}" for seconds in sorted(choices))
+            raise CameraError(f"exposure_s = {exposure_s:g} is not among the camera's: {offered}; choose one of them")
+        widget = self._shutter()
+        widget.set_value(choices[nearest])
+        self._camera.set_single_config(widget.get_name(), widget)
+
+    def _set(self, name: str, value: str) -> None:
+        """Set one of the camera's settings."""
+
+        def change() -> None:
+            widget = self._camera.get_single_config(name)
+            widget.set_value(value)
+            self._camera.set_single_config(name, widget)
+
+        self._bounded(change, f"setting {name} = {value}")
+
+    def _release(self) -> tuple[bytes, str]:
+        """Expose, and return the file and its name."""
+        place = self._camera.capture(self._gphoto2.GP_CAPTURE_IMAGE)
+        file = self._camera.file_get(place.folder, place.name, self._gphoto2.GP_FILE_TYPE_NORMAL)
+        content = bytes(file.get_data_and_size())
+        if not self._settings.keep_on_card:
+            self._camera.file_delete(place.folder, place.name)
+        return content, place.name
+
+
+def shutter_s(words: str) -> float | None:
+    """Return the seconds of a camera's words for an exposure time, such as 1/250, 0.0100s or 2.5; None for bulb."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*s?\s*", words)
+    if match is None or float(match[2] or 1) == 0:
+        return None
+    seconds = float(match[1]) / float(match[2] or 1)
+    return seconds if seconds > 0 else None

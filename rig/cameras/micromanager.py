@@ -1,0 +1,116 @@
+"""Scientific cameras through Micro-Manager's device adapters."""
+
+from pathlib import Path
+from typing import Any
+
+from rig.cameras.bounded import call_within
+from rig.cameras.protocol import CameraReport, Exposure
+from rig.cameras.settings import MicroManagerSettings
+from rig.errors import CameraError, CameraTimeout, MissingExtra
+
+
+class MicroManagerCamera:
+    """A `Camera` that pymmcore-plus talks to.
+
+    Parameters
+    ----------
+    settings : MicroManagerSettings
+        The `[camera]` table.
+    """
+
+    def __init__(self, settings: MicroManagerSettings) -> None:
+        self._settings = settings
+        self._core: Any = None
+
+    def open(self) -> None:
+        """Load the configuration, and set the camera's properties."""
+        try:
+            from pymmcore_plus import CMMCorePlus
+        except ImportError as failure:
+            raise MissingExtra(
+                "backend 'micromanager' needs a package that is not installed; "
+                "run: pip install 'faintfield[micromanager]'"
+            ) from failure
+        self.close()
+        self._core = CMMCorePlus()
+        try:
+            self._bounded(self._load, f"loading {self._settings.configuration or 'the demonstration configuration'}")
+        except CameraError:
+            self.close()
+            raise
+
+    def report(self) -> CameraReport:
+        """Return name, frame size and the camera's properties."""
+        return self._bounded(self._read_report, "reporting its properties")  # type: ignore[no-any-return]
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        """Take one frame."""
+        pixels, label = self._bounded(
+            lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", bound_s=2.0 * exposure_s
+        )
+        if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
+            raise CameraError(
+                f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit, or 8bit if it has no more"
+            )
+        return Exposure(".tiff", pixels=pixels, metadata={"camera": label})
+
+    def close(self) -> None:
+        """Unload the devices."""
+        core, self._core = self._core, None
+        if core is not None:
+            try:
+                call_within(self._settings.answer_s, core.unloadAllDevices, "disconnecting")
+            except (CameraError, RuntimeError):
+                pass  # whatever is wrong with it was reported when it was used
+
+    def _bounded(self, call: Any, what: str, bound_s: float = 0.0) -> Any:
+        """Make a call within its bound, its failures in words."""
+        if self._core is None:
+            raise CameraError("the camera is not connected; open it first")
+        try:
+            return call_within(self._settings.answer_s + bound_s, call, what)
+        except CameraTimeout:
+            self._core = None  # stuck, so not even to be asked to disconnect
+            raise
+        except (RuntimeError, OSError) as failure:
+            raise CameraError(
+                f"the camera failed at {what}: {_in_one_line(failure)}; check its cable, its power and the "
+                "configuration file"
+            ) from failure
+
+    def _load(self) -> None:
+        """Load the adapters that the configuration names."""
+        if self._settings.adapters:
+            self._core.setDeviceAdapterSearchPaths([self._settings.adapters])
+        if self._settings.configuration:
+            self._core.loadSystemConfiguration(str(Path(self._settings.configuration).absolute()))
+        else:
+            self._core.loadSystemConfiguration()
+        camera = self._core.getCameraDevice()
+        if not camera:
+            raise RuntimeError("the configuration has no camera")
+        for name, value in self._settings.properties.items():
+            self._core.setProperty(camera, name, value)
+
+    def _snap(self, exposure_s: float) -> tuple[Any, str]:
+        """Expose, and return the pixels and the camera's label."""
+        self._core.setExposure(1e3 * exposure_s)
+        return self._core.snap(), self._core.getCameraDevice()
+
+    def _read_report(self) -> CameraReport:
+        """Return the report."""
+        core = self._core
+        label = core.getCameraDevice()
+        pixels = core.getImageWidth() * core.getImageHeight() * core.getNumberOfComponents()
+        properties = {name: core.getProperty(label, name) for name in core.getDevicePropertyNames(label)}
+        return CameraReport(
+            name=f"{core.getDeviceLibrary(label)} {core.getDeviceName(label)}",
+            frame_bytes=pixels * core.getBytesPerPixel() + 512,
+            readout_s=0.05,
+            settings=properties,
+        )
+
+
+def _in_one_line(failure: BaseException) -> str:
+    """Return the message of `failure` without line breaks."""
+    return " ".join(str(failure).split()) or type(failure).__name__

@@ -1,0 +1,1 @@
+"""A session on disk: the frozen plan, the frames, and the journal of everything that happened."""

@@ -1,0 +1,122 @@
+"""A real Chromium, driven by its own protocol over a pipe."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+# The protocol is spoken over descriptors 3 and 4; by way of 103 and 104, in case that these are what it is given.
+_LAUNCH = (
+    "import os, sys; os.dup2(int(sys.argv[1]), 103); os.dup2(int(sys.argv[2]), 104); os.dup2(103, 3); "
+    "os.dup2(104, 4); os.execv(sys.argv[3], sys.argv[3:])"
+)
+_LONGEST_WAIT_MS = 30_000
+
+
+class Tab:
+    """One page of the browser."""
+
+    def __init__(self, send: int, receive: int) -> None:
+        self._send = send
+        self._receive = receive
+        self._buffer = b""
+        self._number = 0
+        self.complaints: list[str] = []
+        target = self._call("Target.createTarget", {"url": "about:blank"}, None)["targetId"]
+        self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True}, None)["sessionId"]
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Call a method of the protocol on this page."""
+        return self._call(method, parameters, self._session)
+
+    def open(self, url: str) -> None:
+        """Go to an address."""
+        self.call("Page.navigate", url=url)
+
+    def evaluate(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression, waiting for it if it is a promise."""
+        answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        if "exceptionDetails" in answer:
+            raise AssertionError(answer["exceptionDetails"])
+        return answer["result"].get("value")
+
+    def wait_until(self, condition: str) -> None:
+        """Wait in the page until a JavaScript condition holds."""
+        done = self.evaluate(
+            f"""new Promise((resolve) => {{
+                const begun = Date.now();
+                const look = () => {{
+                    let holds = false;
+                    try {{ holds = Boolean({condition}); }} catch {{}}
+                    if (holds || Date.now() - begun > {_LONGEST_WAIT_MS}) resolve(holds);
+                    else setTimeout(look, 20);
+                }};
+                look();
+            }})"""
+        )
+        assert done, f"did not come true: {condition}; the page says: {self.text()}"
+
+    def text(self) -> str:
+        """Return what is to be read on the page."""
+        return str(self.evaluate("document.body.innerText"))
+
+    def click(self, word: str) -> None:
+        """Wait for a button and click it."""
+        button = f"document.querySelector('button[data-word={word}]:not(:disabled)')"
+        self.wait_until(button)
+        self.evaluate(f"{button}.click()")
+
+    def _call(self, method: str, parameters: dict[str, Any], session: str | None) -> dict[str, Any]:
+        """Send a request and return its result; what else comes is noted if it is a complaint."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        os.write(self._send, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._next()
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer
+                return dict(answer["result"])
+            if answer.get("method") == "Runtime.exceptionThrown" or (
+                answer.get("method") == "Log.entryAdded" and answer["params"]["entry"]["level"] == "error"
+            ):
+                self.complaints.append(json.dumps(answer["params"]))
+
+    def _next(self) -> dict[str, Any]:
+        """Return the next message."""
+        while b"\0" not in self._buffer:
+            data = os.read(self._receive, 1 << 16)
+            assert data, "the browser has ended"
+            self._buffer += data
+        message, _, self._buffer = self._buffer.partition(b"\0")
+        return dict(json.loads(message))
+
+
+@contextmanager
+def browsing(folder: Path) -> Iterator[Tab]:
+    """Run a headless browser whose files are in `folder`."""
+    assert CHROMIUM is not None
+    to_browser, send = os.pipe()
+    receive, from_browser = os.pipe()
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--remote-debugging-pipe"]
+    launch = [sys.executable, "-c", _LAUNCH, str(to_browser), str(from_browser)]
+    command = [*launch, CHROMIUM, *options, f"--user-data-dir={folder}"]
+    browser = subprocess.Popen(command, pass_fds=(to_browser, from_browser), stderr=subprocess.DEVNULL)
+    os.close(to_browser)
+    os.close(from_browser)
+    try:
+        yield Tab(send, receive)
+    finally:
+        browser.kill()
+        browser.wait()
+        os.close(send)
+        os.close(receive)

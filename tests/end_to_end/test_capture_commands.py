@@ -1,0 +1,199 @@
+"""init, check, capture and verify, as a person types them."""
+
+import json
+import signal
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from pipelines import cli
+from rig.session.disk import locked
+from rig.session.journal import Journal
+from rig.session.opening import taken_frames
+from rig.simulation.lab import SimulatedLab
+
+STEPS = [("charuco", 49), ("charuco", 49), ("bright", 49), ("dark_scene", 49), ("noise_reference", 49), ("dark", 40),
+         ("flat", 20)]  # fmt: skip
+
+
+KEEP_OUT = "[[stage.keep_out]]\nx_mm = [-260, -240]\ny_mm = [-260, -240]"
+
+
+class Shell:
+    """Runs commands and keeps what they printed."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], folder: Path) -> None:
+        self._capsys = capsys
+        self.rig = folder / "rig.toml"
+        self.session = folder / "session"
+        self.output = self.words = ""
+
+    def run(self, *arguments: object) -> int:
+        code = cli.run([str(argument) for argument in arguments])
+        self.output, self.words = self._capsys.readouterr()
+        return code
+
+    def result(self, *arguments: object) -> Any:
+        assert self.run(*arguments, "--json") == 0, self.words
+        return json.loads(self.output)
+
+    def edit(self, old: str, new: str) -> None:
+        text = self.rig.read_text()
+        assert old in text
+        self.rig.write_text(text.replace(old, new))
+
+
+@pytest.fixture
+def shell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Shell:
+    """Return a shell beside a rig.toml as `init` writes it, of few pixels."""
+    shell = Shell(capsys, tmp_path)
+    assert shell.run("init", shell.rig) == 0
+    shell.edit("size_px = [640, 480]", "size_px = [64, 48]")
+    return shell
+
+
+def small(shell: Shell) -> Shell:
+    """Make the grid small."""
+    shell.edit("rows = 7\ncolumns = 7", "rows = 2\ncolumns = 2")
+    return shell
+
+
+def test_the_whole_experiment_unattended(shell: Shell) -> None:
+    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 305
+    verdict = shell.result("verify", shell.session)
+    assert verdict["problems"] == []
+    assert (verdict["planned"], verdict["present"], verdict["sealed"]) == (305, 305, True)
+    frames = [frame for frame, _, _ in taken_frames(shell.session)]
+    assert [(kind, sum(frame.step == step for frame in frames)) for step, (kind, _) in enumerate(STEPS)] == STEPS
+    assert [frame.kind for frame in frames] == [kind for kind, count in STEPS for _ in range(count)]
+    assert [frame.number for frame in frames] == list(range(305))
+    grid = [frame.stop.node for frame in frames[:49]]
+    assert grid[:8] == [(0, column) for column in range(7)] + [(1, 6)]
+    assert {frame.exposure_s for frame in frames if frame.kind == "dark"} == {0.05, 0.1, 0.5, 1.0}
+    with Journal(shell.session / "journal.sqlite", read_only=True) as journal:
+        assert [it.frame for it in journal.committed()] == list(range(305))
+        assert not journal.uncommitted()
+        assert len(journal.events("drift_check")) == 5
+        assert len(journal.events("settling")) == 1
+
+
+def test_check_moves_nothing_and_says_what_matters(shell: Shell) -> None:
+    with mock.patch("rig.stages.gantry.Gantry.move_to") as move, mock.patch("rig.stages.gantry.Gantry.home") as home:
+        found = shell.result("check", shell.rig)
+        assert not move.called
+        assert not home.called
+    assert found["frames"] == 305
+    assert found["disk_bytes"] == 305 * (2 * 64 * 48 + 512)
+    assert 300.0 < found["duration_s"] < 1000.0
+    for words in ("305 frames in 7 steps", "about 8 min without prompts", "travel [-400, 0]", "are free"):
+        assert words in shell.words
+
+
+def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
+    stored = shell.rig.with_suffix(".stage.json")
+    assert shell.result("check", shell.rig)["changed_settings"] == []
+    assert not stored.exists()
+    shell.result("check", shell.rig, "--remember")
+    assert shell.result("check", shell.rig)["changed_settings"] == []
+    settings = json.loads(stored.read_text())
+    name = next(name for name in settings if "120" in name)
+    stored.write_text(json.dumps({**settings, name: "250.000"}))
+    (change,) = shell.result("check", shell.rig)["changed_settings"]
+    assert f"{name} was 250.000 when stored and is 500.000 now; set it back" in change
+    stored.write_text("[1]")
+    assert shell.run("check", shell.rig) == 1
+    assert "is not what --remember writes" in shell.words
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "failure", "words"),
+    [
+        ("origin_mm = [-350.0", "origin_mm = [-250.0", "OutsideTravel", "outside the travel"),
+        (
+            "# [[stage.keep_out]]",
+            "[[stage.keep_out]]\nx_mm=[-260, -240]\ny_mm=[-260, -240]\n#",
+            "KeepOutCrossed",
+            "meets",
+        ),
+        ("pitch_mm", "pich_mm", "UnknownKey", "did you mean 'pitch_mm'?"),
+        ('kind = "bright"', 'kind = "brigth"', "BadValue", "brigth"),
+        ("square_mm = 40.0", "square_mm = 4.0", "BadValue", "markers smaller"),
+        ('dictionary = "DICT_5X5_1000"', 'dictionary = "5X5"', "BadValue", "no dictionary of OpenCV"),
+        ("exposure_s = 0.1\n", "exposure_s = 0.0\n", "BadValue", "above 0 s"),
+        ('backend = "simulated"', 'backend = "simulatd"', "BadValue", "simulatd"),
+        ("size_px = [64, 48]", "size_px = [400000, 400000]", "DiskFull", "are needed"),
+    ],
+)
+def test_check_refuses_what_cannot_be_done(shell: Shell, old: str, new: str, failure: str, words: str) -> None:
+    shell.edit(old, new)
+    assert shell.run("check", shell.rig) == 1
+    assert f"faintfield: {failure}: " in shell.words
+    assert words in shell.words
+    assert len(shell.words.splitlines()) == 1
+    assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+    assert not (shell.session / "plan.json").exists()
+
+
+def test_init_overwrites_nothing(shell: Shell) -> None:
+    before = shell.rig.read_bytes()
+    assert shell.run("init", shell.rig) == 1
+    assert "OutputExists" in shell.words
+    assert shell.rig.read_bytes() == before
+
+
+def test_prompts_need_somebody_to_answer(shell: Shell) -> None:
+    assert shell.run("capture", shell.rig, shell.session) == 2
+    assert "give --yes, or --page" in shell.words
+
+
+def test_ctrl_c_stops_after_the_present_frame_and_running_again_goes_on(shell: Shell) -> None:
+    small(shell)
+    expose = SimulatedLab.expose
+    calls = []
+
+    def interrupted(lab: SimulatedLab, exposure_s: float, number: int) -> Any:
+        calls.append(number)
+        if number == 7:
+            signal.raise_signal(signal.SIGINT)
+        return expose(lab, exposure_s, number)
+
+    before = signal.getsignal(signal.SIGINT)
+    with mock.patch.object(SimulatedLab, "expose", interrupted):
+        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "CaptureStopped: stopped with 7 of 80 frames taken; run the same command to go on" in shell.words
+    verdict = shell.result("verify", shell.session)
+    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 73, False)
+    assert "73 still to be taken" in shell.words
+    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 73
+    assert "7 of 80 frames are there; going on" in shell.words
+    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 0
+    assert shell.result("verify", shell.session)["sealed"] is True
+
+
+def test_a_session_stays_with_its_rig_and_with_one_capture(shell: Shell) -> None:
+    small(shell)
+    with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
+        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+    assert "Interrupted" in shell.words
+    with locked(shell.session):
+        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+        assert "SessionBusy" in shell.words
+        assert shell.run("verify", shell.session) == 1
+    shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
+    assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+    assert "PlanRefused: [grid] of the rig.toml is not what the session was begun with" in shell.words
+
+
+def test_verify_says_what_is_wrong(shell: Shell) -> None:
+    small(shell)
+    shell.result("capture", shell.rig, shell.session, "--yes")
+    for path in sorted((shell.session / "frames").iterdir())[:20]:
+        path.unlink()
+    assert shell.run("verify", shell.session) == 1
+    assert shell.words.count("problem: ") == 10
+    assert "SessionCorrupt" in shell.words
+    assert shell.run("verify", shell.session / "absent") == 1
+    assert "plan.json: is missing; name the folder of a session" in shell.words

@@ -1,0 +1,79 @@
+"""A capture in a real terminal, with keys."""
+
+import os
+import re
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipelines import cli
+from rig.session.verify import verify
+
+_LONGEST_WAIT_S = 60.0
+
+
+class Terminal:
+    """A pseudo-terminal with a command in it."""
+
+    def __init__(self, *command: str) -> None:
+        self._near, far = os.openpty()
+        environment = {**os.environ, "TERM": "xterm-256color", "COLUMNS": "110", "LINES": "50"}
+        self._process = subprocess.Popen(command, stdin=far, stdout=far, stderr=far, env=environment)
+        os.close(far)
+        self.seen = ""
+        self._read = 0
+
+    def wait_for(self, words: str) -> None:
+        """Wait until these words are to be seen, after those waited for before."""
+        while words not in self.seen[self._read :]:
+            assert self._more(), f"{words!r} did not come; seen: {self.seen[-2000:]}"
+        self._read = self.seen.index(words, self._read) + len(words)
+
+    def press(self, key: str) -> None:
+        """Press a key."""
+        os.write(self._near, key.encode())
+
+    def end(self) -> int:
+        """Wait until the command has ended, and return its exit code."""
+        while self._more():
+            pass
+        os.close(self._near)
+        return self._process.wait(_LONGEST_WAIT_S)
+
+    def _more(self) -> bool:
+        """Read what has come; False when nothing will any more."""
+        ready, _, _ = select.select([self._near], [], [], _LONGEST_WAIT_S)
+        try:
+            data = os.read(self._near, 1 << 16) if ready else b""
+        except OSError:  # the other end is closed
+            data = b""
+        self.seen += re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", data.decode(errors="replace"))
+        return bool(data)
+
+
+def test_keys_lead_through_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig, session = tmp_path / "rig.toml", tmp_path / "session"
+    assert cli.run(["init", str(rig)]) == 0
+    text = rig.read_text().replace("size_px = [640, 480]", "size_px = [64, 48]")
+    rig.write_text(text.replace("rows = 7\ncolumns = 7", "rows = 2\ncolumns = 2"))
+    command = (sys.executable, "-c", "from pipelines.cli import main; main()", "capture", str(rig), str(session))
+    terminal = Terminal(*command)
+    terminal.wait_for("Homing")
+    terminal.press("g")
+    terminal.wait_for("Step 1 of 7: Board sweep 1")
+    terminal.wait_for("(Enter: go on)")
+    terminal.press("x")  # no key of ours
+    terminal.press("\n")
+    terminal.wait_for("▀▀▀▀")
+    terminal.wait_for("board_corners")
+    terminal.wait_for("Step 2 of 7: Board sweep 2")
+    terminal.press("s")
+    terminal.wait_for("Step 3 of 7: Bright set")
+    terminal.press("q")
+    assert terminal.end() == 1
+    assert "CaptureStopped: stopped with 4 of 80 frames taken" in terminal.seen.replace("\r\n", " ")
+    assert verify(session).present == 4
+    capsys.readouterr()

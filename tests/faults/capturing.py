@@ -1,0 +1,110 @@
+"""Small captures in processes of their own, to be killed in the middle."""
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from rig.cameras.settings import SimulatedSettings
+from rig.capture import Capture
+from rig.guide import Unattended
+from rig.opening import open_rig
+from rig.plan import Grid
+from rig.session import disk, session
+from rig.session.journal import Journal
+from rig.session.opening import opened
+from rig.session.session import FrozenPlan
+from rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
+from rig.simulation.lab import SimulatedLab
+from rig.stages.protocol import Point
+from rig.stages.settings import StageSettings
+from rig.survey import survey
+
+SMALL_RIG = RigSettings(
+    stage=StageSettings("simulated"),
+    camera=SimulatedSettings(size_px=(16, 12)),
+    grid=Grid(2, 3, 50.0, Point(-350.0, -350.0)),
+    step=(StepSettings("bright", 0.1), StepSettings("dark_scene", 0.1), StepSettings("dark", (0.1, 1.0), 2)),
+    settle=SettleSettings(measure=False),
+    drift=DriftSettings(check=False),
+)
+FRAMES = 2 * 3 + 2 * 3 + 4
+
+# Every point of a frame's way to the disk at which the power may fail, with the function that is entered or left there
+STEPS: Mapping[str, tuple[Any, str]] = {
+    "intent": (Journal, "intend"),
+    "exposure": (SimulatedLab, "expose"),
+    "writing": (disk, "write_new"),
+    "flushing": (os, "fsync"),
+    "naming": (Path, "rename"),
+    "flushing the folder": (disk, "sync_folder"),
+    "file written": (session.Session, "write"),
+    "commit": (Journal, "commit"),
+}
+
+
+def capture_small(folder: Path, settings: RigSettings = SMALL_RIG) -> None:
+    """Begin or resume a session without a person, and finish it."""
+    frozen = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
+    with opened(folder, frozen) as open_session:
+        Capture(open_session, open_rig(settings, open_session.journal), Unattended(), lambda path: None).run()
+
+
+def capture_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:
+    """Capture, and be killed before or after a step, the `countdown`-th time that it is taken while frames are."""
+    owner, name = STEPS[step]
+    with dying(owner, name, after=after, countdown=countdown):
+        capture_small(folder)
+
+
+@contextmanager
+def dying(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[None]:
+    """Kill this process when `owner.name` is called for the `countdown`-th time since the first intent."""
+    original: Callable[..., Any] = getattr(owner, name)
+    intend = Journal.intend
+    left = [countdown]
+    begun = [name == "intend"]
+
+    def watched_intend(journal: Journal, frame: int) -> int:
+        begun[0] = True
+        return intend(journal, frame)
+
+    def watched(*arguments: Any, **named: Any) -> Any:
+        left[0] -= begun[0]
+        dies = begun[0] and left[0] == 0
+        if dies and not after:
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = original(*arguments, **named)
+        if dies:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    places = [(owner, name)] + ([(session, name)] if owner is disk and hasattr(session, name) else [])
+    with mock.patch.object(Journal, "intend", watched_intend):
+        patches = [mock.patch.object(place, attribute, watched) for place, attribute in places]
+        for patch in patches:
+            patch.start()
+        yield
+        for patch in patches:
+            patch.stop()
+
+
+def in_process(target: Callable[..., None], *arguments: Any, **named: Any) -> ForkServerProcess:
+    """Start a process that runs `target`; its imports are there already."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    process = context.Process(target=_quietly, args=(target, arguments, named), daemon=True)
+    process.start()
+    return process
+
+
+def _quietly(target: Callable[..., None], arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+    """Run `target` such that a kill is the only way to an unusual end."""
+    threading.excepthook = lambda _: None
+    target(*arguments, **named)

@@ -1,0 +1,239 @@
+"""Cable out, camera gone, disk full, folder made read-only: a named failure or a recovery; the session stays whole."""
+
+import ctypes
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from rig.cameras.protocol import CameraReport, Exposure
+from rig.capture import Capture
+from rig.errors import CameraError, RigError, SessionUnwritable
+from rig.guide import Answer, Operator, Prompt, Unattended
+from rig.opening import Rig
+from rig.session.disk import file_of
+from rig.session.journal import Journal
+from rig.session.opening import opened, read_plan, taken_frames
+from rig.session.session import FrozenPlan, is_sealed
+from rig.session.verify import verify
+from rig.settings import DriftSettings, RigSettings
+from rig.simulation.controller.bench import Bench
+from rig.simulation.controller.faults import Fault, faults_of
+from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.stages.protocol import Point
+from rig.survey import survey
+from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
+
+CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
+# Half a step of 1/80 mm and the rounding of reports
+ON_TARGET_UM = 12
+
+
+class TruthfulCamera:
+    """A camera whose frames hold the stage's true position in micrometres, and that fails to order."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.exposures = 0
+        self.on_exposure: dict[int, Callable[[], None]] = {}
+
+    def open(self) -> None:
+        pass
+
+    def report(self) -> CameraReport:
+        return CameraReport("truthful", 1000)
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        self.exposures += 1
+        self.on_exposure.pop(self.exposures, lambda: None)()
+        x_mm, y_mm = self.bench.true_position()
+        self.bench.clock.sleep_s(exposure_s)
+        micrometres = np.rint(1000.0 * np.array([[x_mm, y_mm]])).astype(np.int32)
+        return Exposure(".tiff", content=micrometres.tobytes())
+
+    def close(self) -> None:
+        pass
+
+
+class Lab:
+    """A bench and the session captured on it; a new bench for each run, as after switching everything off and on."""
+
+    def __init__(self, folder: Path, protocol: str, settings: RigSettings = SMALL_RIG) -> None:
+        self.folder = folder
+        self.protocol = protocol
+        self.settings = msgspec.structs.replace(
+            settings, grid=msgspec.structs.replace(settings.grid, origin_mm=ORIGIN[protocol])
+        )
+
+    def run(
+        self,
+        prepare: Callable[[Bench, TruthfulCamera], None] = lambda bench, camera: None,
+        operator: Operator | None = None,
+    ) -> RigError | None:
+        """Capture; return how it failed, None when it did not."""
+        frozen = read_plan(self.folder) if (self.folder / "plan.json").exists() else self.plan()
+        try:
+            with opened(self.folder, frozen) as session:
+                bench = Bench(CONTROLLERS[self.protocol])
+                camera = TruthfulCamera(bench)
+                rig = Rig(bench.stage(traffic=session.journal), camera, bench.clock, lambda kind, sweep: None)
+                prepare(bench, camera)
+                Capture(session, rig, operator or Unattended(), lambda path: None).run()
+        except RigError as failure:
+            return failure
+        return None
+
+    def plan(self) -> FrozenPlan:
+        bench = Bench(CONTROLLERS[self.protocol])
+        rig = Rig(bench.stage(), TruthfulCamera(bench), bench.clock, lambda kind, sweep: None)
+        return FrozenPlan(survey(rig, self.settings).plan, self.settings)
+
+    def assert_every_frame_from_its_place(self) -> None:
+        """Assert that the session is whole and that every frame was taken where the plan says."""
+        verdict = verify(self.folder)
+        assert verdict.problems == ()
+        assert (verdict.present, verdict.sealed) == (FRAMES, True)
+        for frame, _, path in taken_frames(self.folder):
+            there_um = np.frombuffer(path.read_bytes(), np.int32)
+            np.testing.assert_allclose(there_um, 1000.0 * np.array(frame.stop.target), atol=ON_TARGET_UM)
+
+
+@pytest.mark.parametrize(
+    ("protocol", "fault"),
+    [(protocol, fault) for protocol in CONTROLLERS for fault in faults_of(protocol) if fault.nature != "mechanics"],  # type: ignore[arg-type]
+    ids=str,
+)
+def test_stage_faults_in_mid_capture(tmp_path: Path, protocol: str, fault: Fault) -> None:
+    lab = Lab(tmp_path / "session", protocol)
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        camera.on_exposure = {3: lambda: fault.strike(bench), 9: lambda: fault.strike(bench)}
+
+    failure = lab.run(prepare)
+    if failure is not None:
+        assert "; " in str(failure)
+        assert not is_sealed(lab.folder)
+        assert lab.run() is None
+    lab.assert_every_frame_from_its_place()
+
+
+def slipping(bench: Bench, camera: TruthfulCamera) -> None:
+    """Let an axis lose steps in the second step of the plan."""
+
+    def slip() -> None:
+        bench.firmware.mechanics.axes[0].slip_mm -= 3.0
+
+    camera.on_exposure = {9: slip}
+
+
+def test_lost_steps_are_found_and_their_frames_taken_again(tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
+    assert lab.run(slipping) is None
+    lab.assert_every_frame_from_its_place()
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        suspects = journal.events("suspect")
+        assert len(suspects) == 1
+        assert "lost its scale" in suspects[0].detail["message"]
+        # Everything since the last good check, which was at the end of the first step
+        assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
+    assert verify(lab.folder).superseded == 6
+
+
+class Keeping(Unattended):
+    """A person who wants to keep suspect frames."""
+
+    def ask(self, prompt: Prompt) -> Answer:
+        return "keep" if prompt.key == "drift" else prompt.unattended
+
+
+def test_frames_kept_in_spite_of_lost_steps_stay_marked(tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
+    assert lab.run(slipping, Keeping()) is None
+    verdict = verify(lab.folder)
+    assert verdict.problems == ()
+    assert verdict.suspect == tuple(committed.file for _, committed, _ in taken_frames(lab.folder)[6:12])
+
+
+@pytest.mark.parametrize("failures", [1, 2, 3])
+def test_a_camera_that_fails(tmp_path: Path, failures: int) -> None:
+    lab = Lab(tmp_path / "session", "grbl")
+
+    def fail() -> None:
+        raise CameraError("the camera failed at an exposure: I/O problem; check its cable")
+
+    failure = lab.run(lambda bench, camera: camera.on_exposure.update(dict.fromkeys(range(4, 4 + failures), fail)))
+    if failures < 3:
+        assert failure is None
+    else:
+        assert isinstance(failure, CameraError)
+        assert lab.run() is None
+    lab.assert_every_frame_from_its_place()
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        assert len(journal.events("camera_failed")) == failures
+        assert len(journal.uncommitted()) == failures
+
+
+def limited_capture(folder: Path, room_bytes: int) -> None:
+    """Capture while no file may grow beyond a size, as on a disk without room; SQLite's files are smaller."""
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room_bytes, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+    with pytest.raises(SessionUnwritable, match=r"; "):
+        capture_small(folder)
+
+
+@pytest.mark.parametrize("room_bytes", [100, 600, 40_000, 80_000, 120_000])
+def test_a_full_disk(tmp_path: Path, room_bytes: int) -> None:
+    folder = tmp_path / "session"
+    process = in_process(limited_capture, folder, room_bytes)
+    process.join(60.0)
+    assert process.exitcode == 0
+    assert not list(folder.glob("frames/*.part"))
+    capture_small(folder)
+    verdict = verify(folder)
+    assert verdict.problems == ()
+    assert (verdict.present, verdict.sealed) == (FRAMES, True)
+
+
+def drop_rights() -> None:
+    """Give up all privileges, so that permissions hold for the superuser too (capset, Linux)."""
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    if ctypes.CDLL(None, use_errno=True).capset(header, (ctypes.c_uint32 * 6)()) != 0:
+        raise OSError(ctypes.get_errno(), "capset")
+
+
+def capture_read_only(folder: Path, place: str) -> None:
+    """Capture; a folder becomes read-only after some frames."""
+    drop_rights()
+    taken = iter(range(FRAMES))
+
+    class Interfering(Unattended):
+        def show_status(self, status: object) -> None:
+            if next(taken) == 6:
+                (folder / place).chmod(0o500)
+
+    from rig.opening import open_rig
+
+    plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
+    with opened(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
+        Capture(session, open_rig(SMALL_RIG, session.journal), Interfering(), lambda path: None).run()
+
+
+def test_a_folder_made_read_only(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    process = in_process(capture_read_only, folder, "frames")
+    process.join(60.0)
+    assert process.exitcode == 0
+    (folder / "frames").chmod(0o700)
+    assert 0 < len(list((folder / "frames").iterdir())) < FRAMES
+    capture_small(folder)
+    assert verify(folder).problems == ()
+
+
+def test_frames_are_kept_as_the_camera_made_them() -> None:
+    assert file_of(Exposure(".nef", content=b"raw")) == b"raw"

@@ -1,0 +1,92 @@
+"""kill −9 at every step of a frame and at random instants: nothing lost, nothing twice, one frame at most again."""
+
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rig.session.journal import Journal
+from rig.session.verify import verify
+from tests.faults.capturing import FRAMES, STEPS, capture_and_die, capture_small, in_process
+
+# A process that captures the small session alone is done long before this.
+_LIFE_S = 60.0
+
+
+def assert_whole(folder: Path, kills: int) -> None:
+    """Assert that the frame set equals the plan, and that each kill cost one exposure at most."""
+    verdict = verify(folder)
+    assert verdict.problems == ()
+    assert verdict.sealed
+    assert (verdict.present, verdict.missing, verdict.superseded) == (FRAMES, (), 0)
+    with Journal(folder / "journal.sqlite", read_only=True) as journal:
+        committed = journal.committed()
+        assert sorted(it.frame for it in committed) == list(range(FRAMES))
+        assert [it.frame for it in committed] == sorted(it.frame for it in committed)
+        assert len(journal.uncommitted()) <= kills
+        frames = [frame for _, frame in journal.uncommitted()]
+        aside = list((folder / "set_aside").glob("*"))
+        assert len(aside) <= len(frames)
+        assert len(list((folder / "frames").iterdir())) == FRAMES
+
+
+def live_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:
+    """Let a process capture until it is killed at a step."""
+    process = in_process(capture_and_die, folder, step, after=after, countdown=countdown)
+    process.join(_LIFE_S)
+    assert process.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+@pytest.mark.parametrize("step", STEPS)
+def test_killed_at_a_step(tmp_path: Path, step: str, after: bool) -> None:
+    folder = tmp_path / "session"
+    # Some steps are taken twice for each frame: with these numbers both of them are hit
+    for kills, countdown in enumerate((1, 2), start=1):
+        live_and_die(folder, step, after=after, countdown=countdown)
+        with Journal(folder / "journal.sqlite") as journal:
+            assert len(journal.uncommitted()) <= kills
+    capture_small(folder)
+    assert_whole(folder, kills=2)
+
+
+def kill_at_random(folder: Path, kills: int, generator: np.random.Generator, longest_s: float) -> int:
+    """Kill captures of one session at random instants until it is complete; return how many kills that took."""
+    for kill in range(kills):
+        if (folder / "SHA256SUMS").exists():
+            return kill
+        process = in_process(capture_small, folder)
+        process.join(generator.uniform(0.0, longest_s))
+        if process.exitcode is not None:
+            assert process.exitcode == 0
+            return kill
+        process.kill()
+        process.join()
+        assert process.exitcode in (-signal.SIGKILL, 0)
+    return kills
+
+
+def test_killed_at_random_instants(tmp_path: Path) -> None:
+    assert _random_kills(tmp_path, kills=12, seed=1) == 12
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_killed_at_a_hundred_random_instants(tmp_path: Path) -> None:
+    assert _random_kills(tmp_path, kills=100, seed=2) == 100
+
+
+def _random_kills(tmp_path: Path, kills: int, seed: int) -> int:
+    """Kill so many processes, over as many sessions as that takes, and check each; return the number of kills."""
+    generator = np.random.default_rng(seed)
+    done = session = 0
+    while done < kills:
+        folder = tmp_path / f"session{session}"
+        session += 1
+        here = kill_at_random(folder, min(kills - done, 8), generator, longest_s=0.5)
+        done += here
+        if not (folder / "SHA256SUMS").exists():
+            capture_small(folder)
+        assert_whole(folder, here)
+    return done

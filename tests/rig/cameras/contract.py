@@ -1,0 +1,54 @@
+"""The contract of a camera, which every implementation must keep."""
+
+import pytest
+
+from rig.cameras.protocol import Camera
+from rig.errors import CameraError
+
+
+def check_camera(camera: Camera, exposure_s: float) -> None:
+    """Take a closed camera through its whole life.
+
+    `exposure_s` must be a time that it offers.
+    """
+    _check_closed(camera, exposure_s)
+    camera.open()
+    _check_report(camera, exposure_s)
+    _check_exposures(camera, exposure_s)
+    camera.open()  # opening anew is how a capture goes on after a failure
+    _check_exposures(camera, exposure_s)
+    camera.close()
+    camera.close()
+    _check_closed(camera, exposure_s)
+    camera.open()
+    _check_exposures(camera, exposure_s)
+    camera.close()
+
+
+def _check_closed(camera: Camera, exposure_s: float) -> None:
+    with pytest.raises(CameraError, match="; "):
+        camera.report()
+    with pytest.raises(CameraError, match="; "):
+        camera.expose(exposure_s, 1)
+
+
+def _check_report(camera: Camera, exposure_s: float) -> None:
+    report = camera.report()
+    assert report.name.strip()
+    assert report.frame_bytes > 0
+    assert report.readout_s >= 0.0
+    assert report.offers(exposure_s)
+    assert report.exposures_s is None or list(report.exposures_s) == sorted(report.exposures_s)
+
+
+def _check_exposures(camera: Camera, exposure_s: float) -> None:
+    for number in (1, 2):
+        exposure = camera.expose(exposure_s, number)
+        assert exposure.suffix.startswith(".")
+        assert exposure.suffix == exposure.suffix.lower()
+        if exposure.pixels is not None:
+            assert exposure.pixels.dtype.kind == "u"
+            assert exposure.pixels.ndim in (2, 3)
+        else:
+            assert exposure.content
+            assert len(exposure.content) <= camera.report().frame_bytes

@@ -1,0 +1,273 @@
+"""Every camera keeps the contract; gphoto2 and Micro-Manager with the real libraries and their own virtual cameras."""
+
+import importlib
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rig.cameras.bounded import call_within
+from rig.cameras.folder import FolderCamera
+from rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
+from rig.cameras.micromanager import MicroManagerCamera
+from rig.cameras.protocol import CameraReport, Exposure
+from rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
+from rig.cameras.simulated import SimulatedCamera
+from rig.errors import CameraError, CameraTimeout, MissingExtra
+from rig.simulation.controller.clock import SimulatedClock
+from tests.rig.cameras.contract import check_camera
+
+SEED = b"\xff\xd8 a picture, for all that the camera knows \xff\xd9"
+
+
+def test_the_simulated_camera() -> None:
+    clock = SimulatedClock()
+    camera = SimulatedCamera(
+        SimulatedSettings(size_px=(8, 8)), clock, lambda exposure_s, number: np.zeros((8, 8), np.uint16)
+    )
+    check_camera(camera, 0.1)
+    assert clock.now_s() >= 6 * 0.1
+
+
+class Incoming(SimulatedClock):
+    """A clock under which files grow, as a camera's program writes them."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+        self.coming: list[tuple[str, bytes]] = []
+        self.endless = False
+        self.files = 0
+
+    def sleep_s(self, duration_s: float) -> None:
+        super().sleep_s(duration_s)
+        for name, piece in self.coming[:1]:
+            with (self.folder / name).open("ab") as file:
+                file.write(piece)
+        if not self.endless:
+            del self.coming[:1]
+
+    def announce(self, *pieces: bytes) -> None:
+        """Let a new file come, piece by piece."""
+        self.files += 1
+        self.coming = [(f"IMG_{self.files}.NEF", piece) for piece in pieces]
+
+
+class TriggeredFolder(FolderCamera):
+    """A folder whose program takes a picture whenever it is waited for."""
+
+    clock: Incoming
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        self.clock.announce(b"RAW ", b"", b"", b"FILE")
+        return super().expose(exposure_s, number)
+
+
+@pytest.fixture
+def incoming(tmp_path: Path) -> Incoming:
+    return Incoming(tmp_path)
+
+
+def folder_camera(incoming: Incoming) -> FolderCamera:
+    camera = FolderCamera(FolderSettings(str(incoming.folder), frame_mb=1.0, arrival_s=10.0), incoming)
+    camera.open()
+    return camera
+
+
+def test_a_watched_folder(incoming: Incoming) -> None:
+    camera = TriggeredFolder(FolderSettings(str(incoming.folder), frame_mb=1.0), incoming)
+    camera.clock = incoming
+    check_camera(camera, 0.1)
+
+
+def test_a_file_is_taken_only_when_it_has_stopped_growing(incoming: Incoming) -> None:
+    camera = folder_camera(incoming)
+    incoming.announce(b"one ", b"", b"two ", b"", b"", b"three")
+    exposure = camera.expose(0.1, 1)
+    assert exposure.content == b"one two "  # quiet for three looks; `wait` longer for slower programs
+    assert exposure.suffix == ".nef"
+    assert exposure.metadata["camera_file"] == "IMG_1.NEF"
+
+
+def test_files_that_came_before_or_too_late_are_no_frames(incoming: Incoming) -> None:
+    (incoming.folder / "old.nef").write_bytes(b"old")
+    camera = folder_camera(incoming)
+    with pytest.raises(CameraTimeout, match=r"no file came within 10\.1 s; "):
+        camera.expose(0.1, 1)
+    (incoming.folder / "late.nef").write_bytes(b"of the frame before")
+    incoming.announce(b"new")
+    assert camera.expose(0.1, 2).content == b"new"
+    (incoming.folder / "notes.txt").write_bytes(b"no frame")
+    incoming.announce(b"newer")
+    assert camera.expose(0.1, 3).content == b"newer"
+
+
+def test_a_file_that_never_ends_and_two_files_at_once(incoming: Incoming) -> None:
+    camera = folder_camera(incoming)
+    incoming.announce(b"more ")
+    incoming.endless = True
+    with pytest.raises(CameraTimeout, match="never stopped growing"):
+        camera.expose(0.1, 1)
+    incoming.endless = False
+    incoming.coming = [("a.nef", b"a")]
+    original = incoming.sleep_s
+
+    def both(duration_s: float) -> None:
+        (incoming.folder / "b.nef").write_bytes(b"b")
+        original(duration_s)
+
+    incoming.sleep_s = both  # type: ignore[method-assign]
+    with pytest.raises(CameraError, match=r"2 files came for one frame \(a.nef, b.nef\); "):
+        camera.expose(0.1, 2)
+
+
+def test_a_folder_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="is no folder; create it"):
+        FolderCamera(FolderSettings(str(tmp_path / "absent")), SimulatedClock()).open()
+
+
+@pytest.mark.parametrize(
+    ("words", "seconds"),
+    [("1/250", 1 / 250), ("0.0100s", 0.01), ("30", 30.0), ("2.5", 2.5), ("10/3", 10 / 3), ("bulb", None),
+     ("auto", None), ("1/0", None), ("0", None), ("", None)],
+)  # fmt: skip
+def test_exposure_times_in_a_camera_s_words(words: str, seconds: float | None) -> None:
+    assert shutter_s(words) == (None if seconds is None else pytest.approx(seconds))
+
+
+def test_offered_exposure_times() -> None:
+    report = CameraReport("any", 1, exposures_s=(0.01, 0.1))
+    assert report.offers(0.1001)
+    assert not report.offers(0.05)
+    assert CameraReport("any", 1).offers(math.pi)
+
+
+def test_an_exposure_is_a_file_or_an_array() -> None:
+    for both in ({}, {"content": b"x", "pixels": np.zeros((2, 2))}):
+        with pytest.raises(ValueError, match="either"):
+            Exposure(".nef", **both)  # type: ignore[arg-type]
+
+
+def test_a_call_that_hangs_is_left_behind() -> None:
+    never = threading.Event()
+    with pytest.raises(CameraTimeout, match=r"did not finish an exposure within 0\.01 s; "):
+        call_within(0.01, never.wait, "an exposure")
+    never.set()
+    assert call_within(60.0, lambda: 7, "counting") == 7
+    with pytest.raises(ZeroDivisionError):
+        call_within(60.0, lambda: 1 // 0, "dividing")
+
+
+@pytest.mark.parametrize(
+    ("camera", "package", "extra"),
+    [
+        (GPhoto2Camera(GPhoto2Settings()), "gphoto2", "gphoto2"),
+        (MicroManagerCamera(MicroManagerSettings()), "pymmcore_plus", "micromanager"),
+    ],
+)
+def test_a_missing_extra_says_what_to_install(
+    camera: Any, package: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(importlib.import_module("sys").modules, package, None)
+    with pytest.raises(MissingExtra, match=rf"pip install 'faintfield\[{extra}\]'"):
+        camera.open()
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Return the only picture on the card of gphoto2's own virtual camera, which reads its card once per process."""
+    gphoto2 = pytest.importorskip("gphoto2", reason="python-gphoto2 is not installed here: its camera is not tried")
+    library = Path(gphoto2.__file__).parent / "libgphoto2"
+    if not (library / "vusb").is_dir():
+        pytest.skip("this build of libgphoto2 has no virtual camera")
+    root = tmp_path_factory.mktemp("card")
+    picture = root / "DCIM" / "100NIKON" / "seed.jpg"
+    picture.parent.mkdir(parents=True)
+    picture.write_bytes(SEED)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("IOLIBS", str(library / "vusb"))
+        patch.setenv("VCAMERADIR", str(root))
+        yield picture
+
+
+def test_gphoto2_virtual_camera(card: Path) -> None:
+    check_camera(GPhoto2Camera(GPhoto2Settings(frame_mb=1.0)), 0.01)
+
+
+def test_gphoto2_keeps_the_file_byte_for_byte(card: Path) -> None:
+    camera = GPhoto2Camera(GPhoto2Settings(settings={"f-number": "f/8"}))
+    camera.open()
+    report = camera.report()
+    assert report.settings["f-number"] == "f/8"
+    assert report.exposures_s is not None
+    assert {0.01, 0.1, 1.0} <= set(report.exposures_s)
+    exposure = camera.expose(0.1, 1)
+    assert (exposure.content, exposure.suffix) == (SEED, ".jpg")
+    with pytest.raises(CameraError, match=r"exposure_s = 0\.3 is not among the camera's"):
+        camera.expose(0.3, 2)
+    with pytest.raises(CameraError, match="setting warp = 9"):
+        GPhoto2Camera(GPhoto2Settings(settings={"warp": "9"})).open()
+    camera.close()
+
+
+def test_gphoto2_faults(card: Path) -> None:
+    with pytest.raises(CameraError, match="failed at connecting"):
+        GPhoto2Camera(GPhoto2Settings(port="usb:999,999")).open()
+    with pytest.raises(CameraTimeout, match=r"connecting within 1e-06 s; "):
+        GPhoto2Camera(GPhoto2Settings(answer_s=1e-6)).open()
+    camera = GPhoto2Camera(GPhoto2Settings())
+    camera.open()
+    away = card.rename(card.with_suffix(".away"))  # nothing left to take a picture of: the card is out
+    with pytest.raises(CameraError, match="failed at an exposure"):
+        camera.expose(0.1, 1)
+    away.rename(card)
+    camera.close()
+
+
+@pytest.fixture
+def demo() -> MicroManagerCamera:
+    """Return Micro-Manager's demonstration camera."""
+    why = "pymmcore-plus and mm-test-adapters are not installed here: their camera is not tried"
+    pytest.importorskip("pymmcore_plus", reason=why)
+    adapters = pytest.importorskip("mm_test_adapters", reason=why)
+    return MicroManagerCamera(MicroManagerSettings(adapters=adapters.device_adapter_path()))
+
+
+def test_micromanager_demo_camera(demo: MicroManagerCamera) -> None:
+    check_camera(demo, 0.01)
+
+
+def test_micromanager_frames_are_arrays(demo: MicroManagerCamera) -> None:
+    demo.open()
+    exposure = demo.expose(0.01, 1)
+    assert exposure.pixels is not None
+    assert exposure.pixels.dtype == np.uint16
+    assert exposure.pixels.shape == (512, 512)
+    assert exposure.pixels.std() > 0
+    assert demo.report().settings["PixelType"] == "16bit"
+    demo.close()
+
+
+def test_micromanager_faults(demo: MicroManagerCamera, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.cfg"
+    broken.write_text("Device,Camera,NoSuchAdapter,DCam\n")
+    with pytest.raises(CameraError, match=r"failed at loading .*NoSuchAdapter"):
+        MicroManagerCamera(MicroManagerSettings(configuration=str(broken))).open()
+    with pytest.raises(CameraError, match="failed at loading"):
+        MicroManagerCamera(MicroManagerSettings(properties={"Binning": "seventeen"})).open()
+    demo.open()
+    core = demo._core  # noqa: SLF001 - there is no other way to pull the virtual cable
+    core.unloadDevice("Camera")
+    with pytest.raises(CameraError, match=r"failed at an exposure .*; check its cable"):
+        demo.expose(0.01, 1)
+    demo.close()
+
+
+def test_micromanager_time_out() -> None:
+    pytest.importorskip("pymmcore_plus", reason="pymmcore-plus is not installed here: its time-out is not tried")
+    with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):
+        MicroManagerCamera(MicroManagerSettings(answer_s=1e-6)).open()

@@ -1,0 +1,341 @@
+"""The capture loop: the order of a frame, the operator's wishes, settling, pace."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from rig.boards import Board
+from rig.cameras.protocol import Pixels
+from rig.cameras.settings import SimulatedSettings
+from rig.capture import Capture
+from rig.checks import check_frame
+from rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
+from rig.guide import TITLES, Answer, Prompt, Status, Wish, spoken_duration, step_prompt
+from rig.opening import open_rig
+from rig.plan import Grid
+from rig.session.frames import PlannedFrame, planned_frames
+from rig.session.journal import Journal
+from rig.session.opening import opened, taken_frames
+from rig.session.session import FrozenPlan
+from rig.session.verify import verify
+from rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
+from rig.settling import measure_settling
+from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.experiment import paper_experiment
+from rig.simulation.scene import render
+from rig.stages.protocol import Point
+from rig.survey import survey
+from tests.faults.capturing import FRAMES, SMALL_RIG
+
+
+class Person:
+    """An operator with a plan of their own.
+
+    `answers` are given by prompt key, one after the other; `wishes` by the number of frames that were shown before.
+    """
+
+    def __init__(
+        self, answers: Mapping[str, Sequence[Answer]] | None = None, wishes: Mapping[int, Wish] | None = None
+    ) -> None:
+        self.answers = {key: list(values) for key, values in (answers or {}).items()}
+        self.wishes = dict(wishes or {})
+        self.prompts: list[Prompt] = []
+        self.statuses: list[Status] = []
+        self.seen: list[PlannedFrame] = []
+        self.on_status: Callable[[Status], None] = lambda status: None
+
+    def ask(self, prompt: Prompt) -> Answer:
+        self.prompts.append(prompt)
+        waiting = self.answers.get(prompt.key)
+        answer = waiting.pop(0) if waiting else prompt.unattended
+        assert answer in prompt.answers
+        return answer
+
+    def wish(self) -> Wish | None:
+        return self.wishes.pop(len(self.seen), None)
+
+    def show_status(self, status: Status) -> None:
+        self.statuses.append(status)
+        self.on_status(status)
+
+    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
+        self.seen.append(frame)
+
+
+def run(folder: Path, person: Person, settings: RigSettings = SMALL_RIG) -> RigError | None:
+    """Capture; return why it ended early, if it did."""
+    plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
+    try:
+        with opened(folder, plan) as session:
+            Capture(session, open_rig(settings, session.journal), person, lambda path: None).run()
+    except RigError as failure:
+        return failure
+    return None
+
+
+def assert_whole(folder: Path) -> None:
+    verdict = verify(folder)
+    assert verdict.problems == ()
+    assert (verdict.present, verdict.sealed) == (FRAMES, True)
+
+
+def test_a_person_is_led_through_all_steps(tmp_path: Path) -> None:
+    person = Person()
+    assert run(tmp_path / "session", person) is None
+    assert [frame.number for frame in person.seen] == list(range(FRAMES))
+    assert [prompt.key for prompt in person.prompts] == ["home", "step", "step", "step"]
+    assert [prompt.title for prompt in person.prompts[1:]] == [
+        "Step 1 of 3: Bright set", "Step 2 of 3: Dark-scene set", "Step 3 of 3: Dark frames",
+    ]  # fmt: skip
+    assert any("Lights out" in line for line in person.prompts[2].lines)
+    with Journal(tmp_path / "session" / "journal.sqlite", read_only=True) as journal:
+        told = [event.detail for event in journal.events("prompt")]
+    assert [(it["key"], it["title"], it["answer"]) for it in told] == [
+        (prompt.key, prompt.title, "go") for prompt in person.prompts
+    ]
+    last = person.statuses[-1]
+    assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES - 1, FRAMES)
+    assert last.grid == ((-1.0, 0.75, -1.0), (-1.0, -1.0, -1.0))
+
+
+def test_every_frame_has_its_record(tmp_path: Path) -> None:
+    assert run(tmp_path / "session", Person()) is None
+    for frame, committed, path in taken_frames(tmp_path / "session"):
+        assert path.is_file()
+        assert committed.detail["position_mm"] == pytest.approx(list(frame.stop.target), abs=0.02)
+        assert committed.detail["exposure_s"] == frame.exposure_s
+        assert committed.detail["camera"] == {"camera": "simulated camera"}
+        assert "median_dn" in committed.detail["checks"]
+
+
+@pytest.mark.parametrize(("wish", "answer"), [("stop", None), ("pause", "stop")])
+def test_stop_and_go_on(tmp_path: Path, wish: Wish, answer: Answer | None) -> None:
+    person = Person({"paused": [answer]} if answer else {}, {4: wish})
+    failure = run(tmp_path / "session", person)
+    assert isinstance(failure, CaptureStopped)
+    assert str(failure) == f"stopped with 4 of {FRAMES} frames taken; run the same command to go on"
+    again = Person()
+    assert run(tmp_path / "session", again) is None
+    assert [frame.number for frame in again.seen] == list(range(4, FRAMES))
+    assert_whole(tmp_path / "session")
+
+
+def test_pause_and_resume(tmp_path: Path) -> None:
+    person = Person({"paused": ["go"]}, {2: "pause"})
+    assert run(tmp_path / "session", person) is None
+    assert [prompt.key for prompt in person.prompts].count("paused") == 1
+    assert_whole(tmp_path / "session")
+
+
+def test_retake_keeps_both_files_and_counts_the_later(tmp_path: Path) -> None:
+    person = Person({}, {3: "retake"})
+    assert run(tmp_path / "session", person) is None
+    assert [frame.number for frame in person.seen][:5] == [0, 1, 2, 2, 3]
+    assert_whole(tmp_path / "session")
+    verdict = verify(tmp_path / "session")
+    assert verdict.superseded == 1
+    assert len(list((tmp_path / "session" / "frames").iterdir())) == FRAMES + 1
+    assert taken_frames(tmp_path / "session")[2][1].intent == 4
+
+
+@pytest.mark.parametrize("late", ["again", "keep"])
+def test_skipped_frames_are_asked_for_in_the_end(tmp_path: Path, late: Answer) -> None:
+    person = Person({"skipped": [late], "step": ["go", "skip"]}, {1: "skip"})
+    assert run(tmp_path / "session", person) is None
+    assert person.seen[1].number == 2
+    verdict = verify(tmp_path / "session")
+    assert verdict.problems == ()
+    if late == "again":
+        assert_whole(tmp_path / "session")
+    else:
+        # One frame of the first step, and all six of the second
+        assert len(verdict.left_out) == 7
+        assert (verdict.present, verdict.sealed, verdict.missing) == (FRAMES - 7, True, ())
+
+
+def test_nothing_skipped_is_left_out_without_a_person(tmp_path: Path) -> None:
+    assert isinstance(run(tmp_path / "session", Person({}, {1: "skip"})), CaptureStopped)
+    assert run(tmp_path / "session", Person()) is None
+    assert_whole(tmp_path / "session")
+
+
+def test_declining_to_home_moves_nothing(tmp_path: Path) -> None:
+    person = Person({"home": ["stop"]})
+    assert isinstance(run(tmp_path / "session", person), CaptureStopped)
+    with Journal(tmp_path / "session" / "journal.sqlite", read_only=True) as journal:
+        sent = b"".join(data for _, direction, data in journal.traffic() if direction == "sent")
+    assert b"$H" not in sent
+    assert b"$J" not in sent
+
+
+def test_what_cannot_be_done_is_refused_before_anything_moves() -> None:
+    grid = msgspec.structs.replace(SMALL_RIG.grid, origin_mm=Point(-90.0, -350.0))
+    outside = msgspec.structs.replace(SMALL_RIG, grid=grid)
+    with pytest.raises(OutsideTravel, match=r"outside the travel"):
+        survey(open_rig(outside), outside)
+    real_stage = msgspec.structs.replace(
+        SMALL_RIG, stage=msgspec.structs.replace(SMALL_RIG.stage, protocol="grbl", port="/dev/ttyUSB0")
+    )
+    with pytest.raises(PlanRefused, match=r"needs stage\.protocol = 'simulated'"):
+        open_rig(real_stage)
+
+
+BOARD = Board("large", 9, 6, 40.0, 30.0)
+SWINGING = msgspec.structs.replace(
+    SMALL_RIG,
+    camera=SimulatedSettings(size_px=(160, 120)),
+    board=(BOARD,),
+    grid=Grid(3, 3, 50.0, Point(-350.0, -350.0)),
+    step=(StepSettings("charuco", 0.05), StepSettings("dark_scene", 0.1)),
+    settle=SettleSettings(exposure_s=0.05),
+)
+
+
+def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
+    folder = tmp_path / "session"
+    assert isinstance(run(folder, Person({}, {2: "stop"}), SWINGING), CaptureStopped)
+    assert run(folder, Person(), SWINGING) is None
+    with Journal(folder / "journal.sqlite", read_only=True) as journal:
+        found = journal.events("settling")
+    assert len(found) == 1
+    detail = found[0].detail
+    assert detail["settled"] is True
+    # The swing of 1.5 mm along both axes, seen at 620 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
+    # controller's reports take 0.2 s to 0.4 s of it
+    shift_px = 2**0.5 * 1.5 * 200 / 620
+    rest_s = 0.25 * np.log(shift_px / SWINGING.settle.limit_px)
+    assert rest_s - 0.4 <= detail["wait_s"] <= rest_s - 0.2 + 0.2
+    shifts = [shift for _, shift in detail["curve"]]
+    assert shifts[0] > 5 * max(shifts[-10:])
+
+
+def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: float) -> Callable[[float], Pixels]:
+    """Return a camera that sees the paper's scene shifted by a function of time."""
+    planes, optics = paper_experiment(96, 72).grey().planes, paper_experiment(96, 72).optics
+    generator = np.random.default_rng(5)
+
+    def expose(exposure_s: float) -> Pixels:
+        shift_mm = shift_px(clock.now_s()) * 600.0 / optics.fx_px
+        seen = next(render(planes, optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
+        clock.sleep_s(exposure_s + 0.05)
+        return np.asarray(generator.poisson(100.0 + light * seen), np.uint16)
+
+    return expose
+
+
+@pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
+def test_settling_is_found_where_it_is(rest_s: float) -> None:
+    clock = SimulatedClock()
+    expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
+    found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05))
+    assert found.settled
+    assert rest_s <= found.wait_s <= rest_s + 0.2
+    shifts = dict(found.curve)
+    assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
+
+
+@pytest.mark.parametrize(
+    ("shift_px", "light"),
+    [(lambda now_s: 0.5 * np.sin(9.0 * now_s), 2e4), (lambda now_s: 0.0, 0.0)],
+    ids=["never at rest", "dark"],
+)
+def test_no_rest_is_not_taken_for_rest(shift_px: Callable[[float], float], light: float) -> None:
+    clock = SimulatedClock()
+    found = measure_settling(shifting(shift_px, clock, light), clock, SettleSettings(exposure_s=0.05))
+    assert not found.settled
+    assert found.wait_s == 3.0
+
+
+@pytest.mark.parametrize("rows", [2, 7])
+def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> None:
+    settings = msgspec.structs.replace(
+        SMALL_RIG,
+        grid=Grid(rows, 7, 50.0, Point(-350.0, -350.0)),
+        step=(StepSettings("bright", 0.1), StepSettings("dark_scene", (0.1, 2.0)), StepSettings("dark", 1.0, 20)),
+    )
+    plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
+    person, told = Person(), list[tuple[float, float]]()
+    with opened(tmp_path / "session", plan) as session:
+        rig = open_rig(settings, session.journal)
+        person.on_status = lambda status: told.append((rig.clock.now_s(), status.to_go_s))
+        Capture(session, rig, person, lambda path: None).run()
+        end_s = rig.clock.now_s()
+    # One status for the prompt and two for each frame, moving and exposing; in the first step each frame is a node
+    for now_s, to_go_s in told[11 : len(told) - 10]:
+        assert to_go_s == pytest.approx(end_s - now_s, rel=0.1, abs=2.0)
+    now_s, to_go_s = told[11]
+    assert to_go_s == pytest.approx(end_s - now_s, rel=0.1)
+
+
+def test_the_guide_has_words_for_every_kind() -> None:
+    for kind in TITLES:
+        settings = msgspec.structs.replace(SMALL_RIG, step=(StepSettings(kind, 0.1),), board=(BOARD,))
+        frame = planned_frames(survey(open_rig(settings), settings).plan)[0]
+        prompt = step_prompt(frame, 1, 1, 10, 100.0)
+        assert TITLES[kind] in prompt.title
+        assert len(prompt.lines) >= 3
+        assert all(line.endswith(".") for line in prompt.lines)
+        assert any("10 frames follow, about 2 min" in line for line in prompt.lines)
+
+
+@pytest.mark.parametrize(
+    ("duration_s", "words"),
+    [
+        (0.2, "about 1 s"),
+        (59.6, "about 60 s"),
+        (100, "about 2 min"),
+        (3600, "about 60 min"),
+        (7500, "about 2 h 05 min"),
+    ],
+)
+def test_durations_as_one_says_them(duration_s: float, words: str) -> None:
+    assert spoken_duration(duration_s) == words
+
+
+def scene(kind: str, **changes: float) -> Pixels:
+    """Return a good frame of a kind."""
+    generator = np.random.default_rng(3)
+    noise = generator.normal(100.0, 3.0, (120, 160))
+    if kind == "charuco":
+        picture = np.kron(BOARD.in_opencv().generateImage((160, 106)), np.ones((3, 3)))
+        noise = 100.0 + 20.0 * np.pad(picture, 20, constant_values=255)
+    elif kind in ("bright", "flat"):
+        noise += 2000.0 + (1500.0 * (np.indices(noise.shape).sum(axis=0) % 24 < 12) if kind == "bright" else 0.0)
+    return noise.astype(np.uint16)
+
+
+@pytest.mark.parametrize("kind", TITLES)
+def test_good_frames_give_no_warning(kind: str) -> None:
+    findings = check_frame(scene(kind), kind, CheckSettings(), (BOARD,), [0.1])  # type: ignore[arg-type]
+    assert findings.warnings == ()
+    if kind == "charuco":
+        assert findings.values["board_corners"] == 8 * 5
+
+
+@pytest.mark.parametrize(
+    ("kind", "spoil", "word"),
+    [
+        ("bright", lambda frame: np.where(frame > 3000, 65535, frame), "saturated"),
+        ("bright", lambda frame: frame // 100, "contrast"),
+        ("flat", lambda frame: frame // 10, "median"),
+        ("charuco", lambda frame: frame[:, : frame.shape[1] // 8], "board corners"),
+        ("dark", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[1] > 140), "stray light"),
+        ("noise_reference", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[0] < 20), "stray light"),
+    ],
+)
+def test_bad_frames_give_a_warning(kind: str, spoil: Callable[[Pixels], Pixels], word: str) -> None:
+    frame = np.asarray(spoil(scene(kind)), np.uint16)
+    findings = check_frame(frame, kind, CheckSettings(), (BOARD,), [])  # type: ignore[arg-type]
+    assert any(word in warning and "; " in warning for warning in findings.warnings)
+
+
+def test_a_blurred_frame_is_noticed_beside_sharp_ones() -> None:
+    sharp = scene("bright")
+    blurred = sum(np.roll(sharp.astype(float), shift, axis=1) for shift in range(8)) / 8
+    usual = [check_frame(sharp, "bright", CheckSettings()).values["sharpness"]] * 5
+    assert check_frame(sharp, "bright", CheckSettings(), (), usual).warnings == ()
+    findings = check_frame(np.asarray(blurred, np.uint16), "bright", CheckSettings(), (), usual)
+    assert any("sharpness" in warning for warning in findings.warnings)
