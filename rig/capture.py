@@ -25,7 +25,7 @@ from rig.survey import refuse_what_cannot_be_done
 
 type Decode = Callable[[Path], Pixels | None]
 
-# Without a person, a frame is given up after this many failures in a row.
+# Without a person, a frame is given up after this many failures in a row, and a stage after losing steps so often.
 _UNATTENDED_TRIES = 3
 # Frames that are not kept are numbered from here, far from those that are.
 _FIRST_SHORT_FRAME = 10**9
@@ -62,6 +62,7 @@ class Capture:
         self._warnings: tuple[str, ...] = ()
         self._failures = 0
         self._since_check = 0
+        self._drifts = 0
         self._short_frames = itertools.count(_FIRST_SHORT_FRAME)
 
     def run(self) -> None:
@@ -308,7 +309,9 @@ class Capture:
         suspect = [it for it in failure.suspect if isinstance(it, Committed)]
         self._journal.event("suspect", message=str(failure), intents=[it.intent for it in suspect])
         self._warn(str(failure))
-        prompt = Prompt("drift", "The stage lost its scale", (str(failure),), ("retake", "keep", "stop"), "retake")
+        self._drifts += 1
+        given_up: Answer = "retake" if self._drifts < _UNATTENDED_TRIES else "stop"
+        prompt = Prompt("drift", "The stage lost its scale", (str(failure),), ("retake", "keep", "stop"), given_up)
         answer = self._ask(prompt)
         if answer == "stop":
             self._stop()

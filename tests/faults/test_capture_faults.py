@@ -12,7 +12,7 @@ import pytest
 
 from rig.cameras.protocol import CameraReport, Exposure
 from rig.capture import Capture
-from rig.errors import CameraError, RigError, SessionUnwritable
+from rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
 from rig.guide import Answer, Operator, Prompt, Unattended
 from rig.opening import Rig
 from rig.session.disk import file_of
@@ -143,6 +143,23 @@ def test_lost_steps_are_found_and_their_frames_taken_again(tmp_path: Path) -> No
         # Everything since the last good check, which was at the end of the first step
         assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
     assert verify(lab.folder).superseded == 6
+
+
+def test_a_stage_that_loses_steps_again_and_again_is_given_up(tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        def slip() -> None:
+            bench.firmware.mechanics.axes[0].slip_mm -= 3.0
+
+        camera.on_exposure = dict.fromkeys(range(2, 100, 6), slip)
+
+    assert isinstance(lab.run(prepare), CaptureStopped)
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        assert len(journal.events("suspect")) == 3
+    assert lab.run() is None
+    # What was in doubt when it was given up stays marked, and is there
+    assert verify(lab.folder).problems == ()
 
 
 class Keeping(Unattended):
