@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from rig.boards import Board
 from rig.plan import StepKind
-from rig.simulation.lab_boards import standing_board
 from rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from rig.simulation.lab_boards import standing_board
 from rig.simulation.scene import TexturedPlane, render
 from rig.stages.protocol import Point
 
