@@ -16,6 +16,7 @@ from pipelines.noise_page import draw_page
 from pipelines.noise_result import MAPS_FILE, RESULT_FILE, STANDARD, maps_of, result_of, write_maps
 from pipelines.noise_set import FILE_NAME, load_noise_set, temperature_notes
 from pipelines.provenance import provenance
+from rig.session.session import PLAN
 
 # By so much the masked pixels' mean may differ from the others' in a sound camera.
 _BLACK_TOLERANCE_DN = 2.0
@@ -52,7 +53,8 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     calibrations = [_calibrate_plane(plane, readout.saturation_dn) for plane in readout.planes]
     temperature_c, doubts = temperature_notes(settings)
     doubts += [warning for calibration in calibrations for warning in calibration.warnings]
-    inputs = {name: sha256(folder / name) for name in [FILE_NAME, *(frame.file for frame in settings.frame)]}
+    described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
+    inputs = {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}
     # The numbers come last: where noise.json stands, everything that it names stands too.
     write_maps(out / MAPS_FILE, maps_of(readout, calibrations))
     result = result_of(readout, calibrations) | {

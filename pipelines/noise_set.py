@@ -10,6 +10,7 @@ from calib.noise import Conditions
 from pipelines.errors import BadValue, MissingFile
 from pipelines.frames import RAW_SUFFIXES, exif_exposure_s
 from pipelines.toml_files import inside, read_toml, write_toml
+from rig.session.opening import has_session, taken_frames
 
 FILE_NAME = "noise.toml"
 
@@ -43,13 +44,15 @@ class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_def
 
 
 def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
-    """Read and check `noise.toml`; return the folder that its file names are relative to, and what it says.
+    """Return a noise set and the folder that its file names are relative to: `noise.toml`, or a session's frames.
 
     Raises
     ------
     MissingFile, BadValue
         The file is missing, is not what it should be, or names a frame that is not there.
     """
+    if has_session(folder) and not (folder / FILE_NAME).is_file():
+        return folder, _of_session(folder)
     path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
     settings = read_toml(path, NoiseSet)
     folder = path.parent
@@ -68,6 +71,24 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
     if mosaic is not None and (not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1):
         raise BadValue(f'{path}: mosaic = {list(mosaic)}; give rows of equal length, such as ["RG", "GB"]')
     return folder, settings
+
+
+def _of_session(folder: Path) -> NoiseSet:
+    """Return the dark and flat frames of a session; each step of flats is a light level."""
+    frames = [
+        NoiseFrame(
+            file=str(path.relative_to(folder)),
+            kind=planned.kind,
+            exposure_s=planned.exposure_s,
+            temperature_c=taken.detail.get("camera", {}).get("temperature_c"),
+            level=planned.sweep if planned.kind == "flat" else 0,
+        )
+        for planned, taken, path in taken_frames(folder)
+        if planned.kind in ("dark", "flat")
+    ]
+    if not frames:
+        raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
+    return NoiseSet(1, frames)
 
 
 def write_noise_set(folder: Path, settings: NoiseSet) -> None:

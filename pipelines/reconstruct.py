@@ -25,7 +25,6 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
-from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
@@ -86,6 +85,8 @@ def reconstruct(
         raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
     loaded = load_set(elemental_set)
     if geometry is not None:
+        from pipelines.measured_poses import with_measured_geometry  # 100 MB of calibration that only this needs
+
         loaded = with_measured_geometry(loaded, geometry)
     depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
     folders = {name: out if len(methods) == 1 else out / name for name in methods}

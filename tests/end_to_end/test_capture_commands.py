@@ -197,3 +197,12 @@ def test_verify_says_what_is_wrong(shell: Shell) -> None:
     assert "SessionCorrupt" in shell.words
     assert shell.run("verify", shell.session / "absent") == 1
     assert "plan.json: is missing; name the folder of a session" in shell.words
+
+
+def test_noise_is_measured_from_the_frames_of_a_session_which_stays_whole(shell: Shell) -> None:
+    assert shell.run("capture", small(shell).rig, shell.session, "--yes") == 0
+    measured = shell.result("noise", shell.session)
+    for name, truth in (("offset_dn", 100.0), ("gain_dn_per_e", 2.0), ("read_noise_e", 12**0.5)):
+        assert abs(measured[name]["value"] - truth) <= 4 * measured[name]["se"]
+    assert len(measured["frames"]) == 60
+    assert shell.result("verify", shell.session)["problems"] == []
