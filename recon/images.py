@@ -1,11 +1,48 @@
 """The data of a reconstruction: the elemental images of one scene in electrons, and what is known of their noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import pixel_models
+
 type Image = NDArray[np.floating]
+type LikelihoodName = Literal["poisson", "shifted-poisson", "poisson-gaussian", "least-squares"]
+
+_MODELS = {
+    "poisson": pixel_models.SHIFTED_POISSON,
+    "shifted-poisson": pixel_models.SHIFTED_POISSON,
+    "poisson-gaussian": pixel_models.POISSON_GAUSSIAN,
+    "least-squares": pixel_models.LEAST_SQUARES,
+}
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """By which model of its statistics a pixel is judged, see `recon.pixel_models`.
+
+    Parameters
+    ----------
+    name : str
+        "poisson" ignores the read noise, and takes negative numbers for zero.
+    level_e : float
+        Electrons of light at which least squares takes the variance of a pixel of response one; the others ignore it.
+    """
+
+    name: LikelihoodName = "shifted-poisson"
+    level_e: float = 0.0
+
+    @property
+    def model(self) -> int:
+        """The model's number in `recon.pixel_models`."""
+        return _MODELS[self.name]
+
+    @property
+    def knows_read_noise(self) -> bool:
+        """Whether the model takes the read noise into account."""
+        return self.name != "poisson"
 
 
 @dataclass(frozen=True)
@@ -26,6 +63,8 @@ class ElementalImages:
         σ²: variance that is there without any electron.
     valid : bool array (view, row, column), optional
         False where a pixel carries no number (saturated, say); the operator must have been made with the same.
+    likelihood : Likelihood
+        How the numbers are judged.
 
     Raises
     ------
@@ -37,6 +76,7 @@ class ElementalImages:
     background_e: float | Image = 0.0
     read_variance_e2: float | Image = 0.0
     valid: NDArray[np.bool_] | None = None
+    likelihood: Likelihood = field(default_factory=Likelihood)
 
     def __post_init__(self) -> None:
         if self.electrons.ndim != 3:

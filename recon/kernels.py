@@ -1,4 +1,4 @@
-# mypy: disable-error-code="no-untyped-def"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 # The types of compiled functions are numba's business: each call compiles them for what it is given.
 """The three sweeps of the operator, compiled: gather, scatter, and gather-ratio-scatter in one.
 
@@ -17,6 +17,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.elementary import compiled
+from recon.pixel_models import WORK_ROWS, form_ratio
+
 BLOCK_PX = 128
 TILE_ROWS = 8
 
@@ -24,11 +27,9 @@ TILE_ROWS = 8
 # of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
 EDGE_TOLERANCE = 1e-3
 
-FORWARD, ADJOINT, RATIO = 0, 1, 2
+FORWARD, ADJOINT, RATIO, VALUE = 0, 1, 2, 3
 _SCATTERED, _CONTIGUOUS, _OUTSIDE = 0, 1, 2
 
-# Sums may be reordered, but infinities and NaN keep their meaning: callers test for them.
-_compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"})
 _inlined = numba.njit(inline="always", error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"})
 
 
@@ -55,6 +56,25 @@ class Geometry(NamedTuple):
     ray_y: NDArray[Any]
     response: NDArray[Any]
     valid: NDArray[np.bool_]
+
+
+class PixelModel(NamedTuple):
+    """What is known of the numbers that pixels read, as the kernels read it.
+
+    Attributes
+    ----------
+    model : int
+        One of `recon.pixel_models`.
+    background, variance : array (lattice, row, column)
+        Expected electrons that are not light, and variance of the read noise.
+    level : float
+        Light level at which least squares takes the variance.
+    """
+
+    model: int
+    background: NDArray[Any]
+    variance: NDArray[Any]
+    level: float
 
 
 @_inlined
@@ -161,40 +181,31 @@ def _scatter_block(plane, how, place, weights, values):
             plane[row + np.uintp(1), column + np.uintp(1)] += value * down * right
 
 
-@_inlined
-def _form_ratio(expected, observed, background, variance):
-    """Set `expected` (H f on entry) to the shifted data over their expectation, the heart of eq. (2)."""
-    zero = expected.dtype.type(0)
-    for k in range(expected.size):
-        shifted = max(observed[k] + variance[k], zero)
-        mean = expected[k] + background[k] + variance[k]
-        expected[k] = shifted / mean if mean > 0 else zero
-
-
-@_compiled
-def sweep(
-    operation, plane, seen, accumulator, images, image_of_view, background, variance, geometry, views, worker, workers
-):
-    """Go once over a worker's share of the detector pixels of `views`.
+@compiled
+def sweep(operation, plane, seen, accumulator, images, image_of_view, pixels, geometry, views, worker, workers):
+    """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
     ----------
     operation : int
         `FORWARD`: seen ← H plane. `ADJOINT`: accumulator += Hᵀ images.
-        `RATIO`: accumulator += Hᵀ[ (images + variance)₊ / (H plane + background + variance) ].
+        `RATIO`: accumulator += Hᵀ r, with the ratio r that the model of the pixels makes of images and H plane.
+        `VALUE`: only what is returned, which is zero unless the operation is this or `RATIO`.
         What an operation does not name, it leaves alone.
     plane, accumulator : array (row, column)
         What is read, and what is added to.
     seen, images : array (image, row, column)
         What is written, and what is read; view v has image `image_of_view[v]`.
-    background, variance : array (lattice, row, column)
-        Expected electrons that are not light, and variance of the read noise.
+    pixels : PixelModel
+        What is known of the pixels' numbers.
     """
     rows, columns = geometry.ray_x.shape[1:]
-    shape = plane.shape if operation == FORWARD else accumulator.shape
+    shape = accumulator.shape if operation == ADJOINT else plane.shape
     place = np.empty((2, BLOCK_PX), np.int32)
     weights = np.empty((3, BLOCK_PX), plane.dtype)
     values = np.empty(BLOCK_PX, plane.dtype)
+    work = np.empty((WORK_ROWS, BLOCK_PX), plane.dtype)
+    value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
         for view in views:
             lattice = geometry.lattice_of_view[view]
@@ -221,10 +232,16 @@ def sweep(
                             values[:count] = images[image, row, block]
                         else:
                             _gather_block(plane, how, place, weights, values[:count])
-                            _form_ratio(
+                            value += form_ratio(
+                                pixels.model,
                                 values[:count],
                                 images[image, row, block],
-                                background[lattice, row, block],
-                                variance[lattice, row, block],
+                                pixels.background[lattice, row, block],
+                                pixels.variance[lattice, row, block],
+                                weights[2, :count],
+                                pixels.level,
+                                work,
                             )
-                        _scatter_block(accumulator, how, place, weights, values[:count])
+                        if operation != VALUE:
+                            _scatter_block(accumulator, how, place, weights, values[:count])
+    return value

@@ -15,22 +15,9 @@ def negative_log_likelihood(
     images: ElementalImages,
     views: Sequence[int] | NDArray[np.intp] | None = None,
 ) -> float:
-    """Return `Σ m − y ln m` of the shifted Poisson model, with `y = (g + σ²)₊` and `m = H f + b + σ²`.
+    """Return the negative log-likelihood of a plane under the images' model, without terms that do not depend on it.
 
-    The sum runs over the pixels that see the plane; terms that do not depend on f are left out. Views are taken one at
-    a time, so that the memory needed is that of one.
+    For the shifted Poisson model it is `Σ m − y + y ln(y/m)`, with `y = (g + σ²)₊` and `m = H f + b + σ²`. The sum runs
+    over the pixels that see the plane.
     """
-    chosen = operator.all_views if views is None else np.asarray(views, np.intp)
-    return sum(_of_view(operator, plane, images, int(view)) for view in chosen)
-
-
-def _of_view(operator: PlaneOperator, plane: Image, images: ElementalImages, view: int) -> float:
-    """Return the negative log-likelihood of one view."""
-    sees_plane = operator.forward(np.ones_like(plane), [view])[0] != 0
-    variance, background = (
-        operator.map_of_view(value, view)[sees_plane] for value in (images.read_variance_e2, images.background_e)
-    )
-    mean = operator.forward(plane, [view])[0][sees_plane] + background + variance
-    observed = np.maximum(images.electrons[view][sees_plane] + variance, 0)
-    logarithm = np.log(mean, out=np.zeros_like(mean), where=observed > 0)
-    return float(np.sum(mean - observed * logarithm, dtype=np.float64))
+    return operator.negative_log_likelihood(plane, images, views)

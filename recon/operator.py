@@ -88,12 +88,12 @@ class PlaneOperator:
 
     def adjoint(self, images: Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
         """Return Hᵀ g (row, column) of images (view, row, column), summed over `views` (all by default)."""
-        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=self._images(images))
+        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=self._images(images))[1]
 
     def adjoint_of_map(self, value: float | Image, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
         """Return Hᵀ applied to images that all equal one map, broadcastable to (lattice, row, column)."""
         lattices = self._geometry.lattice_of_view
-        return self._sweep(kernels.ADJOINT, self._views(views), lattices, images=self._map(value))
+        return self._sweep(kernels.ADJOINT, self._views(views), lattices, images=self._map(value))[1]
 
     def sensitivity(self, views: Sequence[int] | NDArray[np.intp] | None = None) -> Image:
         """Return s = Hᵀ 1 (row, column): without flat field, the number of views that see each sample."""
@@ -107,21 +107,48 @@ class PlaneOperator:
         """Return the part of a map, broadcastable to (lattice, row, column), that belongs to a view: (row, column)."""
         return np.asarray(np.broadcast_to(value, self._geometry.ray_x.shape)[self._geometry.lattice_of_view[view]])
 
+    def value_and_ratio(
+        self, plane: Image, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
+    ) -> tuple[float, Image]:
+        """Return the negative log-likelihood of a plane and Hᵀ r (row, column), in one sweep.
+
+        r is the ratio of `recon.pixel_models`: the negative log-likelihood has the derivative s − Hᵀ r. Terms that do
+        not depend on f are left out.
+        """
+        return self._likelihood(kernels.RATIO, plane, images, views)
+
     def adjoint_of_ratio(
         self, plane: Image, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
     ) -> Image:
-        """Return Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ] (row, column) in one sweep; with σ = 0 the ratio of eq. (2)."""
+        """Return Hᵀ r (row, column) alone: for shifted Poisson data Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ], as in eq. (2)."""
+        return self.value_and_ratio(plane, images, views)[1]
+
+    def negative_log_likelihood(
+        self, plane: Image, images: ElementalImages, views: Sequence[int] | NDArray[np.intp] | None = None
+    ) -> float:
+        """Return the negative log-likelihood alone, in a sweep that only reads."""
+        return self._likelihood(kernels.VALUE, plane, images, views)[0]
+
+    def _likelihood(
+        self,
+        operation: int,
+        plane: Image,
+        images: ElementalImages,
+        views: Sequence[int] | NDArray[np.intp] | None,
+    ) -> tuple[float, Image]:
+        """Run one of the sweeps that compare a plane with the data."""
         if images.valid is not None and not self._geometry.valid.size:
             raise GeometryMismatch("the images have pixels that do not count; make the operator with their `valid`")
-        return self._sweep(
-            kernels.RATIO,
-            self._views(views),
-            self.all_views,
-            plane=self._plane(plane),
-            images=self._images(images.electrons),
-            background=self._map(images.background_e),
-            variance=self._map(images.read_variance_e2),
+        likelihood = images.likelihood
+        pixels = kernels.PixelModel(
+            likelihood.model,
+            self._map(images.background_e),
+            self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0),
+            likelihood.level_e,
         )
+        electrons = self._images(images.electrons)
+        views = self._views(views)
+        return self._sweep(operation, views, self.all_views, plane=self._plane(plane), images=electrons, pixels=pixels)
 
     def _sweep(
         self,
@@ -132,24 +159,25 @@ class PlaneOperator:
         plane: Image | None = None,
         images: Image | None = None,
         seen: Image | None = None,
-        background: Image | None = None,
-        variance: Image | None = None,
-    ) -> Image:
-        """Run one kernel on all workers and return the sum of their accumulators."""
+        pixels: kernels.PixelModel | None = None,
+    ) -> tuple[float, Image]:
+        """Run one kernel on all workers and return the sums of their values and of their accumulators."""
         nothing = np.empty((1, 1, 1), self.dtype)
         images = nothing if images is None else images
-        sums = np.zeros((self._workers, *self.grid.shape) if seen is None else (self._workers, 1, 1), self.dtype)
+        pixels = pixels or kernels.PixelModel(0, nothing, nothing, 0.0)
+        scatters = operation in (kernels.ADJOINT, kernels.RATIO)
+        sums = np.zeros((self._workers, *self.grid.shape) if scatters else (self._workers, 1, 1), self.dtype)
+        values = [0.0] * self._workers
 
         def work(worker: int) -> None:
-            kernels.sweep(
+            values[worker] = kernels.sweep(
                 operation,
                 nothing[0] if plane is None else plane,
                 nothing if seen is None else seen,
                 sums[worker],
                 images,
                 image_of_view,
-                nothing if background is None else background,
-                nothing if variance is None else variance,
+                pixels,
                 self._geometry,
                 views,
                 worker,
@@ -157,7 +185,7 @@ class PlaneOperator:
             )
 
         _on_all(work, self._workers)
-        return np.asarray(sums.sum(axis=0))
+        return sum(values), np.asarray(sums.sum(axis=0))
 
     def _plane(self, plane: Image) -> Image:
         if plane.shape != self.grid.shape:
