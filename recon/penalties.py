@@ -37,6 +37,15 @@ class Penalty:
         if self.name in ("huber-tv", "quadratic") and not self.smoothing_e > 0:
             raise ValueError(f"{self.name} needs a smoothing_e > 0, got {self.smoothing_e}")
 
+    @classmethod
+    def for_noise(cls, name: PenaltyName, noise_e: float) -> "Penalty":
+        """Return a penalty whose δ suits a back-projection with noise of a standard deviation of `noise_e`.
+
+        The quadratic penalty then weighs differences as large as the noise about as total variation does; Huber's is
+        total variation for differences above a tenth of the noise.
+        """
+        return cls(name, {"quadratic": noise_e, "huber-tv": 0.1 * noise_e}.get(name, 0.0))
+
     @property
     def bounded(self) -> bool:
         """Whether the derivative of φ stays below one."""

@@ -12,13 +12,9 @@ from typing import Protocol
 import numpy as np
 
 from recon.errors import NotConverged
-from recon.images import ElementalImages, Image
+from recon.images import Image
 from recon.penalties import Penalty
 from recon.proximal import DualField
-from recon.smoothing import blurred
-
-# The metric is at least this part of its median: samples that hardly any view sees are led by their neighbours.
-_LEAST_METRIC = 1e-3
 
 # An inner problem is solved until what is left of it is this part of the last step, or of the tolerance.
 _INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.1, 0.5
@@ -30,36 +26,35 @@ _ROUNDING = 1e-7
 # The metric is not changed after so many passes, so that the iteration has a limit.
 _PASSES_WITH_NEW_METRIC = 4
 
-# A metric this many times the likelihood's curvature is no metric: the objective must fall long before.
-_LARGEST_SCALE = 1e6
+# A metric this many times the likelihood's curvature is none: the objective must fall long before.
+_LARGEST_SCALE = 2.0**10
 
-# Where nothing but light is expected, a sample that data speak for must not become zero; it falls by this at most.
+# Where a sample must not become zero, it falls to this part of itself at most in one pass.
 _FALL = 0.05
 
 
-class ForwardModel(Protocol):
-    """What PMLEM asks of an operator: `recon.operator.PlaneOperator` answers for one plane."""
+class Fit(Protocol):
+    """What PMLEM asks of the data; `recon.data_fit.DataFit` answers for the views of one plane."""
 
-    def value_and_ratio(self, plane: Image, images: ElementalImages) -> tuple[float, Image]:
-        """Return L(f) and Hᵀ r, with ∇L = s − Hᵀ r."""
+    @property
+    def may_reach_zero(self) -> bool:
+        """Whether L is finite wherever f ≥ 0."""
 
-    def sensitivity(self) -> Image:
-        """Return s = Hᵀ 1."""
+    def value_and_gradient(self, plane: Image, /) -> tuple[float, Image]:
+        """Return L(f) up to a constant and ∇L(f), in one pass over the data."""
 
-    def coverage(self) -> Image:
-        """Return Hᵀ H 1."""
-
-    def adjoint_of_map(self, value: float | Image) -> Image:
-        """Return Hᵀ of images that all equal one map."""
+    def metric(self, plane: Image, /) -> Image:
+        """Return a positive diagonal that is about as large as the curvature of L near a plane, or larger."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """How far a plane is from the optimum at most, relative to its size, where curvature is at least that of the metric.
+    """How far a plane is from the optimum at most, in the norm ‖x‖² = Σ w x² of the metric, relative to its own.
 
-    With ρ = ∇L + β ∇ᵀp, w the metric, `a² = Σ w (f − (f − ρ/w)₊)²` and
-    `e = β Σ( φ(|∇f|) + φ*(p) − p·∇f ) + Σ f (ρ − w f)₊`, convexity gives `‖f − f*‖ ≤ ( a + √(a² + 2 m e) )/m` in the norm
-    of w, if L is curved at least m times as much as w between f and the optimum f*. Stated is this for m = 1, over ‖f‖.
+    With ρ = ∇L + β ∇ᵀp, `a² = Σ w (f − (f − ρ/w)₊)²` and `e = β Σ( φ(|∇f|) + φ*(p) − p·∇f ) + Σ f (ρ − w f)₊`,
+    convexity gives `‖f − f*‖ ≤ ( a + √(a² + 2 m e) )/m`, where L is curved at least m times as much as w between f and
+    the optimum f*. Stated is the bound for m = 1: the metric is the row sums of the Hessian, which is that curvature
+    for all that is smooth, and penalties leave little else.
 
     Attributes
     ----------
@@ -102,45 +97,8 @@ class PmlemIterate:
     dual: DualField
 
 
-class Curvature:
-    """The metric: about `Hᵀ[ (H 1) / (H f + b + σ²) ]`, the row sums of the likelihood's Hessian.
-
-    Parameters
-    ----------
-    operator : ForwardModel
-        H.
-    images : ElementalImages
-        The data; their likelihood says what its curvature is.
-    level_e : float
-        Typical light, at which backgrounds that vary over the detector are averaged.
-    """
-
-    def __init__(self, operator: ForwardModel, images: ElementalImages, level_e: float) -> None:
-        self._images = images
-        self.sensitivity = operator.sensitivity()
-        self._coverage = operator.coverage()
-        seen = self.sensitivity > 0
-        self._response = np.divide(self._coverage, self.sensitivity, out=np.ones_like(self._coverage), where=seen)
-        constant = np.asarray(images.constant_variance_e2(), np.float64)
-        if constant.ndim == 0:
-            self._constant: float | Image = float(constant)
-        else:
-            inverse = operator.adjoint_of_map(1 / (level_e + constant))
-            mean = np.divide(inverse, self.sensitivity, out=np.full_like(inverse, 1 / level_e), where=seen)
-            self._constant = np.maximum(1 / mean - level_e, 0)
-
-    def at(self, plane: Image, floor_e: float) -> Image:
-        """Return the metric (row, column) at a plane, which counts as at least `floor_e` everywhere."""
-        light = np.maximum(blurred(plane, (1,)), floor_e)
-        level_e = self._images.likelihood.level_e
-        variance = (light if self._images.likelihood.name != "least-squares" else level_e) * self._response
-        metric = self._coverage / (variance + self._constant)
-        return np.asarray(np.maximum(metric, _LEAST_METRIC * np.median(metric)), plane.dtype)
-
-
 def pmlem(
-    operator: ForwardModel,
-    images: ElementalImages,
+    fit: Fit,
     start: Image,
     *,
     penalty_weight: float,
@@ -150,11 +108,13 @@ def pmlem(
 ) -> Iterator[PmlemIterate]:
     """Yield planes of ever lower objective, each with its certificate; when to stop is the caller's business.
 
-    Proximal gradient in the metric of `Curvature`. A step after which the objective has risen is undone and made again
+    Proximal gradient in the metric of the data. A step after which the objective has risen is undone and made again
     with twice the metric; the value that tells comes with the sweep that the next step needs anyway.
 
     Parameters
     ----------
+    fit : Fit
+        L.
     start : float array (row, column)
         Positive.
     penalty_weight : float
@@ -181,54 +141,41 @@ def pmlem(
     if penalty_weight == 0 or penalty.name == "none":
         penalty_weight, penalty = 0.0, Penalty("none")
     dual = DualField.zero(start.shape, start.dtype) if dual is None else dual.copy()
-    return _Pmlem(operator, images, start, penalty_weight, penalty, tolerance).iterates(start, dual)
+    return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
 class _Pmlem:
     """The iteration, and what it keeps."""
 
-    def __init__(
-        self,
-        operator: ForwardModel,
-        images: ElementalImages,
-        start: Image,
-        weight: float,
-        penalty: Penalty,
-        tolerance: float,
-    ) -> None:
-        self._operator, self._images = operator, images
-        self._weight, self._penalty, self._tolerance = weight, penalty, tolerance
-        level_e = float(start.mean(dtype=np.float64))
-        self._floor_e = 0.01 * level_e
-        self._curvature = Curvature(operator, images, level_e)
+    def __init__(self, fit: Fit, weight: float, penalty: Penalty, tolerance: float) -> None:
+        self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance
         self._scale = 1.0
         self._inner_steps = 0
-        self._last_step = np.inf
 
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate for ever."""
-        metric = self._curvature.at(plane, self._floor_e)
+        metric = self._fit.metric(plane)
         accepted: PmlemIterate | None = None
         gradient = np.zeros_like(plane)
-        passes = 0
+        passes, lowest = 0, np.inf
         while True:
-            value, ratio = self._operator.value_and_ratio(plane, self._images)
+            value, new_gradient = self._fit.value_and_gradient(plane)
             passes += 1
             objective = value + self._weight * dual.penalty_and_slack(plane, self._penalty)[0]
             if np.isnan(objective):
                 raise NotConverged(f"pass {passes} left the finite numbers; give a smaller penalty weight")
-            if accepted is None or objective <= accepted.objective + _ROUNDING * abs(accepted.objective):
-                gradient = self._curvature.sensitivity - ratio
+            if accepted is None or np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest):
+                lowest = min(lowest, objective)
+                gradient = new_gradient
                 certificate = self._certificate(plane, gradient, metric, dual)
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
                 if passes <= _PASSES_WITH_NEW_METRIC:
-                    metric = self._curvature.at(plane, self._floor_e)
-            elif self._scale > _LARGEST_SCALE:
-                yield accepted  # no step leads further down: as far as these numbers go
-                continue
+                    metric = self._fit.metric(plane)
             else:
                 self._scale *= 2
+            while self._scale > _LARGEST_SCALE:
+                yield accepted  # no step leads further down: as far as these numbers go
             plane, dual = self._step(accepted, gradient, metric)
 
     def _step(self, here: PmlemIterate, gradient: Image, metric: Image) -> tuple[Image, DualField]:
@@ -248,7 +195,7 @@ class _Pmlem:
             nearest = dual.nearest(centre, scaled, self._weight, self._penalty, enough, _INNER_STEPS)
             plane = nearest.plane
             self._inner_steps += nearest.steps
-        if np.min(self._images.constant_variance_e2()) == 0:
+        if not self._fit.may_reach_zero:
             np.maximum(plane, here.plane.dtype.type(_FALL) * here.plane, out=plane)
         return plane, dual
 

@@ -4,6 +4,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
 
 import numba
 import numpy as np
@@ -46,13 +48,13 @@ class DualField:
 
     Attributes
     ----------
-    field : float array (2, row, column)
+    vectors : float array (2, row, column)
         p, down and right.
     workers : int
         Threads.
     """
 
-    field: Image
+    vectors: Image
     workers: int = field(default_factory=lambda: int(numba.config.NUMBA_NUM_THREADS))
 
     @classmethod
@@ -62,20 +64,20 @@ class DualField:
 
     def copy(self) -> "DualField":
         """Return a copy that can be changed without changing this one."""
-        return DualField(self.field.copy(), self.workers)
+        return DualField(self.vectors.copy(), self.workers)
 
     def plane(self, centre: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (row, column), not clipped at zero."""
         plane = np.empty_like(centre)
         with self._strips(centre.shape[0]) as each:
-            each(lambda a, b: proximal_kernels.plane_of_dual(a, b, self.field, centre, reach, plane))
+            each(lambda a, b: proximal_kernels.plane_of_dual(a, b, self.vectors, centre, reach, plane))
         return plane
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
         """Return `Σ φ(|∇x|)` of a plane, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x."""
         shape = (penalty.smoothing_e, penalty.bounded)
         with self._strips(plane.shape[0]) as each:
-            sums = each(lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, self.field, *shape))
+            sums = each(lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, self.vectors, *shape))
         return sum(part[0] for part in sums), sum(part[1] for part in sums)
 
     def nearest(
@@ -101,35 +103,35 @@ class DualField:
         """
         reach = centre.dtype.type(weight) / metric
         steps = step_sizes(reach)
-        ahead, made, momentum = self.field.copy(), 0, 1.0
-        spare = np.empty_like(self.field), np.empty_like(self.field)
+        ahead, made, momentum = self.vectors.copy(), 0, 1.0
+        spare = np.empty_like(self.vectors), np.empty_like(self.vectors)
         shape = (penalty.smoothing_e, penalty.bounded)
         with self._strips(centre.shape[0]) as each:
             while True:
                 for _ in range(_EXCHANGES_PER_CHECK):
                     momenta, momentum = _momenta(momentum)
-                    arrays = (self.field, ahead, *spare, centre, reach, steps)
+                    arrays = (self.vectors, ahead, *spare, centre, reach, steps)
                     uphill = each(
                         lambda a, b, arrays=arrays, momenta=momenta: proximal_kernels.step_strip(
                             a, b, *arrays, *shape, momenta
                         )
                     )
-                    old, (self.field, ahead) = (self.field, ahead), spare
+                    old, (self.vectors, ahead) = (self.vectors, ahead), spare
                     spare = old
                     made += momenta.size
                     if sum(uphill) > 0:
-                        ahead[:], momentum = self.field, 1.0
+                        ahead[:], momentum = self.vectors, 1.0
                 plane = np.maximum(self.plane(centre, reach), 0)
                 gap = weight * self.penalty_and_slack(plane, penalty)[1]
                 if made >= most or gap <= enough(plane):
                     return Nearest(plane, gap, made)
 
     @contextmanager
-    def _strips(self, rows: int) -> Iterator[Callable[..., list]]:
+    def _strips(self, rows: int) -> Iterator[Callable[..., list[Any]]]:
         """Yield a way to call a function for every strip of rows, in threads when there are several."""
         count = max(1, min(self.workers, rows // _STRIP_ROWS))
         edges = np.linspace(0, rows, count + 1).astype(int).tolist()
-        pairs = list(zip(edges[:-1], edges[1:], strict=True))
+        pairs = list(pairwise(edges))
         if count == 1:
             yield lambda work: [work(*pairs[0])]
             return
