@@ -64,7 +64,7 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
     scores = {tried.weight: tried.held_out for tried in chosen.tried}
     assert min(scores) < chosen.weight < max(scores)
     assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
-    assert chosen.passes < 60
+    assert chosen.passes < 60 * 7  # each of seven folds: these views have few pixels
 
 
 def test_too_few_views_are_refused() -> None:
