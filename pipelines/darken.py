@@ -164,9 +164,7 @@ def _write_dark_views(
     if loaded.flat is not None:
         write_plane(folder / _FLAT, loaded.flat, pitch_mm=1.0)
         camera = msgspec.structs.replace(camera, flat=_FLAT)
-    views = [
-        msgspec.structs.replace(view, image=name) for view, name in zip(loaded.settings.view, names, strict=True)
-    ]
+    views = [msgspec.structs.replace(view, image=name) for view, name in zip(loaded.settings.view, names, strict=True)]
     settings = msgspec.structs.replace(
         loaded.settings, exposure_s=exposure_s, camera=camera, noise=stated_noise(sensor), view=views
     )

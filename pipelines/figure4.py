@@ -4,7 +4,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import product
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -65,21 +65,31 @@ class _Stage:
     bright: Image
     texture: Image
 
-    def images(self, snr: float, seed: int) -> tuple[ElementalImages, float]:
-        """Return one exposure of all views, and the electrons of a white object in it."""
+    def exposures(self, seed: int) -> Iterator[tuple[float, ElementalImages, float]]:
+        """Yield SNR, images, and the electrons of a white object, from the darkest exposure to the brightest.
+
+        Each exposure is the one before with more photons and the same read noise. Each has the statistics of an
+        exposure of its own; what differs from one to the next is their light alone, not their luck.
+        """
         sensor, exposure_s = self.experiment.sensor, self.experiment.exposure_s
         dark_e = sensor.dark_current_e_per_s * exposure_s
         in_region = self.light[self.experiment.reference_view][self.region]
-        scale_e = signal_scale_for_snr(in_region, snr, dark_e, sensor.read_noise_e)
         generator = np.random.default_rng(seed)
-        frames = (sensor.expose(view * scale_e / sensor.quantum_efficiency, exposure_s, generator) for view in self.light)
-        electrons = np.stack([(frame - np.float32(sensor.offset_dn)) / sensor.gain_dn_per_e for frame in frames])
-        return ElementalImages(electrons.astype(np.float32), dark_e, sensor.read_noise_e**2), scale_e
+        read_noise_e = generator.normal(0.0, sensor.read_noise_e, self.light.shape)
+        counts = generator.poisson(dark_e, self.light.shape)
+        last_e = 0.0
+        for snr in SNRS:
+            scale_e = signal_scale_for_snr(in_region, snr, dark_e, sensor.read_noise_e)
+            counts += generator.poisson(self.light * (scale_e - last_e))
+            frames_dn = sensor.digitise(counts + read_noise_e)
+            electrons = (frames_dn - np.float32(sensor.offset_dn)) / np.float32(sensor.gain_dn_per_e)
+            yield snr, ElementalImages(electrons, dark_e, sensor.read_noise_e**2), scale_e
+            last_e = scale_e
 
     def errors(self, plane: Image, scale_e: float) -> tuple[float, float]:
         """Return the mean square errors of a plane against the bright one and against the texture."""
         scaled = plane / scale_e
-        return tuple(mean_square_error(scaled, truth, self.region) for truth in (self.bright, self.texture))  # type: ignore[return-value]
+        return mean_square_error(scaled, self.bright, self.region), mean_square_error(scaled, self.texture, self.region)
 
 
 def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
@@ -92,29 +102,34 @@ def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
     seeds : int
         Draws of the noise per object and SNR.
     """
-    objects = [make(0.0, 0.0, _DEPTH_MM).grey() for make in (toy_truck, toy_airplane, star_chart, shaded_ball)]
-    cases = list(product(objects, SNRS))
-    errors: list[Error] = []
-    stage: _Stage | None = None
-    for shown, snr in progress(cases, "figure 4"):
-        if stage is None or stage.name != shown.name:
-            stage = _staged(shown, size_px)
-        errors.extend(_errors(stage, snr, seeds))
-    return errors
+    makers = (toy_truck, toy_airplane, star_chart, shaded_ball)
+    exposures = (
+        (stage, weights, seed, exposure)
+        for make in makers
+        for stage, weights in [(_staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px), {})]
+        for seed in range(1, seeds + 1)
+        for exposure in stage.exposures(seed)
+    )
+    cases = progress(exposures, "figure 4: exposures", len(makers) * seeds * len(SNRS))
+    return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
 
 
-def _errors(stage: _Stage, snr: float, seeds: int) -> Iterator[Error]:
-    """Yield the errors of all methods at one SNR; the best weights are those of the first draw."""
-    weights: dict[str, float | None] = {}
-    for seed in range(1, seeds + 1):
-        images, scale_e = stage.images(snr, seed)
-        for method in METHODS:
-            if method.name not in weights:
-                weights[method.name] = _best_weight(stage, method, images, scale_e)
-            weight = weights[method.name]
-            given = () if weight is None else (weight,)
-            mse, mse_texture = stage.errors(method.plane(stage.operator, images, *given), scale_e)
-            yield Error(stage.name, snr, method.name, mse, seed, mse_texture, weight)
+def _errors(
+    stage: _Stage,
+    weights: dict[tuple[str, float], float | None],
+    seed: int,
+    snr: float,
+    images: ElementalImages,
+    scale_e: float,
+) -> Iterator[Error]:
+    """Yield the errors of all methods on one exposure; best weights are those of the first draw, kept in `weights`."""
+    for method in METHODS:
+        if (method.name, snr) not in weights:
+            weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
+        weight = weights[method.name, snr]
+        given = () if weight is None else (weight,)
+        mse, mse_texture = stage.errors(method.plane(stage.operator, images, *given), scale_e)
+        yield Error(stage.name, snr, method.name, mse, seed, mse_texture, weight)
 
 
 def _best_weight(stage: _Stage, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
@@ -177,7 +192,7 @@ def is_monotone(points: Sequence[dict[str, Any]], method: str) -> bool:
     falls = True
     for name in {point["object"] for point in points}:
         curve = sorted((p["snr"], p["mse"]) for p in points if (p["object"], p["method"]) == (name, method))
-        falls &= all(after[1] < before[1] for before, after in zip(curve, curve[1:], strict=False))
+        falls &= all(after[1] < before[1] for before, after in pairwise(curve))
     return falls
 
 
