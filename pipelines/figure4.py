@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
@@ -92,6 +92,11 @@ class _Stage:
         return mean_square_error(scaled, self.bright, self.region), mean_square_error(scaled, self.texture, self.region)
 
 
+# By method and SNR.
+type _Weights = dict[tuple[str, float], float | None]
+type _Case = tuple[_Stage, _Weights, int, tuple[float, ElementalImages, float]]
+
+
 def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
     """Return the errors of all objects, SNRs, methods and draws of the noise.
 
@@ -103,20 +108,25 @@ def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
         Draws of the noise per object and SNR.
     """
     makers = (toy_truck, toy_airplane, star_chart, shaded_ball)
-    exposures = (
-        (stage, weights, seed, exposure)
-        for make in makers
-        for stage, weights in [(_staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px), {})]
-        for seed in range(1, seeds + 1)
-        for exposure in stage.exposures(seed)
-    )
-    cases = progress(exposures, "figure 4: exposures", len(makers) * seeds * len(SNRS))
+    cases = progress(_exposures(makers, size_px, seeds), "figure 4: exposures", len(makers) * seeds * len(SNRS))
     return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
+
+
+def _exposures(
+    makers: Sequence[Callable[[float, float, float], TexturedPlane]], size_px: tuple[int, int], seeds: int
+) -> Iterator[_Case]:
+    """Yield every object at every SNR with every draw; an object's draws share the best weights."""
+    for make in makers:
+        stage = _staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
+        weights: _Weights = {}
+        for seed in range(1, seeds + 1):
+            for exposure in stage.exposures(seed):
+                yield stage, weights, seed, exposure
 
 
 def _errors(
     stage: _Stage,
-    weights: dict[tuple[str, float], float | None],
+    weights: _Weights,
     seed: int,
     snr: float,
     images: ElementalImages,

@@ -17,7 +17,13 @@ from pipelines.figure_methods import METHODS, OURS
 # Colours that stay apart for colour-blind readers (Okabe and Ito), with marks and dashes that tell them without colour.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _MARKS, _DASHES = "os^Dv<>", ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-_STYLE = {"font.size": 9, "axes.titlesize": 9, "axes.titlelocation": "left", "savefig.dpi": 200, "axes.axisbelow": True}
+_STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "savefig.dpi": 200,
+    "axes.axisbelow": True,
+}
 
 
 @dataclass(frozen=True)
@@ -81,16 +87,16 @@ def draw_figure4(points: Sequence[dict[str, Any]]) -> bytes:
     objects = list(dict.fromkeys(point["object"] for point in points))
     with rc_context(_STYLE):
         figure = Figure(figsize=(10.5, 7.6), layout="constrained")
-        above, below = figure.subfigures(2, 1, height_ratios=(1.1, 1))
+        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))).flat
         papers, ours = above.subplots(1, 2)
-        for axes, title in ((papers, "(a) on the paper's axis, 0 to 0.12"), (ours, "(b) the same curves, nearer")):
+        for axes, title in ((papers, f"(a) on the paper's axis: {_title(OURS)}"), (ours, "(b) the same, nearer")):
             for index, name in enumerate(objects):
                 _curve(axes, _of(points, name, OURS), index, name)
-            axes.set_title(f"{title}: {_title(OURS)}")
+            axes.set_title(title)
             _name_axes(axes)
             axes.set_ylim(0, None)
         papers.set_ylim(*PAPERS_AXIS)
-        ours.legend(frameon=False, title="object")
+        papers.legend(frameon=False, title="object", loc="upper right")
         panels = below.subplots(1, len(objects), sharey=True)
         for axes, name, letter in zip(np.atleast_1d(panels), objects, "cdefgh", strict=False):
             for index, method in enumerate(METHODS):

@@ -76,4 +76,4 @@ METHODS = (
 )
 
 # The reconstruction that stands for the paper's.
-OURS = "pmlem-osl"
+OURS: Method = "pmlem-osl"

@@ -9,13 +9,14 @@ import msgspec
 import numpy as np
 
 from pipelines.arguments import Count, Seed, SizePx
+from pipelines.brightness import NOISE_REFERENCE
 from pipelines.console import say
 from pipelines.elemental_set import load_set
 from pipelines.figure4 import PAPERS_AXIS, as_csv, as_rows, curves, is_monotone, measure
 from pipelines.figure_methods import METHODS, OURS
 from pipelines.files import check_free, write_json, write_whole
 from pipelines.frames import read_frame
-from pipelines.overview import INTEGRAL_IMAGE, NOISE_REFERENCE, grey_scale_dn
+from pipelines.overview import INTEGRAL_IMAGE, grey_scale_dn
 from pipelines.pages import data_uri, template
 from pipelines.planes import Method
 from pipelines.provenance import provenance

@@ -75,11 +75,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     MissingFile, BadValue
         There is no result in the folder, or one that cannot be read.
     """
-    if not directory.is_dir():
-        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
-    results = {path.parent: read_result(path, Result) for path in _below(directory, RECONSTRUCTION_FILE)}
-    if not results:
-        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
+    results = results_below(directory)
     inputs = {name: digest for result in results.values() for name, digest in result["inputs"].items()}
     noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
     calibrations = {
@@ -88,7 +84,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     }
     page = template("report.html").render(
         title=_title(directory, results),
-        sets=[_set_section(path.parent) for path in _below(directory, OVERVIEW_FILE)],
+        sets=_set_sections(directory),
         **_plane_sections(directory, results),
         **calibrations,
         **_error_sections(directory),
@@ -100,6 +96,22 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     path = directory / REPORT_FILE
     write_whole(path, page)
     return path
+
+
+def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
+    """Return the contents of each reconstruction.json in a folder and below it, by its folder.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is none, or one that cannot be read.
+    """
+    if not directory.is_dir():
+        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
+    results = {path.parent: read_result(path, Result) for path in _below(directory, RECONSTRUCTION_FILE)}
+    if not results:
+        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
+    return results
 
 
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
@@ -172,6 +184,14 @@ def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
     depths = sorted({plane["depth_mm"] for result in results.values() for plane in result["planes"]})
     planes = f"{depths[0]:g} mm" if len(depths) == 1 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
     return f"{directory.resolve().name}: planes at {planes}"
+
+
+def _set_sections(directory: Path) -> list[dict[str, Any]]:
+    """Return what the page says of each set, once of one that was reconstructed several times."""
+    known: dict[bytes, Path] = {}
+    for path in _below(directory, OVERVIEW_FILE):
+        known.setdefault(path.read_bytes(), path.parent)
+    return [_set_section(folder) for folder in known.values()]
 
 
 def _set_section(folder: Path) -> dict[str, Any]:

@@ -5,6 +5,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pipelines.pages import data_uri
 from pipelines.result_files import Geometry, Noise, read_result
 from recon.metrics import noise_variance_e2
@@ -43,7 +45,7 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> dict[s
     """
     content = read_result(path, Noise)
     rows = [
-        {"words": words, "unit": unit, **content[name]}
+        {"words": words, "unit": unit, "digits": _digits(content[name].get("se")), **content[name]}
         for name, words, unit in _NOISE_ROWS
         if isinstance(content.get(name), dict)
     ]
@@ -59,6 +61,11 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> dict[s
         "pages": [(_link(directory, page), data_uri(page.read_bytes(), ".png")) for page in pages],
         "record": content.get("provenance"),
     }
+
+
+def _digits(error: float | None) -> int:
+    """Return the decimals that a number with a standard error deserves."""
+    return int(np.clip(np.ceil(1 - np.log10(error)), 0, 6)) if error else 4
 
 
 def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> dict[str, Any]:
