@@ -54,7 +54,7 @@ class Error:
 
 
 @dataclass(frozen=True)
-class _Stage:
+class Stage:
     """One object alone before the camera: its light (view, row, column), relative, and what it should give."""
 
     name: str
@@ -94,7 +94,7 @@ class _Stage:
 
 # By method and SNR.
 type _Weights = dict[tuple[str, float], float | None]
-type _Case = tuple[_Stage, _Weights, int, tuple[float, ElementalImages, float]]
+type _Case = tuple[Stage, _Weights, int, tuple[float, ElementalImages, float]]
 
 
 def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
@@ -117,7 +117,7 @@ def _exposures(
 ) -> Iterator[_Case]:
     """Yield every object at every SNR with every draw; an object's draws share the best weights."""
     for make in makers:
-        stage = _staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
+        stage = staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
         weights: _Weights = {}
         for seed in range(1, seeds + 1):
             for exposure in stage.exposures(seed):
@@ -125,7 +125,7 @@ def _exposures(
 
 
 def _errors(
-    stage: _Stage,
+    stage: Stage,
     weights: _Weights,
     seed: int,
     snr: float,
@@ -142,7 +142,7 @@ def _errors(
         yield Error(stage.name, snr, method.name, mse, seed, mse_texture, weight)
 
 
-def _best_weight(stage: _Stage, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
+def _best_weight(stage: Stage, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
     """Return the weight whose plane is nearest to the bright one, None for a method that finds its own."""
     tried = {
         weight: stage.errors(method.plane(stage.operator, images, weight), scale_e)[0] for weight in method.weights
@@ -150,7 +150,7 @@ def _best_weight(stage: _Stage, method: FigureMethod, images: ElementalImages, s
     return min(tried, key=tried.__getitem__) if tried else None
 
 
-def _staged(shown: TexturedPlane, size_px: tuple[int, int]) -> _Stage:
+def staged(shown: TexturedPlane, size_px: tuple[int, int]) -> Stage:
     """Render an object from all nodes, and without noise, and make the operator of its plane."""
     paper = paper_experiment(*size_px)
     experiment = SimulatedExperiment((shown,), paper.optics, paper.sensor)
@@ -166,7 +166,7 @@ def _staged(shown: TexturedPlane, size_px: tuple[int, int]) -> _Stage:
         flat=optics.relative_illumination(),
     )
     bright = back_projection(operator, ElementalImages(light))
-    return _Stage(shown.name, experiment, operator, light, ideal.visible[shown.name] > 0.5, bright, ideal.light)
+    return Stage(shown.name, experiment, operator, light, ideal.visible[shown.name] > 0.5, bright, ideal.light)
 
 
 def _grid(experiment: SimulatedExperiment) -> PlaneGrid:
