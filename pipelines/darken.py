@@ -88,7 +88,8 @@ def darken(
         write_json(folder / "provenance.json", record | {"scale_e": scale, "photons_on_object": photons})
     figures = brightness(load_set(out))
     known = {"quantum_efficiency": quantum_efficiency, "read_noise_e": read_noise_e}
-    result = {
+    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
+    return {
         "out": str(out),
         "views": len(loaded.image_paths),
         "snr": snr,
@@ -98,8 +99,6 @@ def darken(
         "photons_from_moments": photons_from_moments(snr, dark_e=dark_e, **known),
         "scale_e": scale,
     }
-    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
-    return result
 
 
 def _region_and_scale(

@@ -1,4 +1,4 @@
-"""The report in a real headless browser, from disk: no complaint, working sliders, on a phone, in print, in the dark."""
+"""The report in a real headless browser, from disk: no complaint, working sliders; on a phone, printed, in the dark."""
 
 import base64
 import json
@@ -7,10 +7,12 @@ import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pipelines.cli import run
 from tests.end_to_end.browser import CHROMIUM, Tab, browsing
@@ -64,11 +66,11 @@ def _caption(tab: Tab) -> str:
     return str(tab.evaluate("document.getElementById('at').value"))
 
 
-def _screen(tab: Tab) -> np.ndarray[tuple[int, int, int], np.dtype[np.uint8]]:
+def _screen(tab: Tab) -> NDArray[Any]:
     picture = base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"])
     decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
     assert decoded is not None
-    return decoded  # type: ignore[return-value]
+    return np.asarray(decoded)
 
 
 def test_it_opens_without_a_complaint(page: Tab) -> None:
