@@ -36,7 +36,7 @@ class FigureMethod:
 
 def _solved(method: Method, operator: PlaneOperator, images: ElementalImages, weight: float | None = None) -> Image:
     """Return the plane that `reconstruct --method` would write."""
-    return solve(operator, images, method, Settings(weight)).plane
+    return solve(operator, images, method, Settings(penalty_weight=weight)).plane
 
 
 def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:

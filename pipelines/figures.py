@@ -3,12 +3,13 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from cyclopts import Parameter
 
-from pipelines.arguments import Count, Seed, SizePx
+from pipelines.arguments import Count, Positive, Seed, SizePx
 from pipelines.brightness import NOISE_REFERENCE
 from pipelines.console import say
 from pipelines.elemental_set import load_set
@@ -41,8 +42,8 @@ def figures(
     out: Path,
     /,
     *,
-    only: list[Literal[2, 3, 4]] | None = None,
-    snr: float = 0.16,
+    only: Annotated[list[Literal[2, 3, 4]] | None, Parameter(consume_multiple=True)] = None,
+    snr: Positive = 0.16,
     seed: Seed = 1,
     seeds: Count = 5,
     size_px: SizePx = (640, 480),

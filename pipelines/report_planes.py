@@ -20,7 +20,7 @@ METHOD_NAMES = {
     "backprojection": "back-projection",
     "mlem": "MLEM",
     "pmlem-osl": "PMLEM (one-step-late, TV)",
-    "pmlem": "PMLEM (convergent, TV)",
+    "pmlem": "PMLEM",
 }
 
 
