@@ -16,6 +16,8 @@ from pipelines.pages import INK, data_uri, inked, svg
 _MOST_ROWS = 6
 _GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
 
+_OF_A_SESSION = "reconstructions"
+
 METHOD_NAMES = {
     "backprojection": "back-projection",
     "mlem": "MLEM",
@@ -52,9 +54,9 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_fil
             if not path.is_file():
                 raise MissingFile(f"{path}: is recorded in {folder / record_file} but missing; reconstruct again")
             method = records[0]["method"]
-            label = method if where.name == method else f"{where.name}/{method}" if where.name else method
-            parent = where.parent.name if where.name == method else ""
-            column = f"{parent}/{label}" if parent else label
+            # The folder of a method says no more than its name, and that of a session's reconstructions nothing.
+            parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
+            column = f"{parts[-1]}/{method}" if parts else method
             planes.append(Plane(column, method, records[0]["depth_mm"], path, records))
     order = list(METHOD_NAMES)
     return sorted(

@@ -88,6 +88,15 @@ def test_a_session_shows_its_noise_and_geometry_wherever_the_page_stands(
     assert "http-equiv" in text
 
 
+def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_path: Path, done: Command) -> None:
+    for where in ("", "backprojection", "bright/backprojection"):
+        session = tmp_path / f"session-{where.replace('/', '-')}"
+        shutil.copytree(drawn, session / "reconstructions" / where)
+        done("report", session)
+        title = "bright set: back-projection" if "bright" in where else "back-projection"
+        assert f'alt="{title} at 500.0 mm"' in (session / "report.html").read_text()
+
+
 def test_a_page_says_whether_its_planes_were_made_with_the_calibration(session: Path, done: Command) -> None:
     folder = session / "reconstructions" / "scene"
     done("report", folder)
