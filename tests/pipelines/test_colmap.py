@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.colmap_files import ColmapModel, read_model, write_model
+from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from pipelines.elemental_set import load_set
 from pipelines.errors import BadValue
 from pipelines.import_colmap import export_colmap, import_colmap
@@ -118,3 +118,16 @@ def test_a_model_becomes_an_elemental_set(tmp_path: Path) -> None:
     export_colmap(tmp_path / "set", tmp_path / "back", binary=True)
     back = read_model(tmp_path / "back")
     np.testing.assert_allclose([image.rt_cam_world for image in back.images], [np.zeros(6), expected], atol=1e-9)
+
+
+def test_images_of_one_name_in_two_folders_are_refused(tmp_path: Path) -> None:
+    """They would be copied over one another."""
+    lens = read_model(STORED / "text").lenses[1]
+    images = [ColmapImage(f"{side}/0.png", 1, np.zeros(6)) for side in ("left", "right")]
+    (tmp_path / "model").mkdir()
+    write_model(tmp_path / "model", ColmapModel({1: lens}, images), binary=False)
+    for image in images:
+        (tmp_path / image.name).parent.mkdir()
+        cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
+    with pytest.raises(BadValue, match="two images are named 0"):
+        import_colmap(tmp_path / "model", tmp_path / "set", images=tmp_path, exposure_s=1)
