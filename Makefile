@@ -49,5 +49,5 @@ $(VENV)/installed: requirements.lock pyproject.toml
 $(VENV)/compiled: $(VENV)/installed $(wildcard recon/*.py)
 	@echo "Compiling the kernels ..."
 	rm -f recon/__pycache__/*.nb[ci]
-	$(BIN)/python -c 'from recon.operator import compile_kernels; compile_kernels()'
+	$(BIN)/python -c 'from recon import operator, proximal; operator.compile_kernels(); proximal.compile_kernels()'
 	@touch $@

@@ -139,6 +139,12 @@ class DualField:
             yield lambda work: list(pool.map(lambda pair: work(*pair), pairs))
 
 
+def compile_kernels() -> None:
+    """Compile what float32 planes need, unless the cache beside the code has it."""
+    ones = np.ones((2, 2), np.float32)
+    DualField.zero((2, 2), ones.dtype).nearest(ones, ones, 1.0, Penalty(), lambda _: 0.0, 1)
+
+
 def step_sizes(reach: Image) -> Image:
     """Return the largest steps that are sure to lead downhill: 1/8 of the inverse of β/w, at its largest nearby."""
     largest = reach.copy()
