@@ -74,12 +74,12 @@ class SimulatedLab:
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
         """Do what the guide asks of a person: put things up or away, switch the light, cover the lens."""
-        objects = self._experiment.planes
-        self._planes = {
-            "charuco": tuple(standing_board(board, sweep, place) for place, board in enumerate(self._boards)),
-            "bright": objects,
-            "dark_scene": objects,
-        }.get(kind, ())
+        self._planes = ()
+        if kind == "charuco":
+            optics = self._experiment.optics
+            self._planes = tuple(standing_board(board, sweep, at, optics) for at, board in enumerate(self._boards))
+        elif kind in ("bright", "dark_scene"):
+            self._planes = self._experiment.planes
         self._photons_per_s = self._unlit if kind == "dark_scene" else self._lit
         self._flat = kind == "flat"
 
