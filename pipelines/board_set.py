@@ -58,11 +58,12 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 @dataclass(frozen=True)
 class BoardView:
-    """What was seen at a node in a sweep: the files of its repeated frames."""
+    """What was seen at a node in a sweep: the files of its repeated frames, and the filters on their pixels."""
 
     node: Node
     sweep: int
     paths: tuple[Path, ...]
+    mosaic: tuple[str, ...] | None = None
 
     def image(self) -> NDArray[np.float32]:
         """Return the mean of the frames (row, column), the colours of RGB frames averaged.
@@ -74,8 +75,9 @@ class BoardView:
         """
         total: NDArray[Any] | None = None
         for path in self.paths:
-            pixels = read_frame(path).pixels_dn.astype(np.float32)
-            grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
+            frame = read_frame(path)
+            pixels = frame.pixels_dn.astype(np.float32)
+            grey = pixels.mean(axis=2) if pixels.ndim == 3 else _without_filters(pixels, self.mosaic or frame.mosaic)
             if total is not None and grey.shape != total.shape:
                 raise WrongSize(f"{path}: is {grey.shape[::-1]} px, its repeats {total.shape[::-1]}; take it again")
             total = grey if total is None else total + grey
@@ -156,11 +158,29 @@ def _of_session(folder: Path) -> BoardSet:
         raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
     boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
     centre = frozen.plan.centre.node
-    return BoardSet(folder / PLAN, boards, _views(files), centre, frozen.rig.grid.pitch_mm)
+    return BoardSet(folder / PLAN, boards, _views(files, frozen.rig.mosaic), centre, frozen.rig.grid.pitch_mm)
 
 
-def _views(files: dict[tuple[Node, int], list[Path]]) -> list[BoardView]:
-    return [BoardView(node, sweep, tuple(paths)) for (node, sweep), paths in files.items()]
+def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
+    return [BoardView(node, sweep, tuple(paths), mosaic) for (node, sweep), paths in files.items()]
+
+
+def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None) -> NDArray[np.float32]:
+    """Return a frame as if it had no colour filters: black and white of each phase brought to those of the whole.
+
+    A board is grey, so that its light differs from phase to phase by a factor only, whatever the black level.
+    """
+    if mosaic is None:
+        return pixels
+    period = (len(mosaic), len(mosaic[0]))
+    ends = (0.05, 0.95)
+    black, white = np.quantile(pixels, ends)
+    grey = np.empty_like(pixels)
+    for row, column in np.ndindex(*period):
+        phase = pixels[row :: period[0], column :: period[1]]
+        low, high = np.quantile(phase, ends)
+        grey[row :: period[0], column :: period[1]] = black + (phase - low) * ((white - black) / max(high - low, 1.0))
+    return grey
 
 
 def write_board_set(folder: Path, settings: BoardSetFile) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
-from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION
+from pipelines.brightness import OBJECT_REGION
 from pipelines.console import progress, say
-from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
+from pipelines.elemental_set import NOISE_REFERENCE, Camera, ElementalSet, Noise, View, write_set
 from pipelines.errors import BadValue
 from pipelines.files import building_folder, write_json
 from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
@@ -20,6 +20,7 @@ from recon.metrics import expected_snr_from_powers, photons_from_linear_snr, pho
 from rig.grid import grid_nodes
 from rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from rig.simulation.scene import TexturedPlane, render
+from rig.simulation.sensor import through_mosaic
 
 NOISE_FREE = "noise_free"
 
@@ -129,18 +130,10 @@ def _render(experiment: SimulatedExperiment, poses: NDArray[np.float64], mosaic:
     object_region = np.zeros(views.shape[1:], bool)
     rendering = render(planes, experiment.optics, poses)
     for index, view in enumerate(progress(rendering, "rendering views", len(poses))):
-        views[index] = view.light if mosaic is None else _through_mosaic(view.light, mosaic)
+        views[index] = view.light if mosaic is None else through_mosaic(view.light, mosaic)
         if index == experiment.reference_view:
             object_region = np.sum(list(view.visible.values()), axis=0) > 0.5
     return _Rendered(poses, views, object_region)
-
-
-def _through_mosaic(light: NDArray[np.float32], mosaic: tuple[str, ...]) -> NDArray[np.float32]:
-    """Return for each pixel of (row, column, RGB) the colour that its filter lets pass."""
-    rows, columns = np.indices(light.shape[:2])
-    colours = np.array([["RGB".index(letter) for letter in row] for row in mosaic])
-    chosen = colours[rows % colours.shape[0], columns % colours.shape[1]]
-    return np.take_along_axis(light, chosen[:, :, np.newaxis], axis=2)[:, :, 0]
 
 
 def _write_dark_set(

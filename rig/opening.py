@@ -70,7 +70,7 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
             camera = FolderCamera(settings.camera, WallClock())
         case SimulatedSettings() if bench is not None:
             lab = _lab(settings, settings.camera, bench)
-            camera = SimulatedCamera(settings.camera, stage.clock, lab.expose)
+            camera = SimulatedCamera(settings.camera, stage.clock, lab)
             return Rig(stage, camera, stage.clock, lab.arrange)
         case SimulatedSettings():
             raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
@@ -120,13 +120,4 @@ def _simulated_bench(settings: StageSettings) -> Bench:
 
 def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
     """Return the simulated lab around the simulated stage."""
-    return SimulatedLab(
-        settings.grid.centre().target,
-        bench.true_position,
-        bench.still_s,
-        settings.board,
-        size_px=camera.size_px,
-        lit_photons_per_s=camera.lit_photons_per_s,
-        unlit_photons_per_s=camera.unlit_photons_per_s,
-        seed=camera.seed,
-    )
+    return SimulatedLab(settings.grid.centre().target, bench.true_position, bench.still_s, settings.board, camera)

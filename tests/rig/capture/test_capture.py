@@ -110,7 +110,7 @@ def test_every_frame_has_its_record(tmp_path: Path) -> None:
         assert path.is_file()
         assert committed.detail["position_mm"] == pytest.approx(list(frame.stop.target), abs=0.02)
         assert committed.detail["exposure_s"] == frame.exposure_s
-        assert committed.detail["camera"] == {"camera": "simulated camera"}
+        assert committed.detail["camera"]["camera"] == "simulated camera"
         assert "median_dn" in committed.detail["checks"]
 
 
