@@ -1,6 +1,7 @@
 """How dark a set is: its SNR and photons per pixel, by the paper's formulas and by counting."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +43,9 @@ class Brightness:
     mean_signal_e: float
 
 
-def brightness(loaded: LoadedSet) -> Brightness:
-    """Measure the reference view of a set, in all its colours together."""
-    region_path = loaded.folder / OBJECT_REGION
+def brightness(loaded: LoadedSet, region_path: Path | None = None) -> Brightness:
+    """Measure the reference view of a set, in all its colours together; over the set's own object region by default."""
+    region_path = region_path or loaded.folder / OBJECT_REGION
     region = read_frame(region_path).pixels_dn > 127 if region_path.is_file() else None
     has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
     signal, reference = [], []

@@ -12,14 +12,10 @@ from typing import Annotated, Any
 import msgspec
 from cyclopts import App, CycloptsError, Parameter
 
-from calib.errors import CalibrationError
 from pipelines.console import framed_console, say
-from pipelines.errors import InputError, WrongUsage
-from recon.errors import ReconstructionError
-from rig.errors import RigError
+from pipelines.errors import NAMED_FAILURES, WrongUsage
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
-NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)
 
 app = App(
     name="faintfield",
@@ -41,6 +37,7 @@ for _name in (
     "verify",
     "noise",
     "geometry",
+    "run",
     "simulate",
     "darken",
     "reconstruct",

@@ -38,6 +38,7 @@ def write_geometry(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     """Write the files of a geometry into `out`, geometry.json last, and return its contents."""
+    (out / GEOMETRY_FILE).unlink(missing_ok=True)  # it would vouch for files that replace its own
     write_whole(out / COVARIANCE_FILE, _covariance_npz(geometry))
     write_whole(out / CORNERS_FILE, _corners_npz(observations))
     for node, rt_cam_ref in zip(geometry.nodes, geometry.rt_cam_ref, strict=True):

@@ -57,6 +57,7 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
     inputs = {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}
     # The numbers come last: where noise.json stands, everything that it names stands too.
+    (out / NOISE_FILE).unlink(missing_ok=True)
     write_maps(out / NOISE_MAPS, maps_of(readout, calibrations))
     result = result_of(readout, calibrations) | {
         "temperature_c": temperature_c,

@@ -6,12 +6,14 @@ from typing import Literal
 from pipelines.console import say
 from pipelines.elemental_set import Camera, ElementalSet, LoadedSet, View
 from pipelines.errors import BadValue, MissingFile
-from pipelines.fitted_noise import NOISE_FILE, read_fitted_noise
+from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from pipelines.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
 from rig.plan import CapturePlan, Stop
 from rig.session.frames import planned_frames
 from rig.session.opening import read_plan, taken_frames
 from rig.session.session import PLAN
+
+RECONSTRUCTIONS = "reconstructions"
 
 type SceneKind = Literal["dark_scene", "bright"]
 
@@ -68,6 +70,12 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         described_in=PLAN,
         noise_reference=_noise_reference(folder),
     )
+
+
+def files_of_scene(folder: Path, kind: SceneKind = "dark_scene") -> list[str]:
+    """Return the names of all files that a reconstruction of a session reads."""
+    _, frames = _frames_of_views(folder, read_plan(folder).plan, kind)
+    return [PLAN, NOISE_FILE, NOISE_MAPS, GEOMETRY_FILE, *(name for _, names in frames for name in names)]
 
 
 def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[float, list[tuple[Stop, list[str]]]]:
