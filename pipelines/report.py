@@ -101,8 +101,10 @@ def write_report(directory: Path) -> Path:
 
 
 def _below(directory: Path, name: str) -> list[Path]:
-    """Return the files of a name in a folder and down to two folders below it, in order."""
-    return sorted({path for pattern in (name, f"*/{name}", f"*/*/{name}") for path in directory.glob(pattern)})
+    """Return the files of a name in a folder and down to three folders below it, in order."""
+    return sorted(
+        {path for pattern in (name, f"*/{name}", f"*/*/{name}", f"*/*/*/{name}") for path in directory.glob(pattern)}
+    )
 
 
 def _metrics(directory: Path) -> list[dict[str, Any]]:

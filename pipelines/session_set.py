@@ -3,6 +3,10 @@
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.lens import Lens
 from pipelines.console import say
 from pipelines.elemental_set import Camera, ElementalSet, LoadedSet, View
 from pipelines.errors import BadValue, MissingFile
@@ -63,7 +67,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         lens,
         noise.model,
         offset_from_files=False,
-        flat=noise.response,
+        flat=None if noise.response is None else _relative_to_axis(noise.response, noise.unusable, lens),
         unusable=noise.unusable,
         measured_in=measured_in / GEOMETRY_FILE if measured_in.is_dir() else measured_in,
         poses="nominal",
@@ -104,6 +108,16 @@ def _noise_reference(folder: Path) -> tuple[Path, ...]:
     centre = read_plan(folder).plan.centre
     taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == "noise_reference"]
     return tuple(path for frame, path in taken if frame.stop == centre and path.is_file())
+
+
+def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:
+    """Return the response (row, column) relative to pixels about the lens's axis, in whose electrons planes are."""
+    near = max(lens.size_px) // 20 + 1
+    row, column = round(lens.cy_px), round(lens.cx_px)
+    window = (slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near))
+    about_axis = response[window][~unusable[window]]
+    level = float(about_axis.mean(dtype=np.float64)) if about_axis.size else 0.0
+    return (response / np.float32(level)) if level > 0 else response
 
 
 def _view(stop: Stop, centre: Stop, names: list[str]) -> View:
