@@ -17,7 +17,7 @@ from rig.stages.protocol import Point
 from rig.stages.settings import StageSettings
 
 EXPOSURE_S = 0.1
-_SWEEPS = 4
+_SWEEPS = 6
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
     """
     camera = SimulatedSettings(size.size_px, position_error_mm=0.3, rotation_error_mrad=3.5, seed=seed)
     steps = [
-        *[StepSettings("charuco", 0.05)] * _SWEEPS,
+        *[StepSettings("charuco", 0.1)] * _SWEEPS,
         StepSettings("bright", 0.02),
         StepSettings("dark_scene", EXPOSURE_S),
         StepSettings("noise_reference", EXPOSURE_S, at="centre"),
@@ -66,11 +66,11 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
         camera=msgspec.structs.replace(camera, unlit_photons_per_s=_photons_per_s(camera, snr)),
         grid=Grid(size.nodes, size.nodes, size.pitch_mm, Point(-350.0, -350.0)),
         step=tuple(steps),
-        settle=SettleSettings(limit_px=0.004),
+        settle=SettleSettings(measure=False, wait_s=2.5),
         checks=CheckSettings(saturation_dn=float(camera.saturation_dn)),
         drift=DriftSettings(),
         scene=SceneSettings((500.0, 700.0)),
-        board=(Board("large", 9, 7, 40.0, 30.0),),
+        board=(Board("large", 9, 7, 40.0, 30.0, "DICT_4X4_50"),),
     )
 
 
