@@ -7,17 +7,20 @@ import numpy as np
 
 from pipelines.frames import read_frame
 from pipelines.image_files import contact_sheet, grey_levels, shrunk, write_png
+from rig.session.opening import taken_frames
 
 _WHITE_E = 1.5
+_VIEW = ("dark_scene", (3, 3))
 _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
 
 
 def draw(demo: Path, out: Path) -> None:
     """Write one dark view beside both planes, back-projected and by PMLEM, on one grey scale."""
-    view = read_frame(demo / "dark-scene" / "view_r3_c3.tiff").pixels_dn
+    (path,) = [path for frame, _, path in taken_frames(demo / "session") if (frame.kind, frame.stop.node) == _VIEW]
+    view = read_frame(path).pixels_dn
     black, white = np.quantile(view, (0.001, 0.999))
     planes = [
-        grey_levels(read_frame(demo / "dark" / method / name).pixels_dn, _WHITE_E)
+        grey_levels(read_frame(demo / "session" / "reconstructions" / method / name).pixels_dn, _WHITE_E)
         for name in (_TRUCK, _AIRPLANE)
         for method in ("backprojection", "pmlem-osl")
     ]

@@ -30,8 +30,8 @@ from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
-from pipelines.report import RECONSTRUCTION_FILE, write_report
-from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
+from pipelines.report import RECONSTRUCTION_FILE, RECONSTRUCTIONS, write_report
+from pipelines.session_set import SceneKind, load_session
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.operator import PlaneOperator

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from jinja2 import Template
 
 RECONSTRUCTION_FILE = "reconstruction.json"
+
+# The folder of a session that its planes go into.
+RECONSTRUCTIONS = "reconstructions"
 REPORT_FILE = "report.html"
 
 # So many depths stand side by side; more of them are shown on a slider only.
@@ -133,7 +136,8 @@ def _planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[_Plane
                 )
             method = records[0]["method"]
             label = method if where.name == method else f"{where.name}/{method}" if where.name else method
-            parent = where.parent.name if where.name == method else ""
+            above = where.parent if where.parent.name != RECONSTRUCTIONS else where.parent.parent
+            parent = above.name if where.name == method else ""
             column = f"{parent}/{label}" if parent else label
             planes.append(_Plane(column, method, records[0]["depth_mm"], path, records))
     order = list(METHOD_NAMES)

@@ -20,6 +20,9 @@ columns = {columns}
 pitch_mm = {pitch_mm}
 origin_mm = [-350.0, -350.0]
 
+[checks]
+{checks}
+
 [settle]
 measure = false
 wait_s = 3.0
@@ -33,6 +36,7 @@ columns = 9
 rows = 7
 square_mm = 40.0
 marker_mm = 30.0
+dictionary = "DICT_4X4_50"
 """
 SWEEPS = ("charuco", "charuco", "charuco", "charuco")
 STEPS = (*SWEEPS, "dark_scene", "dark", "flat")
@@ -41,12 +45,20 @@ _FRAMES = {"dark": 8, "flat": 4}
 
 
 def rig_toml(
-    steps: Sequence[str] = STEPS, *, rows: int = 3, columns: int = 3, pitch_mm: float = 100.0, camera: str = ""
+    steps: Sequence[str] = STEPS,
+    *,
+    rows: int = 3,
+    columns: int = 3,
+    pitch_mm: float = 100.0,
+    camera: str = "",
+    checks: str = "",
 ) -> str:
-    """Return a rig.toml."""
+    """Return a rig.toml; `camera` and `checks` are further lines of these tables."""
     exposures = [(kind, _EXPOSURES_S.get(kind, 0.1), _FRAMES.get(kind, 1)) for kind in steps]
     tables = [f'[[step]]\nkind = "{kind}"\nexposure_s = {e}\nframes_per_node = {n}\n' for kind, e, n in exposures]
-    return "\n".join([_RIG.format(rows=rows, columns=columns, pitch_mm=pitch_mm, camera=camera), *tables])
+    return "\n".join(
+        [_RIG.format(rows=rows, columns=columns, pitch_mm=pitch_mm, camera=camera, checks=checks), *tables]
+    )
 
 
 def captured(folder: Path, text: str) -> Path:
