@@ -42,7 +42,8 @@ def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Pat
     measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, truth))
     exact = reconstruct_set(true_set(session, truth), tmp_path / "true", request)["out"]
     best = error(assess(true_set(session, truth), {(DEFAULT_METHOD, _DEPTH_MM): Path(exact) / plane.name}, truth))
-    assert measured < 0.02
+    # Of a mosaic, a quarter of the pixels see each of two colours
+    assert measured < (0.04 if "mosaic" in camera else 0.02)
     assert measured < 1.2 * best
     assert read_frame(plane).pixels_dn.ndim == (3 if "mosaic" in camera else 2)
 
