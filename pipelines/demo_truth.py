@@ -19,8 +19,7 @@ from pipelines.metrics import assess
 from pipelines.planes import Method
 from pipelines.posed_images import relative
 from pipelines.reconstruct import folder_of_method, plane_name
-from pipelines.report import RECONSTRUCTIONS
-from pipelines.session_set import load_session, nominal_session
+from pipelines.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from pipelines.simulate import NOISE_FREE, write_ground_truth
 from rig.cameras.settings import SimulatedSettings
 from rig.cameras.simulated import TRUE_POSE

@@ -30,8 +30,9 @@ from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
-from pipelines.report import RECONSTRUCTION_FILE, RECONSTRUCTIONS, write_report
-from pipelines.session_set import SceneKind, load_session
+from pipelines.report import RECONSTRUCTION_FILE, write_report
+from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
+from pipelines.stacks import write_stack
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.operator import PlaneOperator
@@ -154,6 +155,8 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
             **provenance("reconstruct", options_of(name, request, loaded.poses), inputs),
         }
         write_json(folder / RECONSTRUCTION_FILE, result)
+        if request.with_focus:
+            write_stack(folder, result["planes"])
     report = write_report(out)
     _say_what_oscillates(run.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")

@@ -25,8 +25,8 @@ from pipelines.reconstruct import (
     reconstruct_set,
     swept_depths,
 )
-from pipelines.report import RECONSTRUCTION_FILE, RECONSTRUCTIONS, REPORT_FILE, write_report
-from pipelines.session_set import files_of_scene, load_session
+from pipelines.report import RECONSTRUCTION_FILE, REPORT_FILE, write_report
+from pipelines.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from rig.session.opening import has_session, read_plan, taken_frames
 from rig.session.session import PLAN
 

@@ -17,6 +17,8 @@ from rig.session.frames import planned_frames
 from rig.session.opening import read_plan, taken_frames
 from rig.session.session import PLAN
 
+RECONSTRUCTIONS = "reconstructions"
+
 type SceneKind = Literal["dark_scene", "bright"]
 
 _CALLED: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
