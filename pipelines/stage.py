@@ -21,7 +21,11 @@ from rig.stages.gantry import Gantry
 from rig.stages.protocol import Identity, Point, Position
 from rig.stages.settings import StageSettings
 
-app = App(name="stage", help="Bring up a stage: ask it, home it, move it, try it.")
+app = App(
+    name="stage",
+    help="Bring up a stage: ask it, home it, move it, try it.",
+    help_epilogue="Example: faintfield stage test --port simulated:grbl",
+)
 
 
 @Parameter(name="*")
@@ -82,7 +86,7 @@ def stage_table(path: Path) -> StageSettings:
     return read_toml(path, _RigFile).stage
 
 
-@app.command
+@app.command(sort_key=1)
 def info(connection: Connection = Connection()) -> Identity:
     """Say who the controller is and how it is set; nothing moves."""
     with _connected(connection) as stage:
@@ -93,7 +97,7 @@ def info(connection: Connection = Connection()) -> Identity:
         return identity
 
 
-@app.command
+@app.command(sort_key=3)
 def home(connection: Connection = Connection()) -> Position:
     """Find the switches."""
     with _connected(connection) as stage:
@@ -102,7 +106,7 @@ def home(connection: Connection = Connection()) -> Position:
         return homing.position
 
 
-@app.command
+@app.command(sort_key=4)
 def goto(
     x_mm: float,
     y_mm: float,
@@ -130,7 +134,7 @@ def goto(
         return position
 
 
-@app.command
+@app.command(sort_key=2)
 def jog(
     dx_mm: float,
     dy_mm: float,
@@ -155,7 +159,7 @@ def jog(
         return position
 
 
-@app.command(name="test")
+@app.command(name="test", sort_key=5)
 def conform(connection: Connection = Connection()) -> list[Check]:
     """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves.
 
@@ -179,7 +183,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     return checks
 
 
-@app.command
+@app.command(sort_key=6)
 def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
     """Serve a simulated controller on a port, for other programs, until Ctrl-C ends it.
 
