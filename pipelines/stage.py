@@ -65,7 +65,9 @@ class Connection:
             if self.protocol is not None:
                 raise WrongUsage(f"--port {self.port} says what it speaks; leave out --protocol")
             if self.port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
-                raise WrongUsage(f"--port {self.port}: simulated are {', '.join(SIMULATED_FIRMWARE)}")
+                raise WrongUsage(
+                    f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
+                )
         return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
 
 

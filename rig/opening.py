@@ -114,7 +114,7 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     """Return the bench of the simulated stage that `settings` name."""
     name = settings.port.partition(":")[2] or "grbl"
     if name not in SIMULATED_FIRMWARE:
-        raise PlanRefused(f"{settings.port}: no such stage is simulated; there are {', '.join(SIMULATED_FIRMWARE)}")
+        raise PlanRefused(f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}")
     return Bench(SIMULATED_FIRMWARE[name])
 
 

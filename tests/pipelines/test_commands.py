@@ -62,4 +62,4 @@ def test_completion_scripts_know_commands_and_options(tmp_path: Path, capsys: py
     assert str(script) in capsys.readouterr().out
     written = script.read_text()
     assert all(word in written for word in ("reconstruct", "--depth-mm", "colmap", "goto"))
-    assert (tmp_path / ".bashrc").read_text().count(str(script)) == 1
+    assert str(script) in (tmp_path / ".bashrc").read_text()
