@@ -77,17 +77,6 @@ class Observations:
         """How many corners were seen."""
         return int((self.weights > 0).sum())
 
-    def of_views(self, chosen: NDArray[np.bool_]) -> "Observations":
-        """Return the same nodes and targets with only some of the views (view,)."""
-        return Observations(
-            self.nodes,
-            self.targets,
-            self.node_of[chosen],
-            self.target_of[chosen],
-            self.pixels[chosen],
-            self.weights[chosen],
-        )
-
 
 def gather(
     observations: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]], reference: Node
