@@ -14,7 +14,7 @@ from pipelines.elemental_set import ElementalSet
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
 # The Python blocks of api.md share their names, as in a notebook.
-DOCUMENTS = {"README.md": False, "docs/guide.md": False, "docs/api.md": True, "docs/capture.md": False}
+DOCUMENTS = {"README.md": False, "docs/guide.md": False, "docs/api.md": True}
 
 
 def _blocks(document: str, *kinds: str) -> list[tuple[str, str]]:
