@@ -27,13 +27,9 @@ bench: $(VENV)/installed ## speed against peers, as ratios
 	$(BIN)/python -m benchmarks
 
 results: $(VENV)/installed ## the demo's figures and pictures, put into README.md and docs/pictures; needs Chromium
-	$(BIN)/faintfield demo $(OUT) --measure
-	rm -rf build/results && mkdir -p build/results
-	$(BIN)/faintfield init build/results/rig.toml
-	$(BIN)/faintfield capture build/results/rig.toml build/results/session --yes
-	$(BIN)/faintfield noise build/results/session
+	$(BIN)/faintfield demo $(OUT)
 	$(BIN)/python docs/collect_results.py $(OUT)
-	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT) build/results
+	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)
 
 lock: ## renew requirements.lock from pyproject.toml; cameras are extras and not in it
 	$(PYTHON) -m venv .uv

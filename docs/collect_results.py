@@ -21,6 +21,12 @@ _METHODS = {
     "pmlem-osl": "PMLEM, one-step-late",
 }
 
+_NOISE = {
+    "gain_dn_per_e": ("gain", "DN/e⁻"),
+    "read_noise_e": ("read noise", "e⁻"),
+    "dark_current_e_per_s": ("dark current", "e⁻/s"),
+}
+
 
 def collect(demo: Path) -> dict[str, Any]:
     """Return what README says of the demo in a folder, rounded as it deserves."""
@@ -36,8 +42,14 @@ def collect(demo: Path) -> dict[str, Any]:
         "photons_per_px": float(f"{metrics['photons_per_px']['from_moments']:.2g}"),
         "planes": planes,
     }
-    centre_rms_mm = metrics.get("geometry", {}).get("centre_rms_mm")
-    return results if centre_rms_mm is None else results | {"centre_rms_mm": float(f"{centre_rms_mm:.2g}")}
+    if "geometry" in metrics:
+        results["centre_rms_mm"] = float(f"{metrics['geometry']['centre_rms_mm']:.2g}")
+    if "noise" in metrics:
+        results["noise"] = {
+            name: {key: float(f"{metrics['noise'][name][key]:.4g}") for key in ("value", "se", "truth")}
+            for name in _NOISE
+        }
+    return results
 
 
 def table(results: dict[str, Any]) -> str:
@@ -57,9 +69,14 @@ def table(results: dict[str, Any]) -> str:
         }
         cells = " | ".join(of_depth.get(depth, "–") for depth in depths)
         lines.append(f"| {_METHODS.get(method, method)}, {poses} poses | {cells} |")
+    said = [
+        f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
+        for name, (words, unit) in _NOISE.items()
+        if (known := results.get("noise", {}).get(name))
+    ]
     if "centre_rms_mm" in results:
-        lines += ["", f"Measured camera positions are {results['centre_rms_mm']:g} mm rms off the true ones."]
-    return "\n".join(lines) + "\n"
+        said.insert(0, f"camera centres {results['centre_rms_mm']:g} mm rms off the true ones")
+    return "\n".join([*lines, *(["", f"Measured on the way: {'; '.join(said)}."] if said else [])]) + "\n"
 
 
 def filled(readme: str, results: dict[str, Any]) -> str:

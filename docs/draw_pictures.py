@@ -1,7 +1,7 @@
-"""Make the pictures of README.md and the guide: `python docs/draw_pictures.py FOLDER...`, from the repository's root.
+"""Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
-The folders hold a finished demo, and a noise result where the demo has none. Pages are taken by a real Chromium; that
-of a capture shows a capture on the simulated rig, begun for the purpose.
+Run it from the repository's root. Pages are taken by a real Chromium; that of a capture shows one on the simulated
+rig, begun for the purpose.
 """
 
 import base64
@@ -29,13 +29,13 @@ _WIDTH_PX = 1000
 _PAGES = (("report", "report.html", 740), ("stage", "geometry.html", 1380))
 
 
-def draw_planes(folders: list[Path]) -> None:
+def draw_planes(demo: Path) -> None:
     """Draw one dark view beside both planes, as the mean of all views and by PMLEM, on one grey scale."""
-    view = read_frame(_first(folders, "dark-scene/view_r3_c3.tiff")).pixels_dn
+    view = read_frame(_first(demo, "*_dark_scene_*_r3_c3_*.tiff")).pixels_dn
     black, white = np.quantile(view, (0.001, 0.999))
-    penalised = next(method for method in _PENALISED if _found(folders, f"{method}/{_TRUCK}"))
+    penalised = next(method for method in _PENALISED if _found(demo, f"{method}/{_TRUCK}"))
     planes = [
-        grey_levels(read_frame(_first(folders, f"{method}/{name}")).pixels_dn, _WHITE_E)
+        grey_levels(read_frame(_first(demo, f"{method}/{name}")).pixels_dn, _WHITE_E)
         for name in (_TRUCK, _AIRPLANE)
         for method in ("backprojection", penalised)
     ]
@@ -45,18 +45,18 @@ def draw_planes(folders: list[Path]) -> None:
     )
 
 
-def draw_noise_page(folders: list[Path]) -> None:
+def draw_noise_page(demo: Path) -> None:
     """Copy the page of a noise result, reduced."""
-    _keep(_first(folders, "noise_page.png").read_bytes(), "noise")
+    _keep(_first(demo, "noise_page.png").read_bytes(), "noise")
 
 
-def draw_pages(folders: list[Path]) -> None:
+def draw_pages(demo: Path) -> None:
     """Take the pages of a reconstruction and of a stage as a browser shows them, and the one of a capture."""
     with TemporaryDirectory() as scratch, browsing(Path(scratch) / "browser") as tab:
         tab.call("Emulation.setScrollbarsHidden", hidden=True)
         for name, page, height_px in _PAGES:
             _resize(tab, height_px)
-            tab.open(_first(folders, page).resolve().as_uri())
+            tab.open(_first(demo, page).resolve().as_uri())
             tab.wait_until("document.readyState == 'complete' && location.protocol == 'file:'")
             _take(tab, name)
         _resize(tab, 600)
@@ -120,20 +120,20 @@ def _keep(content: bytes, name: str) -> None:
         few.save(_PICTURES / f"{name}.png", optimize=True)
 
 
-def _found(folders: list[Path], name: str) -> list[Path]:
-    """Return the files of that name, those of the first folder first, and those that lie less deep before others."""
-    return [path for folder in folders for path in sorted(folder.rglob(name), key=lambda path: len(path.parts))]
+def _found(demo: Path, name: str) -> list[Path]:
+    """Return the files of that name, those that lie less deep before others."""
+    return sorted(demo.rglob(name), key=lambda path: len(path.parts))
 
 
-def _first(folders: list[Path], name: str) -> Path:
+def _first(demo: Path, name: str) -> Path:
     """Return the first of them."""
-    if found := _found(folders, name):
+    if found := _found(demo, name):
         return found[0]
-    raise FileNotFoundError(f"no {name} in {', '.join(map(str, folders))}")
+    raise FileNotFoundError(f"no {name} in {demo}; run `faintfield demo {demo}` to its end")
 
 
 if __name__ == "__main__":
-    given = [Path(word) for word in sys.argv[1:]]
-    draw_planes(given)
-    draw_noise_page(given)
-    draw_pages(given)
+    finished = Path(sys.argv[1])
+    draw_planes(finished)
+    draw_noise_page(finished)
+    draw_pages(finished)
