@@ -53,6 +53,8 @@ COMMANDS: dict[Group, tuple[Command, ...]] = {
             "reconstruct dark --geometry boards --depth-mm 500 --depth-mm 700 --out planes",
         ),
         Command("report", "pipelines.report:report", "report planes"),
+        Command("view", "pipelines.view:view", "view planes"),
+        Command("figures", "pipelines.figures:figures", "figures figures --only 4"),
     ),
 }
 IMPORTS = (

@@ -60,7 +60,7 @@ def geometry(
     record = provenance("geometry", options, dict(board_set.input_hashes()))
     boards = list(board_set.boards.values())
     content = write_geometry(out, measured, settings, boards, observations, stage, record)
-    page = write_stage_page(out, measured, stage, content)
+    page = write_stage_page(out, measured, content)
     _say_result(board_set, measured, stage, content)
     return {"out": str(out), "report": str(page), **{name: content[name] for name in _RETURNED}}
 
