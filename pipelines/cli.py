@@ -13,16 +13,12 @@ from typing import Annotated, Any
 import msgspec
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from calib.errors import CalibrationError
 from pipelines.commands import register_commands
 from pipelines.console import framed_console, say
-from pipelines.errors import InputError, WrongUsage
+from pipelines.errors import NAMED_FAILURES, WrongUsage
 from pipelines.log_file import logged
-from recon.errors import ReconstructionError
-from rig.errors import RigError
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
-NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)
 
 # What every command takes; listed last.
 EVERY_COMMAND = Group("Every command", sort_key=9)

@@ -31,7 +31,7 @@ class Command(NamedTuple):
 
 COMMANDS: dict[Group, tuple[Command, ...]] = {
     TRY_IT: (
-        Command("demo", "pipelines.demo:demo", "demo first-demo --seed 2"),
+        Command("demo", "pipelines.demo:demo", "demo first-demo --quick"),
         Command("simulate", "pipelines.simulate:simulate", "simulate scene --rows 5 --columns 5 --size-px 320 240"),
         Command("darken", "pipelines.darken:darken", "darken bright dark --snr 0.16 --seed 1"),
     ),
@@ -47,6 +47,7 @@ COMMANDS: dict[Group, tuple[Command, ...]] = {
         Command("geometry", "pipelines.geometry:geometry", "geometry boards --depth-mm 500 --depth-mm 700"),
     ),
     RECONSTRUCT: (
+        Command("run", "pipelines.run:run", "run session --depth-mm 500 --depth-mm 700"),
         Command(
             "reconstruct",
             "pipelines.reconstruct:reconstruct",

@@ -39,7 +39,7 @@ def geometry(
     Parameters
     ----------
     directory
-        Folder with charuco.toml and the images it names.
+        A session with charuco frames, or a folder with charuco.toml and the images it names.
     out
         Folder for the results; DIRECTORY by default.
     lens

@@ -6,6 +6,7 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
+from rig.grid import centre_node
 from rig.stages.motion import one_sided, path_duration_s
 from rig.stages.protocol import MotionLimits, Point
 from rig.stages.workspace import Workspace
@@ -60,8 +61,8 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def centre(self) -> "Stop":
-        """Return the centre node, whose camera is the reference frame; of two, the upper or left one."""
-        row, column = (self.rows - 1) // 2, (self.columns - 1) // 2
+        """Return the centre node, whose camera is the reference frame."""
+        row, column = centre_node(self.rows, self.columns)
         return Stop((row, column), self.position(row, column))
 
 

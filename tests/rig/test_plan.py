@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.errors import KeepOutCrossed, OutsideTravel
+from rig.grid import centre_node
 from rig.plan import CapturePlan, Grid, Step
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.grbl import SimulatedGrbl
@@ -44,6 +45,7 @@ def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
     assert serpentine == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0)]
     assert raster == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
     assert Grid(7, 7, 50.0, Point(0.0, 0.0)).centre().node == (3, 3)
+    assert Grid(2, 4, 50.0, Point(0.0, 0.0)).centre().node == (1, 2) == centre_node(2, 4)
 
 
 def test_frames_and_room() -> None:
