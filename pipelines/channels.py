@@ -150,9 +150,13 @@ def checked_frame(loaded: LoadedSet, path: Path, layout: ChannelLayout) -> Frame
         )
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
-        raise UnreadableImage(f"{path}: is {kind}, unlike the set's first view; all views must be of one kind")
+        raise UnreadableImage(
+            f"{path}: is {kind}, unlike the set's first view; all views must be of one kind; export all alike"
+        )
     if found.dtype not in (np.uint8, np.uint16):
-        raise WrongBitDepth(f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers")
+        raise WrongBitDepth(
+            f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers; export them so"
+        )
     saturation_dn = loaded.noise.saturation_dn
     if found.dtype == np.uint8 and np.isfinite(saturation_dn) and saturation_dn > 255:
         raise WrongBitDepth(

@@ -57,7 +57,10 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     shape = size_px[::-1]
     outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
     if len(outside):
-        raise BadValue(f"{path}: hot pixel {outside[0].tolist()} is not one of {shape}; is it another camera's?")
+        raise BadValue(
+            f"{path}: hot pixel {outside[0].tolist()} is not one of {shape}; it seems to be another camera's; "
+            "measure this one"
+        )
     unusable = np.zeros(shape, bool)
     unusable[tuple(hot.T)] = True
     maps = _read_maps(path.with_name(NOISE_MAPS), (*_NUMBERS, "mask", "relative_response"), shape)
@@ -111,5 +114,8 @@ def _read_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> di
         raise BadValue(f"{path}: cannot be read ({failure}); run `faintfield noise` again") from failure
     for name, values in maps.items():
         if values.shape != shape:
-            raise BadValue(f"{path}: {name} has shape {values.shape}, the camera {shape}; is it another camera's?")
+            raise BadValue(
+                f"{path}: {name} has shape {values.shape}, the camera {shape}; it seems to be another camera's; "
+                "measure this one"
+            )
     return maps

@@ -90,7 +90,8 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
             if image.shape[::-1] != size_px:
                 raise WrongSize(
                     f"{view.paths[0]}: is {image.shape[1]} x {image.shape[0]} px, the first image "
-                    f"{size_px[0]} x {size_px[1]}; all images of one camera have one size"
+                    f"{size_px[0]} x {size_px[1]}; all images of one camera have one size; "
+                    "take it again, or leave it out"
                 )
             yield image
 

@@ -308,10 +308,12 @@ def swept_depths(sweep_mm: str) -> list[float]:
     """Return the depths of FIRST:LAST:COUNT."""
     parts = re.fullmatch(r"(\d+(?:\.\d*)?):(\d+(?:\.\d*)?):(\d+)", sweep_mm)
     if parts is None:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: give FIRST:LAST:COUNT, such as 400:900:64")
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give FIRST:LAST:COUNT, such as 400:900:64")
     first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
     if min(first, last) <= 0 or first == last or count < 2:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: two different positive depths and at least 2 planes are needed")
+        raise WrongUsage(
+            f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths and at least 2 planes"
+        )
     return [round(float(depth), 6) for depth in np.linspace(first, last, count)]
 
 

@@ -120,8 +120,8 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
     if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
         raise PlanRefused(
-            f"{settings.port}: no such stage is simulated; there are {', '.join(SIMULATED_FIRMWARE)}, each also with "
-            ":pty behind it"
+            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, each "
+            "also with :pty behind it"
         )
     if not cable:
         return Bench(SIMULATED_FIRMWARE[name or "grbl"])

@@ -1,6 +1,5 @@
 """What will be captured: every position and every frame, laid down before anything moves and never computed again."""
 
-import hashlib
 from collections.abc import Sequence
 from typing import Literal
 
@@ -175,7 +174,3 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         )
         moving_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
         return moving_s + stops * (_ARRIVAL_S + self.settle_s) + exposing_s
-
-    def fingerprint(self) -> str:
-        """Return the SHA-256 of the plan, in hexadecimal: two plans that differ anywhere differ here."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()

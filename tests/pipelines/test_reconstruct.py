@@ -325,7 +325,7 @@ def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> 
     [
         ((), 2, "no plane is asked for"),
         (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
-        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: two different positive depths"),
+        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different positive depths"),
         (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),
         (("--sweep-mm", "400:900:1"), 2, "at least 2 planes"),
         (("--sweep-mm", "500:500.3:7"), 2, "would share a file name; keep them 0.1 mm apart"),

@@ -99,8 +99,6 @@ def test_a_plan_is_frozen_and_survives_a_file() -> None:
         plan.approach_mm = 1.0  # type: ignore[misc]  # that it cannot be assigned is what is tested
     again = msgspec.json.decode(msgspec.json.encode(plan), type=CapturePlan)
     assert again == plan
-    assert again.fingerprint() == plan.fingerprint()
-    assert plan_of(Grid(7, 7, 50.0, Point(10.0, 10.0), "raster")).fingerprint() != plan.fingerprint()
 
 
 def test_wrong_values() -> None:
