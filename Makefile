@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
 OUT ?= demo
 
-.PHONY: demo test lint bench lock clean help
+.PHONY: demo test lint bench results lock clean help
 
 help: ## list the tasks
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
@@ -25,6 +25,11 @@ lint: $(VENV)/installed ## style, types and import contracts
 
 bench: $(VENV)/compiled ## speed against peers, as ratios
 	$(BIN)/python -m benchmarks
+
+results: $(VENV)/installed ## the demo's figures and pictures, put into README.md and docs/pictures; needs Chromium
+	$(BIN)/faintfield demo $(OUT)
+	$(BIN)/python docs/collect_results.py $(OUT)
+	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)
 
 lock: ## renew requirements.lock from pyproject.toml; cameras are extras and not in it
 	$(PYTHON) -m venv .uv

@@ -1,30 +1,139 @@
-"""Draw the picture of README.md from a finished demo: `python docs/draw_pictures.py demo`."""
+"""Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
+Run it from the repository's root. Pages are taken by a real Chromium; that of a capture shows one on the simulated
+rig, begun for the purpose.
+"""
+
+import base64
+import io
+import os
+import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
+from PIL import Image
 
 from pipelines.frames import read_frame
 from pipelines.image_files import contact_sheet, grey_levels, shrunk, write_png
+from tests.end_to_end.browser import Tab, browsing
 
+_PICTURES = Path(__file__).parent / "pictures"
 _WHITE_E = 1.5
 _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
+_PENALISED = ("pmlem", "pmlem-osl")
+_WIDTH_PX = 1000
+_PAGES = (("report", "report.html", 900), ("stage", "geometry.html", 1380))
 
 
-def draw(demo: Path, out: Path) -> None:
-    """Write one dark view beside both planes, back-projected and by PMLEM, on one grey scale."""
-    view = read_frame(demo / "dark-scene" / "view_r3_c3.tiff").pixels_dn
+def draw_planes(demo: Path) -> None:
+    """Draw one dark view beside both planes, as the mean of all views and by PMLEM, on one grey scale."""
+    view = read_frame(_first(demo, "*_dark_scene_*_r3_c3_*.tiff")).pixels_dn
     black, white = np.quantile(view, (0.001, 0.999))
+    penalised = next(method for method in _PENALISED if _found(demo, f"{method}/{_TRUCK}"))
     planes = [
-        grey_levels(read_frame(demo / "dark" / method / name).pixels_dn, _WHITE_E)
+        grey_levels(read_frame(_first(demo, f"{method}/{name}")).pixels_dn, _WHITE_E)
         for name in (_TRUCK, _AIRPLANE)
-        for method in ("backprojection", "pmlem-osl")
+        for method in ("backprojection", penalised)
     ]
     one_view = grey_levels(view, float(white), float(black))
-    pictures = [one_view, *planes[:2], one_view, *planes[2:]]
-    write_png(out, shrunk(contact_sheet(pictures, columns=3), 1280))
+    write_png(
+        _PICTURES / "demo.png", shrunk(contact_sheet([one_view, *planes[:2], one_view, *planes[2:]], 3), _WIDTH_PX)
+    )
+
+
+def draw_noise_page(demo: Path) -> None:
+    """Copy the page of a noise result, reduced."""
+    _keep(_first(demo, "noise_page.png").read_bytes(), "noise")
+
+
+def draw_pages(demo: Path) -> None:
+    """Take the pages of a reconstruction and of a stage as a browser shows them, and the one of a capture."""
+    with TemporaryDirectory() as scratch, browsing(Path(scratch) / "browser") as tab:
+        tab.call("Emulation.setScrollbarsHidden", hidden=True)
+        for name, page, height_px in _PAGES:
+            _resize(tab, height_px)
+            tab.open(_first(demo, page).resolve().as_uri())
+            tab.wait_until("document.readyState == 'complete' && location.protocol == 'file:'")
+            _take(tab, name)
+        _resize(tab, 600)
+        with _capturing(Path(scratch)) as address:
+            tab.open(address)
+            tab.click("go")  # homing
+            tab.click("skip")
+            tab.wait_until("document.getElementById('title').textContent.includes('Bright')")
+            tab.click("go")
+            tab.wait_until("parseInt(document.getElementById('count').textContent) >= 20")
+            _take(tab, "capture")
+
+
+@contextmanager
+def _capturing(folder: Path) -> Iterator[str]:
+    """Run a capture of a board sweep and a bright set on a simulated rig, and yield the address of its page."""
+    from pipelines.init import init
+
+    rig = folder / "rig.toml"
+    init(rig)
+    text = rig.read_text()
+    first, second, third = (text.index(f'kind = "{kind}"') for kind in ("charuco", "bright", "dark_scene"))
+    head, bright = text[: text.rindex("[[step]]", 0, first)], text[text.rindex("[[step]]", 0, second) : third]
+    charuco = '[[step]]\nkind = "charuco"\nexposure_s = 0.05\n\n'
+    rig.write_text(head + charuco + bright.removesuffix("[[step]]\n"))
+    command = [
+        sys.executable,
+        "-c",
+        "from pipelines.cli import main; main()",
+        "capture",
+        str(rig),
+        str(folder / "it"),
+        "--page",
+    ]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, env=os.environ)
+    try:
+        assert process.stderr is not None
+        said = next(line for line in process.stderr if line.startswith("page: "))
+        yield said.removeprefix("page: ").strip()
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _resize(tab: Tab, height_px: int) -> None:
+    """Give the page so much room."""
+    size = {"width": 1100, "height": height_px}
+    tab.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
+
+
+def _take(tab: Tab, name: str) -> None:
+    """Keep what the browser shows."""
+    _keep(base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"]), name)
+
+
+def _keep(content: bytes, name: str) -> None:
+    """Write a PNG into the folder of pictures, reduced and in 256 colours: it is looked at, not measured."""
+    with Image.open(io.BytesIO(content)) as picture:
+        picture.thumbnail((_WIDTH_PX, 4 * _WIDTH_PX))
+        few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(_PICTURES / f"{name}.png", optimize=True)
+
+
+def _found(demo: Path, name: str) -> list[Path]:
+    """Return the files of that name, those that lie less deep before others."""
+    return sorted(demo.rglob(name), key=lambda path: len(path.parts))
+
+
+def _first(demo: Path, name: str) -> Path:
+    """Return the first of them."""
+    if found := _found(demo, name):
+        return found[0]
+    raise FileNotFoundError(f"no {name} in {demo}; run `faintfield demo {demo}` to its end")
 
 
 if __name__ == "__main__":
-    draw(Path(sys.argv[1]), Path(__file__).parent / "pictures" / "demo.png")
+    finished = Path(sys.argv[1])
+    draw_planes(finished)
+    draw_noise_page(finished)
+    draw_pages(finished)

@@ -1,6 +1,6 @@
-"""The board set: a folder of images of ChArUco boards with `charuco.toml`."""
+"""The board set: a folder of images of ChArUco boards with `charuco.toml`, or the charuco frames of a session."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,9 @@ from pipelines.errors import BadValue, MissingFile, WrongSize
 from pipelines.files import sha256, write_whole
 from pipelines.frames import read_frame
 from pipelines.toml_files import inside, read_toml
+from rig.grid import centre_node
+from rig.session.opening import has_session, read_plan, taken_frames
+from rig.session.session import PLAN
 
 FILE_NAME = "charuco.toml"
 
@@ -55,11 +58,12 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 @dataclass(frozen=True)
 class BoardView:
-    """What was seen at a node in a sweep: the files of its repeated frames."""
+    """What was seen at a node in a sweep: the files of its repeated frames, and the filters on their pixels."""
 
     node: Node
     sweep: int
     paths: tuple[Path, ...]
+    mosaic: tuple[str, ...] | None = None
 
     def image(self) -> NDArray[np.float32]:
         """Return the mean of the frames (row, column), the colours of RGB frames averaged.
@@ -71,8 +75,9 @@ class BoardView:
         """
         total: NDArray[Any] | None = None
         for path in self.paths:
-            pixels = read_frame(path).pixels_dn.astype(np.float32)
-            grey = pixels.mean(axis=2) if pixels.ndim == 3 else pixels
+            frame = read_frame(path)
+            pixels = frame.pixels_dn.astype(np.float32)
+            grey = pixels.mean(axis=2) if pixels.ndim == 3 else _without_filters(pixels, self.mosaic or frame.mosaic)
             if total is not None and grey.shape != total.shape:
                 raise WrongSize(f"{path}: is {grey.shape[::-1]} px, its repeats {total.shape[::-1]}; take it again")
             total = grey if total is None else total + grey
@@ -92,6 +97,8 @@ class BoardSet:
         All boards.
     views : list of BoardView
         In the order in which they were taken.
+    reference : (int, int)
+        The node whose camera is the reference: the centre of the grid.
     pitch_mm : float, optional
         Distance of neighbouring nodes as the stage was told.
     """
@@ -99,13 +106,8 @@ class BoardSet:
     source: Path
     boards: dict[str, Board]
     views: list[BoardView]
+    reference: Node
     pitch_mm: float | None
-
-    @property
-    def reference(self) -> Node:
-        """The centre node of the grid that the views span."""
-        rows, columns = (1 + max(view.node[axis] for view in self.views) for axis in (0, 1))
-        return rows // 2, columns // 2
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that was read."""
@@ -115,16 +117,18 @@ class BoardSet:
 
 
 def load_board_set(folder: Path) -> BoardSet:
-    """Read and check `charuco.toml` and that the files it names exist.
+    """Read and check `charuco.toml`, or the charuco frames of a session, and that the files named exist.
 
     Raises
     ------
     InputError
         A file is missing, a key unknown, or a value cannot be; the message names it.
     """
+    if has_session(folder) and not (folder / FILE_NAME).is_file():
+        return _of_session(folder)
     path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
     settings = read_toml(path, BoardSetFile)
-    boards = _boards(path, settings)
+    boards = _boards(path, settings.board)
     if not settings.image:
         raise BadValue(f"{path}: names no [[image]]; give each its file, node and sweep")
     files: dict[tuple[Node, int], list[Path]] = {}
@@ -137,8 +141,46 @@ def load_board_set(folder: Path) -> BoardSet:
         files.setdefault((entry.node, entry.sweep), []).append(file)
     if settings.pitch_mm is not None and not settings.pitch_mm > 0:
         raise BadValue(f"{path}: pitch_mm = {settings.pitch_mm}; it must be positive")
-    views = [BoardView(node, sweep, tuple(paths)) for (node, sweep), paths in files.items()]
-    return BoardSet(path, boards, views, settings.pitch_mm)
+    rows, columns = (1 + max(node[axis] for node, _ in files) for axis in (0, 1))
+    return BoardSet(path, boards, _views(files), centre_node(rows, columns), settings.pitch_mm)
+
+
+def _of_session(folder: Path) -> BoardSet:
+    """Return the charuco frames of a session; each charuco step is a sweep, during which the boards stand still."""
+    frozen = read_plan(folder)
+    files: dict[tuple[Node, int], list[Path]] = {}
+    for planned, _, path in taken_frames(folder):
+        if planned.kind == "charuco":
+            if not path.is_file():
+                raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
+            files.setdefault((planned.stop.node, planned.sweep), []).append(path)
+    if not files:
+        raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
+    boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
+    centre = frozen.plan.centre.node
+    return BoardSet(folder / PLAN, boards, _views(files, frozen.rig.mosaic), centre, frozen.rig.grid.pitch_mm)
+
+
+def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
+    return [BoardView(node, sweep, tuple(paths), mosaic) for (node, sweep), paths in files.items()]
+
+
+def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None) -> NDArray[np.float32]:
+    """Return a frame as if it had no colour filters: black and white of each phase brought to those of the whole.
+
+    A board is grey, so that its light differs from phase to phase by a factor only, whatever the black level.
+    """
+    if mosaic is None:
+        return pixels
+    period = (len(mosaic), len(mosaic[0]))
+    ends = (0.05, 0.95)
+    black, white = np.quantile(pixels, ends)
+    grey = np.empty_like(pixels)
+    for row, column in np.ndindex(*period):
+        phase = pixels[row :: period[0], column :: period[1]]
+        low, high = np.quantile(phase, ends)
+        grey[row :: period[0], column :: period[1]] = black + (phase - low) * ((white - black) / max(high - low, 1.0))
+    return grey
 
 
 def write_board_set(folder: Path, settings: BoardSetFile) -> None:
@@ -147,12 +189,12 @@ def write_board_set(folder: Path, settings: BoardSetFile) -> None:
     write_whole(folder / FILE_NAME, tomli_w.dumps(content))
 
 
-def _boards(path: Path, settings: BoardSetFile) -> dict[str, Board]:
+def _boards(path: Path, entries: Sequence[BoardEntry]) -> dict[str, Board]:
     """Return the boards by name; two that share a name or a marker are refused."""
-    if not settings.board:
+    if not entries:
         raise BadValue(f"{path}: names no [[board]]; give what `faintfield board` printed beneath the board")
     boards: dict[str, Board] = {}
-    for entry in settings.board:
+    for entry in entries:
         try:
             board = entry.board()
         except ValueError as failure:

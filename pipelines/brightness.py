@@ -1,17 +1,17 @@
 """How dark a set is: its SNR and photons per pixel, by the paper's formulas and by counting."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.channels import channel_layouts, checked_frame, lattice_noise
+from pipelines.channels import channel_layouts, lattice_noise, view_electrons
 from pipelines.elemental_set import LoadedSet
 from pipelines.frames import read_frame
 from recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 
-# Beside a set's images, where they are known: an exposure of nothing, and the object region of the reference view.
-NOISE_REFERENCE = "noise_reference.tiff"
+# Beside a set's images, where it is known: the object region of the reference view.
 OBJECT_REGION = "object_region.png"
 
 
@@ -43,28 +43,26 @@ class Brightness:
     mean_signal_e: float
 
 
-def brightness(loaded: LoadedSet) -> Brightness:
-    """Measure the reference view of a set, in all its colours together."""
-    path = loaded.image_paths[loaded.reference_view]
-    region_path, reference_path = loaded.folder / OBJECT_REGION, loaded.folder / NOISE_REFERENCE
+def brightness(loaded: LoadedSet, region_path: Path | None = None) -> Brightness:
+    """Measure the reference view of a set, in all its colours together; over the set's own object region by default."""
+    region_path = region_path or loaded.folder / OBJECT_REGION
     region = read_frame(region_path).pixels_dn > 127 if region_path.is_file() else None
+    has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
     signal, reference = [], []
     for layout in channel_layouts(loaded):
-        frame = checked_frame(loaded, path, layout)
-        for lattice in layout.lattices:
-            noise = lattice_noise(loaded, lattice, frame)
+        images = view_electrons(loaded, layout, loaded.frame_paths(loaded.reference_view))
+        nothing = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
+        for index, lattice in enumerate(layout.lattices):
             where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
-            dark_e = noise.background_e(loaded.settings.exposure_s)
-            signal.append((noise.electrons(lattice.of(layout.of(frame.pixels_dn))))[where])
-            if reference_path.is_file():
-                nothing = read_frame(reference_path).pixels_dn
-                reference.append(noise.electrons(lattice.of(layout.of(nothing))).ravel())
+            signal.append(images[index][0][where])
+            if has_reference:
+                reference.append(nothing[index][0].ravel())
             else:
-                power = np.broadcast_to(noise.read_variance_e2() + dark_e + np.square(dark_e), lattice.shape)
+                noise = lattice_noise(loaded, lattice, None)
+                dark_e = loaded.background_e(noise)
+                power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
                 reference.append(np.sqrt(power).ravel())
-    return _figures(
-        loaded, np.concatenate(signal), np.concatenate(reference), region is not None, reference_path.is_file()
-    )
+    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), region is not None, has_reference)
 
 
 def _figures(
@@ -76,9 +74,9 @@ def _figures(
 ) -> Brightness:
     """Apply the formulas."""
     noise = loaded.noise
-    read_noise_e = float(np.sqrt(np.mean(np.square(noise.read_noise_e))))
+    read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
     snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
-    dark_e = float(np.mean(noise.background_e(loaded.settings.exposure_s)))
+    dark_e = float(np.mean(loaded.background_e(noise)))
     known = {"quantum_efficiency": noise.quantum_efficiency, "read_noise_e": read_noise_e}
     return Brightness(
         region="object region" if has_region else "whole view",

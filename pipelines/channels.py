@@ -1,5 +1,6 @@
 """From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -95,29 +96,46 @@ def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
         A frame is not what the set says it is; the message names it.
     """
     phases = len(layout.lattices)
-    views = len(loaded.image_paths)
+    views = len(loaded.settings.view)
     shape = layout.lattices[0].shape
     electrons = np.empty((views * phases, *shape), np.float32)
     saturated: dict[int, NDArray[np.bool_]] = {}
-    for view, path in enumerate(loaded.image_paths):
-        frame = checked_frame(loaded, path, layout)
-        pixels = layout.of(frame.pixels_dn)
-        for phase, lattice in enumerate(layout.lattices):
-            noise = lattice_noise(loaded, lattice, frame)
-            stack_index = view * phases + phase
-            pixels_dn = lattice.of(pixels)
-            electrons[stack_index] = noise.electrons(pixels_dn)
-            over = noise.saturated(pixels_dn)
+    for view in range(views):
+        for phase, (sum_e, over) in enumerate(view_electrons(loaded, layout, loaded.frame_paths(view))):
+            electrons[view * phases + phase] = sum_e
             if over.any():
-                saturated[stack_index] = over
+                saturated[view * phases + phase] = over
     noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
-    exposure_s = loaded.settings.exposure_s
     return ElementalImages(
         electrons,
-        background_e=_stacked([noise.background_e(exposure_s) for noise in noises], shape),
-        read_variance_e2=_stacked([noise.read_variance_e2() for noise in noises], shape),
+        background_e=_stacked([loaded.background_e(noise) for noise in noises], shape),
+        read_variance_e2=_stacked([loaded.read_variance_e2(noise) for noise in noises], shape),
         valid=_valid(electrons.shape, saturated),
     )
+
+
+def view_electrons(
+    loaded: LoadedSet, layout: ChannelLayout, paths: Sequence[Path]
+) -> list[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
+    """Return for each lattice the electrons (row, column) of all frames of a view, and where one of them is saturated.
+
+    The sum says of the light all that the frames say one by one, up to the shape of the read noise: Poisson counts add
+    up to Poisson counts, and variances add.
+    """
+    sums: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
+    for path in paths:
+        frame = checked_frame(loaded, path, layout)
+        pixels = layout.of(frame.pixels_dn)
+        for index, lattice in enumerate(layout.lattices):
+            noise = lattice_noise(loaded, lattice, frame)
+            pixels_dn = lattice.of(pixels)
+            electrons, over = noise.electrons(pixels_dn), noise.saturated(pixels_dn)
+            if path is paths[0]:
+                sums.append((electrons, over))
+            else:
+                before_e, before_over = sums[index]
+                sums[index] = (before_e + electrons, before_over | over)
+    return sums
 
 
 def checked_frame(loaded: LoadedSet, path: Path, layout: ChannelLayout) -> Frame:
@@ -132,9 +150,13 @@ def checked_frame(loaded: LoadedSet, path: Path, layout: ChannelLayout) -> Frame
         )
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
-        raise UnreadableImage(f"{path}: is {kind}, unlike the set's first view; all views must be of one kind")
+        raise UnreadableImage(
+            f"{path}: is {kind}, unlike the set's first view; all views must be of one kind; export all alike"
+        )
     if found.dtype not in (np.uint8, np.uint16):
-        raise WrongBitDepth(f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers")
+        raise WrongBitDepth(
+            f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers; export them so"
+        )
     saturation_dn = loaded.noise.saturation_dn
     if found.dtype == np.uint8 and np.isfinite(saturation_dn) and saturation_dn > 255:
         raise WrongBitDepth(

@@ -1,29 +1,36 @@
 """The command line: which commands there are, and how their ends become exit codes.
 
-A command is a function that takes its arguments and returns its result, a JSON-able object. Commands are registered
-by name, so that a module is imported only when its command runs.
+A command is a function that takes its arguments and returns its result, a JSON-able object. `pipelines.commands` lists
+them by name, so that a module is imported only when its command runs.
 """
 
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter
 
-from calib.errors import CalibrationError
+from pipelines.commands import register_commands
 from pipelines.console import framed_console, say
-from pipelines.errors import InputError, WrongUsage
-from recon.errors import ReconstructionError
-from rig.errors import RigError
+from pipelines.errors import NAMED_FAILURES, WrongUsage
+from pipelines.log_file import logged
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
-NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)
+
+# What every command takes; listed last.
+EVERY_COMMAND = Group("Every command", sort_key=9)
+
+_START = """Start with: faintfield demo first-demo
+
+Every command ends its own --help with an example; docs/guide.md leads from the parts list to the first plane."""
 
 app = App(
     name="faintfield",
     help="See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.",
+    help_epilogue=_START,
     version=version("faintfield"),
     error_console=framed_console,
     default_parameter=Parameter(negative=()),
@@ -31,40 +38,17 @@ app = App(
 )
 # `run` says in one line what an interrupt leaves behind.
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
-
-
-for _name in (
-    "demo",
-    "init",
-    "check",
-    "capture",
-    "verify",
-    "noise",
-    "geometry",
-    "simulate",
-    "darken",
-    "reconstruct",
-    "figures",
-    "report",
-    "view",
-):
-    app.command(f"pipelines.{_name}:{_name}")
-app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))
-app["import"].command("pipelines.import_grid:import_grid", name="grid")
-app["import"].command("pipelines.import_emva1288:import_emva1288", name="emva1288")
-app.command("pipelines.stage:app", name="stage")
-app.command("pipelines.board_pdf:board")
-app["import"].command("pipelines.import_colmap:import_colmap", name="colmap")
-app["import"].command("pipelines.import_mrcal:import_mrcal", name="mrcal")
-app.command(App(name="export", help="Write the lens and poses of a set for other people's programs."))
-app["export"].command("pipelines.import_colmap:export_colmap", name="colmap")
-app["export"].command("pipelines.import_mrcal:export_mrcal", name="mrcal")
+register_commands(app)
+app.register_install_completion_command(help="Complete commands and options with the tab key of your shell.")
+for _flag in ("--install-completion", "--help", "--version"):
+    app[_flag].group = EVERY_COMMAND
 
 
 @app.meta.default
 def _launch(
     *tokens: Annotated[str, Parameter(show=False, allow_leading_hyphen=True)],
-    json: bool = False,
+    json: Annotated[bool, Parameter(group=EVERY_COMMAND, show_default=False)] = False,
+    log: Annotated[Path | None, Parameter(group=EVERY_COMMAND)] = None,
 ) -> None:
     """See in the dark: reconstruct the planes of a scene from a grid of photon-starved images.
 
@@ -72,8 +56,11 @@ def _launch(
     ----------
     json
         Print the result as one JSON object on standard output.
+    log
+        Add a record to this file: the command, versions, all that is said, with times, and how it ended.
     """
-    result: Any = app(tokens, exit_on_error=False, print_error=True)
+    with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)):
+        result: Any = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
     elif isinstance(result, dict) and "report" in result:

@@ -1,5 +1,6 @@
 """Words and progress for people, always on standard error; standard output is for results alone."""
 
+import logging
 from collections.abc import Iterable, Iterator
 
 from rich.console import Console
@@ -14,13 +15,16 @@ from rich.progress import (
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
+logger = logging.getLogger("faintfield")
+
 # A message in a frame needs its lines broken, or the frame cuts them off.
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
 
 def say(text: str) -> None:
-    """Print one line of human words."""
+    """Print one line of human words, and record it where a log is kept."""
     console.print(text, markup=False)
+    logger.info(text)
 
 
 def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:

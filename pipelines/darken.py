@@ -10,10 +10,10 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from pipelines.arguments import Fraction, NotNegative, Positive, Seed
-from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION, brightness
+from pipelines.brightness import OBJECT_REGION, brightness
 from pipelines.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from pipelines.console import progress, say
-from pipelines.elemental_set import LoadedSet, load_set, write_set
+from pipelines.elemental_set import NOISE_REFERENCE, LoadedSet, load_set, write_set
 from pipelines.errors import BadValue
 from pipelines.exposures import stated_noise, write_exposures
 from pipelines.files import building_folder, write_json

@@ -1,83 +1,71 @@
-"""`faintfield demo`: the whole experiment on simulated light, ending with report.html."""
+"""`faintfield demo`: the whole experiment on a rig that exists in the computer alone, ending with report.html."""
 
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
-import numpy as np
-
-from calib.board import Board
 from pipelines.arguments import Positive, Seed
+from pipelines.capture import capture
 from pipelines.console import say
-from pipelines.elemental_set import FILE_NAME
-from pipelines.files import building_folder, check_free, write_json
-from pipelines.geometry import geometry
+from pipelines.demo_rig import DemoSize, demo_rig
+from pipelines.demo_truth import demo_metrics, true_set, write_truth
+from pipelines.elemental_set import load_set
+from pipelines.files import check_free, write_json
 from pipelines.metrics import METRICS_FILE
-from pipelines.reconstruct import reconstruct
+from pipelines.planes import Method
+from pipelines.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
 from pipelines.report import write_report
-from pipelines.simulate import NOISE_FREE, simulate
-from pipelines.simulate_boards import simulate_board_set
-from pipelines.truth import read_truth
-from rig.simulation.experiment import paper_experiment
+from pipelines.run import run_steps, session_steps
+from pipelines.session_set import nominal_session
+from pipelines.simulate import NOISE_FREE
+from pipelines.toml_files import write_toml
 
-_DEPTHS_MM = [500.0, 700.0]
-_DARK_SCENE = "dark-scene"
-_BOARDS = "boards"
+# By this file a folder is known as one that an earlier demo made, and that the next may replace.
+_MARK = "demo.json"
+
+_METHODS: list[Method] = list(get_args(Method.__value__))
 
 
-def demo(out: Path = Path("demo"), /, *, snr: Positive = 0.16, seed: Seed = 1, measure: bool = False) -> dict[str, Any]:
-    """Run the paper's experiment: simulate it in the dark, reconstruct both objects, and draw the report.
+def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.16, seed: Seed = 1) -> dict[str, Any]:
+    """Run the paper's experiment on a simulated rig, from the first board sweep to the report.
+
+    A simulated gantry behind a pseudo-terminal carries a simulated camera; boards, objects, dark and flat frames are
+    captured as a session, and noise, geometry and planes found from it. Only then the truth is looked up, in OUT/truth,
+    and metrics.json says how far off everything is: with measured poses, with nominal ones, and with the true ones.
 
     Parameters
     ----------
     out
         Folder to write; the results of an earlier demo are replaced.
+    quick
+        A small one: fewer nodes and pixels.
     snr
         Of the dark views, eq. (4).
     seed
         Of all chance.
-    measure
-        Do not take the camera's poses for known: photograph boards from the same nodes, measure where it was, and
-        compare with the nominal grid. Takes half a minute more.
     """
-    check_free(out, replace_if=f"{_DARK_SCENE}/{FILE_NAME}")
-    scene = out / _DARK_SCENE
-    say("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm, almost dark")
-    simulate(scene, snr=snr, seed=seed, poses="nominal" if measure else "true", overwrite=True)
-    say("reconstructing both planes without noise, for comparison")
-    reconstruct(scene / NOISE_FREE, out=out / "noise-free", depth_mm=_DEPTHS_MM, method=["backprojection"])
-    planes = _with_nominal_poses(scene, out, seed) if measure else []
-    say("reconstructing both planes from the dark")
-    dark = reconstruct(
-        scene,
-        out=out / "dark",
-        depth_mm=_DEPTHS_MM,
-        method=["backprojection", "mlem", "pmlem-osl"],
-        geometry=out / _BOARDS if measure else None,
-    )
-    metrics = {**dark["metrics"], "planes": [*dark["metrics"]["planes"], *planes]}
+    _make_free(out)
+    settings = demo_rig(DemoSize.quick() if quick else DemoSize.full(), snr, seed)
+    write_toml(out / "rig.toml", settings)
+    session = out / "session"
+    say("capturing: boards, a toy truck at 500 mm and a toy airplane at 700 mm, almost dark, then dark and flat frames")
+    capture(out / "rig.toml", session, yes=True)
+    depths = list(settings.scene.depth_mm)
+    run_steps(session, session_steps(session, Request(depths, _METHODS)))
+    say("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
+    truth = write_truth(out / "truth", session, snr)
+    reconstruct_set(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
+    alone = Request(depths, [DEFAULT_METHOD])
+    reconstruct_set(nominal_session(session), out / "nominal", alone)
+    reconstruct_set(true_set(session, truth), out / "true", alone)
+    metrics = demo_metrics(out, session, truth, _METHODS, DEFAULT_METHOD)
     write_json(out / METRICS_FILE, metrics)
     return {"out": str(out), "report": str(write_report(out)), "metrics": metrics}
 
 
-def _with_nominal_poses(scene: Path, out: Path, seed: int) -> list[dict[str, Any]]:
-    """Measure the camera from boards, and return the errors that a reconstruction has without that."""
-    say("photographing boards from the same nodes, and measuring where the camera was")
-    _photograph_boards(scene, out / _BOARDS, seed)
-    geometry(out / _BOARDS, depth_mm=_DEPTHS_MM)
-    say("reconstructing both planes from the dark, with nominal poses")
-    nominal = reconstruct(scene, out=out / "nominal", depth_mm=_DEPTHS_MM, method=["pmlem-osl"])
-    planes: list[dict[str, Any]] = nominal["metrics"]["planes"]
-    return planes
-
-
-def _photograph_boards(scene: Path, out: Path, seed: int) -> None:
-    """Photograph three boards with the camera where it was for the dark scene."""
-    truth = read_truth(scene)
-    assert truth is not None
-    boards = [Board(f"board-{letter}", 11, 8, 36.0, 26.0, "DICT_4X4_250", 44 * k) for k, letter in enumerate("abc")]
-    generator = np.random.default_rng([seed, 1])
-    if out.exists():
-        shutil.rmtree(out)
-    with building_folder(out) as folder:
-        simulate_board_set(folder, paper_experiment(), np.array(truth.true_rt_cam_ref), boards, generator)
+def _make_free(out: Path) -> None:
+    """Remove what an earlier demo left, and nothing else."""
+    check_free(out, replace_if=_MARK)
+    for name in ("session", "truth", "noise-free", "nominal", "true"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    write_json(out / _MARK, {"format": 1, "made_by": "faintfield demo"})

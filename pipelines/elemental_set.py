@@ -20,6 +20,9 @@ from pipelines.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
 
+# Beside a set's images, where it is known: an exposure of nothing.
+NOISE_REFERENCE = "noise_reference.tiff"
+
 # How far the reference view's pose may be from zero: less than any calibration can tell.
 _ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
 
@@ -49,17 +52,18 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
 
 
 class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One `[[view]]`: an image and the pose it was taken from."""
+    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first."""
 
     image: str
     rt_cam_ref: tuple[float, float, float, float, float, float]
     node: tuple[int, int] | None = None
     cx_px: float | None = None
     cy_px: float | None = None
+    repeats: tuple[str, ...] = ()
 
 
 class ElementalSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `elemental.toml`."""
+    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together."""
 
     format: Literal[1]
     exposure_s: float
@@ -90,7 +94,13 @@ class LoadedSet:
     unusable : bool array (row, column)
         Pixels that never count (hot, dead).
     measured_in : Path, optional
-        The geometry.json that lens and poses were taken from; None where they are the set's own.
+        The geometry.json that the lens was taken from; None where it is the set's own.
+    poses : str
+        Where the poses come from: "stated" in the set, "measured", "nominal" or "true".
+    described_in : str
+        The file that says what the images are.
+    noise_reference : tuple of Path
+        Exposures of nothing, where there are any.
     """
 
     folder: Path
@@ -101,6 +111,9 @@ class LoadedSet:
     flat: NDArray[np.float32] | None
     unusable: NDArray[np.bool_]
     measured_in: Path | None = None
+    poses: Literal["stated", "measured", "nominal", "true"] = "stated"
+    described_in: str = FILE_NAME
+    noise_reference: tuple[Path, ...] = ()
 
     @property
     def reference_view(self) -> int:
@@ -114,8 +127,26 @@ class LoadedSet:
 
     @property
     def image_paths(self) -> list[Path]:
-        """Where the images lie."""
+        """Where the images lie: of each view the first frame."""
         return [self.folder / view.image for view in self.settings.view]
+
+    @property
+    def frames_per_view(self) -> int:
+        """How many frames are added up to a view."""
+        return 1 + len(self.settings.view[0].repeats)
+
+    def frame_paths(self, view: int) -> list[Path]:
+        """Return where all frames of a view lie."""
+        entry = self.settings.view[view]
+        return [self.folder / name for name in (entry.image, *entry.repeats)]
+
+    def background_e(self, noise: NoiseModel) -> Map:
+        """Return the dark electrons expected in all frames of a view, by the noise model of the set or a part of it."""
+        return noise.background_e(self.settings.exposure_s)
+
+    def read_variance_e2(self, noise: NoiseModel) -> Map:
+        """Return the variance that reading adds to a view: once per frame."""
+        return self.frames_per_view * noise.read_variance_e2()
 
     def principal_points_px(self) -> NDArray[np.float64]:
         """Return cx, cy of each view (view, 2)."""
@@ -163,7 +194,7 @@ class LoadedSet:
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
-        for name in [FILE_NAME, *_named_files(self.settings)]:
+        for name in [self.described_in, *_named_files(self.settings)]:
             yield name, sha256(self.folder / name)
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
@@ -202,6 +233,7 @@ def load_set(folder: Path) -> LoadedSet:
         offset_from_files=isinstance(settings.noise, Noise) and settings.noise.offset_dn is None,
         flat=noise.response if camera.flat is None else _read_flat(folder / camera.flat, camera.size_px),
         unusable=noise.unusable,
+        noise_reference=tuple(path for path in [folder / NOISE_REFERENCE] if path.is_file()),
     )
 
 
@@ -222,7 +254,8 @@ def write_set(folder: Path, settings: ElementalSet) -> None:
 def _named_files(settings: ElementalSet) -> list[str]:
     """Return the names of the files that `elemental.toml` names."""
     optional = [settings.camera.flat, settings.noise if isinstance(settings.noise, str) else None]
-    return [*(name for name in optional if name is not None), *(view.image for view in settings.view)]
+    images = [name for view in settings.view for name in (view.image, *view.repeats)]
+    return [*(name for name in optional if name is not None), *images]
 
 
 def _check_numbers(path: Path, settings: ElementalSet) -> None:
@@ -259,7 +292,10 @@ def _check_views(path: Path, settings: ElementalSet) -> None:
             f"{path}: view[{settings.reference_view}] is the reference but its pose is {reference.tolist()}; "
             "poses are relative to the reference view, whose own is zero"
         )
-    _refuse_repeated(path, "image", [view.image for view in settings.view])
+    _refuse_repeated(path, "image", [name for view in settings.view for name in (view.image, *view.repeats)])
+    counts = {1 + len(view.repeats) for view in settings.view}
+    if len(counts) > 1:
+        raise BadValue(f"{path}: views have {min(counts)} to {max(counts)} frames; give all of them as many repeats")
     _refuse_repeated(path, "node", [list(view.node) for view in settings.view if view.node is not None])
 
 

@@ -17,6 +17,10 @@ WrongUsage
 Every message says what is wrong, the value found, the limit it broke, and what to do.
 """
 
+from calib.errors import CalibrationError
+from recon.errors import ReconstructionError
+from rig.errors import RigError
+
 
 class InputError(Exception):
     """A file or folder given to a command cannot be used."""
@@ -64,3 +68,7 @@ class DiskFull(CannotWrite):
 
 class WrongUsage(Exception):
     """The options of a command do not make sense together; exit code 2, unlike an InputError."""
+
+
+# What a user can mend: the launcher says it in one line and ends with exit code 1.
+NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)

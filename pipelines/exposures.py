@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.brightness import NOISE_REFERENCE
-from pipelines.elemental_set import Noise
+from pipelines.elemental_set import NOISE_REFERENCE, Noise
 from pipelines.image_files import write_frame
 from rig.simulation.sensor import SimulatedSensor
 

@@ -10,9 +10,8 @@ import numpy as np
 from cyclopts import Parameter
 
 from pipelines.arguments import Count, Positive, Seed, SizePx
-from pipelines.brightness import NOISE_REFERENCE
 from pipelines.console import say
-from pipelines.elemental_set import load_set
+from pipelines.elemental_set import NOISE_REFERENCE, load_set
 from pipelines.figure4 import PAPERS_AXIS, as_csv, as_rows, curves, is_monotone, measure
 from pipelines.figure_methods import METHODS, OURS
 from pipelines.files import check_free, write_json, write_whole

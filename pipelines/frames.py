@@ -84,7 +84,9 @@ def read_frame(path: Path) -> Frame:
     if pixels.size == 0:
         raise UnreadableImage(_cannot_decode(path, "no pixels"))
     if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
-        raise UnreadableImage(f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted")
+        raise UnreadableImage(
+            f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted; export it as such"
+        )
     return Frame(pixels)
 
 

@@ -39,7 +39,7 @@ def geometry(
     Parameters
     ----------
     directory
-        Folder with charuco.toml and the images it names.
+        A session with charuco frames, or a folder with charuco.toml and the images it names.
     out
         Folder for the results; DIRECTORY by default.
     lens
@@ -90,7 +90,8 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
             if image.shape[::-1] != size_px:
                 raise WrongSize(
                     f"{view.paths[0]}: is {image.shape[1]} x {image.shape[0]} px, the first image "
-                    f"{size_px[0]} x {size_px[1]}; all images of one camera have one size"
+                    f"{size_px[0]} x {size_px[1]}; all images of one camera have one size; "
+                    "take it again, or leave it out"
                 )
             yield image
 

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from calib.board import Board
@@ -21,66 +20,12 @@ from calib.geometry import (
 )
 from calib.geometry.stage import StageReport
 from calib.lens import Lens
-from pipelines.errors import BadValue, MissingFile
 from pipelines.files import write_json, write_whole
+from pipelines.measured_poses import GEOMETRY_FILE
 
-GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
 CORNERS_FILE = "geometry_corners.npz"
 CAMERAS = "cameras"
-
-
-class LensEntry(msgspec.Struct, frozen=True):
-    """The `lens` of geometry.json."""
-
-    model: str
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...]
-
-
-class NodeEntry(msgspec.Struct, frozen=True):
-    """One of the `nodes` of geometry.json."""
-
-    node: tuple[int, int]
-    rt_cam_ref: tuple[float, float, float, float, float, float]
-    sigma_mm: float
-    sigma_rad: float
-
-
-class GeometryFile(msgspec.Struct, frozen=True):
-    """What others read of geometry.json; the rest of it is for people."""
-
-    lens: LensEntry
-    size_px: tuple[int, int]
-    nodes: list[NodeEntry]
-    reference_node: tuple[int, int]
-
-    def camera_lens(self) -> Lens:
-        """Return the lens."""
-        lens = self.lens
-        return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-
-
-def read_geometry(path: Path) -> GeometryFile:
-    """Read geometry.json, or that of a folder.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is none, or it is no result of `faintfield geometry`.
-    """
-    path = path / GEOMETRY_FILE if path.is_dir() else path
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
-    try:
-        geometry = msgspec.json.decode(path.read_bytes(), type=GeometryFile)
-        geometry.camera_lens()
-    except (msgspec.DecodeError, ValueError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield geometry` ({failure}); run that again") from failure
-    return geometry
 
 
 def write_geometry(
@@ -93,6 +38,7 @@ def write_geometry(
     record: dict[str, Any],
 ) -> dict[str, Any]:
     """Write the files of a geometry into `out`, geometry.json last, and return its contents."""
+    (out / GEOMETRY_FILE).unlink(missing_ok=True)  # it would vouch for files that replace its own
     write_whole(out / COVARIANCE_FILE, _covariance_npz(geometry))
     write_whole(out / CORNERS_FILE, _corners_npz(observations))
     for node, rt_cam_ref in zip(geometry.nodes, geometry.rt_cam_ref, strict=True):

@@ -47,7 +47,10 @@ def import_colmap(
     model = read_model(src)
     used = sorted({image.camera for image in model.images})
     if len(used) != 1:
-        raise BadValue(f"{src}: its images were taken with {len(used)} cameras; one camera on a gantry is one lens")
+        raise BadValue(
+            f"{src}: its images were taken with {len(used)} cameras; one camera on a gantry is one lens; "
+            "let COLMAP share one camera (ImageReader.single_camera)"
+        )
     scale = np.repeat([1.0, mm_per_unit], 3)
     folder = images or src
     posed = [PosedImage(folder / image.name, image.rt_cam_world * scale) for image in model.images]

@@ -93,7 +93,8 @@ def parse_descriptor(path: Path) -> Descriptor:
             ) from failure
     if not read.frames or not 1 <= read.bits <= 32:
         raise BadValue(
-            f"{path}: names {len(read.frames)} images of {read.bits} bits; an 'n' line and images are needed"
+            f"{path}: names {len(read.frames)} images of {read.bits} bits; an 'n' line and images are needed; "
+            "name the descriptor of a data set"
         )
     return read
 

@@ -140,7 +140,10 @@ def _find_grid(src: Path, rows: int | None, columns: int | None) -> _Grid:
 def _grid_in_order(src: Path, paths: list[Path], rows: int, columns: int) -> _Grid:
     """Return the pictures in the order of their names as a grid of the size given."""
     if len(paths) != rows * columns:
-        raise MissingFile(f"{src}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}")
+        raise MissingFile(
+            f"{src}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
+            "correct --rows and --columns, or add the missing ones"
+        )
     nodes = [(row, column) for row in range(rows) for column in range(columns)]
     return _Grid(dict(zip(nodes, paths, strict=True)), rows, columns)
 
@@ -163,7 +166,9 @@ def _read_picture(path: Path) -> Frame:
     """Read a picture whose pixels are what a camera's are."""
     frame = read_frame(path)
     if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
-        raise BadValue(f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted")
+        raise BadValue(
+            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted; convert it"
+        )
     return frame
 
 
@@ -200,7 +205,7 @@ def _copy_picture(path: Path, folder: Path, first: Frame) -> str:
     if frame.pixels_dn.shape != first.pixels_dn.shape:
         raise WrongSize(
             f"{path}: is {frame.pixels_dn.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "
-            "all must be alike"
+            "all must be alike; take it again or leave it out"
         )
     as_it_is = path.suffix.lower() in RAW_SUFFIXES or frame.pixels_dn.dtype == np.uint16
     name = path.name if as_it_is else f"{path.stem}.tiff"

@@ -61,7 +61,8 @@ def import_mrcal(
         posed.append(PosedImage(_image_of(path, images or src), rt_cam_world * scale))
     if len(set(lenses)) > 1:
         raise BadValue(
-            f"{src}: its models have {len(set(lenses))} different lenses; one camera on a gantry is one lens"
+            f"{src}: its models have {len(set(lenses))} different lenses; one camera on a gantry is one lens; "
+            "name the folder of one calibration"
         )
     name = write_posed_set(
         out,
@@ -111,7 +112,9 @@ def _read(path: Path) -> tuple[Lens, Any]:
         name, numbers = model.intrinsics()
         width, height = (int(side) for side in model.imagersize())
     except Exception as failure:  # mrcal raises what it likes
-        raise BadValue(f"{path}: is not a camera model that can be read ({failure})".replace("\n", " ")) from failure
+        raise BadValue(
+            f"{path}: is not a camera model that can be read ({failure}); write it with mrcal again".replace("\n", " ")
+        ) from failure
     if name not in _MODELS:
         raise BadValue(
             f"{path}: its lens is {name}; convert it with mrcal-convert-lensmodel to one of {sorted(_MODELS)}"

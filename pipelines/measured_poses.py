@@ -1,13 +1,71 @@
-"""A set whose lens and poses are those that were measured, not those that the stage was told."""
+"""A set whose lens and poses are those that were measured, not those that the stage was told.
+
+Reading what was measured needs none of the calibration, which is heavy to load.
+"""
 
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 
+from calib.lens import Lens
 from pipelines.elemental_set import LoadedSet
-from pipelines.errors import BadValue
-from pipelines.geometry_files import GEOMETRY_FILE, read_geometry
+from pipelines.errors import BadValue, MissingFile
+
+GEOMETRY_FILE = "geometry.json"
+
+
+class LensEntry(msgspec.Struct, frozen=True):
+    """The `lens` of geometry.json."""
+
+    model: str
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...]
+
+
+class NodeEntry(msgspec.Struct, frozen=True):
+    """One of the `nodes` of geometry.json."""
+
+    node: tuple[int, int]
+    rt_cam_ref: tuple[float, float, float, float, float, float]
+    sigma_mm: float
+    sigma_rad: float
+
+
+class GeometryFile(msgspec.Struct, frozen=True):
+    """What others read of geometry.json; the rest of it is for people."""
+
+    lens: LensEntry
+    size_px: tuple[int, int]
+    nodes: list[NodeEntry]
+    reference_node: tuple[int, int]
+
+    def camera_lens(self) -> Lens:
+        """Return the lens."""
+        lens = self.lens
+        return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+
+
+def read_geometry(path: Path) -> GeometryFile:
+    """Read geometry.json, or that of a folder.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is none, or it is no result of `faintfield geometry`.
+    """
+    path = path / GEOMETRY_FILE if path.is_dir() else path
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
+    try:
+        geometry = msgspec.json.decode(path.read_bytes(), type=GeometryFile)
+        geometry.camera_lens()
+    except (msgspec.DecodeError, ValueError) as failure:
+        raise BadValue(f"{path}: is not the result of `faintfield geometry` ({failure}); run that again") from failure
+    return geometry
 
 
 def with_measured_geometry(loaded: LoadedSet, path: Path) -> LoadedSet:
@@ -52,4 +110,4 @@ def with_measured_geometry(loaded: LoadedSet, path: Path) -> LoadedSet:
         if view.node is not None
     ]
     measured = msgspec.structs.replace(settings, camera=camera, view=views)
-    return replace(loaded, settings=measured, lens=lens, measured_in=path)
+    return replace(loaded, settings=measured, lens=lens, measured_in=path, poses="measured")

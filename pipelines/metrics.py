@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.brightness import brightness
+from pipelines.brightness import OBJECT_REGION, brightness
 from pipelines.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.frames import read_frame
@@ -19,7 +19,9 @@ from recon.solvers import back_projection
 METRICS_FILE = "metrics.json"
 
 
-def assess(loaded: LoadedSet, planes: Mapping[tuple[Method, float], Path]) -> dict[str, Any] | None:
+def assess(
+    loaded: LoadedSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
+) -> dict[str, Any] | None:
     """Return the contents of metrics.json, None for a set without ground truth or without planes at its objects.
 
     Two mean square errors per plane and method, over the region where the object is visible, the object scaled to 0…1:
@@ -32,19 +34,22 @@ def assess(loaded: LoadedSet, planes: Mapping[tuple[Method, float], Path]) -> di
         The set that was reconstructed.
     planes : mapping of (method, depth in mm) to Path
         The planes' files.
+    truth_in : Path, optional
+        The folder of the truth; the set's own when None.
     """
-    truth = read_truth(loaded.folder)
+    folder = truth_in or loaded.folder
+    truth = read_truth(folder)
     depths = [depth for depth in dict.fromkeys(depth for _, depth in planes) if true_plane(truth, depth)]
     if truth is None or not depths:
         return None
-    noise_free = load_set(loaded.folder / truth.noise_free)
+    noise_free = load_set(folder / truth.noise_free)
     bright = _back_projections(noise_free, depths)
     rows = [
-        _errors(loaded, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
+        _errors(folder, loaded.poses, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
         for (method, depth), path in planes.items()
         if depth in depths
     ]
-    figures = brightness(loaded)
+    figures = brightness(loaded, folder / OBJECT_REGION)
     return {
         "planes": [row for row in rows if row is not None],
         "snr": {"asked": truth.snr, "measured": figures.snr},
@@ -57,19 +62,19 @@ def assess(loaded: LoadedSet, planes: Mapping[tuple[Method, float], Path]) -> di
 
 
 def _errors(
-    loaded: LoadedSet, truth: Truth, method: str, depth: float, plane: NDArray[Any], bright: NDArray[Any]
+    folder: Path, poses: str, truth: Truth, method: str, depth: float, plane: NDArray[Any], bright: NDArray[Any]
 ) -> dict[str, Any] | None:
     """Return the errors of one plane, None where its samples are not those of the truth."""
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
-    texture, region = texture_and_region(loaded.folder, at_depth)
+    texture, region = texture_and_region(folder, at_depth)
     if plane.shape != texture.shape:
         return None
     error = mean_square_error(plane, bright, region)
     return {
         "depth_mm": depth,
         "method": method,
-        "poses": truth.poses if loaded.measured_in is None else "measured",
+        "poses": truth.poses if poses == "stated" else poses,
         "object": at_depth.name,
         "mse_bright": error,
         "mse_texture": mean_square_error(plane, texture, region),

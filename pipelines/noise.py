@@ -11,9 +11,10 @@ from calib.noise import NoiseCalibration, calibrate
 from pipelines.console import say
 from pipelines.errors import MissingFile
 from pipelines.files import sha256, write_json, write_whole
+from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS
 from pipelines.noise_frames import Plane, read_series
 from pipelines.noise_page import draw_page
-from pipelines.noise_result import MAPS_FILE, RESULT_FILE, STANDARD, maps_of, result_of, write_maps
+from pipelines.noise_result import STANDARD, maps_of, result_of, write_maps
 from pipelines.noise_set import FILE_NAME, load_noise_set, temperature_notes
 from pipelines.provenance import provenance
 from rig.session.session import PLAN
@@ -41,7 +42,7 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     Parameters
     ----------
     folder
-        Noise set: a folder with noise.toml and the frames that it names.
+        A session with dark frames, or a folder with noise.toml and the frames that it names.
     out
         Where to write; FOLDER itself if not given.
     """
@@ -56,19 +57,20 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
     inputs = {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}
     # The numbers come last: where noise.json stands, everything that it names stands too.
-    write_maps(out / MAPS_FILE, maps_of(readout, calibrations))
+    (out / NOISE_FILE).unlink(missing_ok=True)
+    write_maps(out / NOISE_MAPS, maps_of(readout, calibrations))
     result = result_of(readout, calibrations) | {
         "temperature_c": temperature_c,
         "frames": msgspec.to_builtins(settings.frame),
         "warnings": list(dict.fromkeys(doubts)),
-        "maps": MAPS_FILE,
-        "maps_sha256": sha256(out / MAPS_FILE),
+        "maps": NOISE_MAPS,
+        "maps_sha256": sha256(out / NOISE_MAPS),
         "provenance": provenance("noise", {}, inputs),
     }
     for plane, calibration in zip(readout.planes, calibrations, strict=True):
         suffix = f"_{plane.name}" if plane.name else ""
         write_whole(out / f"noise_page{suffix}.png", draw_page(calibration, f"{folder.resolve().name} {plane.name}"))
-    write_json(out / RESULT_FILE, result)
+    write_json(out / NOISE_FILE, result)
     _tell(out, result)
     return result
 
@@ -115,4 +117,4 @@ def _tell(out: Path, result: dict[str, Any]) -> None:
     say("  pixels: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
     for warning in result["warnings"]:
         say(f"  warning: {warning}")
-    say(f"{out / RESULT_FILE}")
+    say(f"{out / NOISE_FILE}")

@@ -141,5 +141,7 @@ def _checked(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
             "interest and binning, or leave it out"
         )
     if not np.issubdtype(pixels.dtype, np.integer):
-        raise WrongBitDepth(f"{path}: holds {pixels.dtype} pixels; noise is measured in whole digital numbers")
+        raise WrongBitDepth(
+            f"{path}: holds {pixels.dtype} pixels; noise is measured in whole digital numbers; record raw files"
+        )
     return pixels

@@ -12,8 +12,6 @@ from calib.noise import Estimate, NoiseCalibration
 from pipelines.files import writing
 from pipelines.noise_frames import Readout
 
-RESULT_FILE, MAPS_FILE = "noise.json", "noise_maps.npz"
-
 STANDARD = "EMVA 1288 release 4.0"
 
 # By the name of each map in the file: fill for pixels that were not calibrated, which are masked anyway.

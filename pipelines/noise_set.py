@@ -10,7 +10,7 @@ from calib.noise import Conditions
 from pipelines.errors import BadValue, MissingFile
 from pipelines.frames import RAW_SUFFIXES, exif_exposure_s
 from pipelines.toml_files import inside, read_toml, write_toml
-from rig.session.opening import has_session, taken_frames
+from rig.session.opening import has_session, read_plan, taken_frames
 
 FILE_NAME = "noise.toml"
 
@@ -88,7 +88,8 @@ def _of_session(folder: Path) -> NoiseSet:
     ]
     if not frames:
         raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
-    return NoiseSet(1, frames)
+    rig = read_plan(folder).rig
+    return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic)
 
 
 def write_noise_set(folder: Path, settings: NoiseSet) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.brightness import NOISE_REFERENCE, brightness
+from pipelines.brightness import brightness
 from pipelines.elemental_set import LoadedSet
 from pipelines.files import write_json
 from pipelines.frames import read_frame
@@ -31,9 +31,9 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
     small = [_as_seen(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
     write_png(out / INTEGRAL_IMAGE, contact_sheet(small, columns))
     write_png(out / REFERENCE_VIEW, _as_seen(reference, white, black))
-    has_noise_reference = (loaded.folder / NOISE_REFERENCE).is_file()
+    has_noise_reference = bool(loaded.noise_reference)
     if has_noise_reference:
-        nothing = read_frame(loaded.folder / NOISE_REFERENCE).pixels_dn
+        nothing = read_frame(loaded.noise_reference[0]).pixels_dn
         write_png(out / REFERENCE_OF_NOISE, _as_seen(nothing, white, black))
     write_json(
         out / OVERVIEW_FILE,
@@ -42,6 +42,7 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
             "views": len(loaded.settings.view),
             "size_px": camera.size_px,
             "exposure_s": loaded.settings.exposure_s,
+            "frames_per_view": loaded.frames_per_view,
             "read_noise_e": float(np.sqrt(np.mean(np.square(loaded.noise.read_noise_e)))),
             "has_noise_reference": has_noise_reference,
             "quantum_efficiency": loaded.noise.quantum_efficiency,

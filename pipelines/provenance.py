@@ -23,5 +23,10 @@ def provenance(command: str, options: dict[str, Any], inputs: dict[str, str]) ->
         "command": command,
         "options": options,
         "inputs": inputs,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}},
+        "versions": versions(),
     }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what computes results, by name."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}

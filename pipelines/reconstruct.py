@@ -1,8 +1,8 @@
-"""`faintfield reconstruct`: planes of an elemental set at chosen depths."""
+"""`faintfield reconstruct`: planes of a session or an elemental set at chosen depths."""
 
 import re
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,24 +25,54 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
+from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from pipelines.stacks import write_stack
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.images import LikelihoodName
 from recon.operator import PlaneOperator
 from recon.penalties import PenaltyName
+from rig.session.opening import has_session
+
+DEFAULT_METHOD: Method = "pmlem"
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for.
+
+    Attributes
+    ----------
+    depths_mm : list of float
+        Of the planes.
+    methods : list of Method
+        By which each is reconstructed.
+    settings : Settings
+        Of the methods.
+    pitch_mm : float, optional
+        Distance of the planes' samples; one detector pixel of the reference view when None.
+    with_focus : bool
+        Whether a curve of focus against depth is wanted.
+    """
+
+    depths_mm: list[float]
+    methods: list[Method]
+    settings: Settings = field(default_factory=Settings)
+    pitch_mm: float | None = None
+    with_focus: bool = False
 
 
 def reconstruct(
-    elemental_set: Annotated[Path, Parameter(name="SET")],
+    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")],
     /,
     *,
-    out: Path,
+    out: Path | None = None,
     depth_mm: list[float] | None = None,
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
@@ -53,6 +83,7 @@ def reconstruct(
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
+    scene: SceneKind = "dark_scene",
 ) -> dict[str, Any]:
     """Reconstruct planes of the scene at chosen depths.
 
@@ -62,9 +93,10 @@ def reconstruct(
     Parameters
     ----------
     elemental_set
-        Folder with elemental.toml.
+        A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
-        Folder for the results; planes of the same depth are replaced.
+        Folder for the results; planes of the same depth are replaced. For a session, its folder reconstructions by
+        default.
     depth_mm
         Depth of a plane; give it once per plane.
     sweep_mm
@@ -90,56 +122,81 @@ def reconstruct(
         Distance of the plane's samples; by default one detector pixel of the reference view.
     geometry
         geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
+    scene
+        Which of a session's sets: the dark scene, or the bright one.
     """
-    started = time.monotonic()
-    methods: list[Method] = list(dict.fromkeys(method or ["pmlem"]))
-    swept = _swept_depths(sweep_mm) if sweep_mm else []
+    swept = swept_depths(sweep_mm) if sweep_mm else []
     if not (depth_mm or swept or disparity_px):
         raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
-    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
+    if has_session(elemental_set):
+        loaded = load_session(elemental_set, scene, geometry)
+        out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    else:
+        loaded = load_set(elemental_set)
+        loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
+    if out is None:
+        raise WrongUsage("no folder for the results is named; give --out")
+    depths = [*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])]
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
-    loaded = load_set(elemental_set)
-    if geometry is not None:
-        from pipelines.measured_poses import with_measured_geometry  # 100 MB of calibration that only this needs
-
-        loaded = with_measured_geometry(loaded, geometry)
-    depths = _distinct([*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])])
-    folders = {name: out if len(methods) == 1 else out / name for name in methods}
-    run = _Run(loaded, depths, pitch_mm, folders)
-    require_room(out, run.needed_bytes())
     weight = None if penalty_weight == "auto" else penalty_weight
-    run.reconstruct(Settings(weight, passes, likelihood, penalty), with_focus=bool(swept))
+    settings = Settings(weight, passes, likelihood, penalty)
+    return reconstruct_set(loaded, out, Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)))
+
+
+def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str, Any]:
+    """Reconstruct planes of a set that was loaded, and write them, their origin, their errors and the report."""
+    started = time.monotonic()
+    depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
+    request = replace(request, depths_mm=depths, methods=methods)
+    folders = {name: folder_of_method(out, name, methods) for name in methods}
+    run = _Run(loaded, depths, request.pitch_mm, folders)
+    require_room(out, run.needed_bytes())
+    for folder in folders.values():
+        (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
+    run.reconstruct(request.settings, with_focus=request.with_focus)
     write_overview(loaded, out)
     metrics = assess(loaded, run.written)
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
         write_json(out / METRICS_FILE, metrics)
     inputs = dict(loaded.input_hashes())
-    options: dict[str, Any] = {
-        "depth_mm": depths,
-        "penalty_weight": penalty_weight,
-        "penalty": penalty,
-        "likelihood": likelihood,
-        "passes": passes,
-        "pitch_mm": pitch_mm,
-    }
-    options["poses"] = "stated" if loaded.measured_in is None else "measured"
     for name, folder in folders.items():
         result = {
             "format": 1,
             "planes": [record for record in run.records if record["method"] == name],
             "focus": run.focus(),
             "wall_time_s": time.monotonic() - started,
-            **provenance("reconstruct", {"method": name, **options}, inputs),
+            **provenance("reconstruct", options_of(name, request, loaded.poses), inputs),
         }
         write_json(folder / RECONSTRUCTION_FILE, result)
-        if swept:
+        if request.with_focus:
             write_stack(folder, result["planes"])
     report = write_report(out)
     _say_what_oscillates(run.records)
     _say_what_is_not_reached(run.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {"out": str(out), "report": str(report), "planes": run.records, "focus": run.focus(), "metrics": metrics}
+
+
+def folder_of_method(out: Path, method: Method, methods: list[Method]) -> Path:
+    """Return where the planes of a method go: into a folder of their own when there are several methods."""
+    return out if len(methods) == 1 else out / method
+
+
+def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
+    """Return what reconstruction.json records of a request."""
+    return {
+        "method": method,
+        "depth_mm": request.depths_mm,
+        "penalty_weight": "auto" if request.settings.penalty_weight is None else request.settings.penalty_weight,
+        "penalty": request.settings.penalty,
+        "likelihood": request.settings.likelihood,
+        "passes": request.settings.passes,
+        "pitch_mm": request.pitch_mm,
+        "focus": request.with_focus,
+        "poses": poses,
+    }
 
 
 def plane_name(depth_mm: float) -> str:
@@ -254,7 +311,7 @@ class _Run:
         self.written[method, depth] = path
 
 
-def _distinct(depths: list[float]) -> list[float]:
+def distinct_depths(depths: list[float]) -> list[float]:
     """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
     by_name: dict[str, float] = {}
     for depth in depths:
@@ -265,14 +322,16 @@ def _distinct(depths: list[float]) -> list[float]:
     return list(by_name.values())
 
 
-def _swept_depths(sweep_mm: str) -> list[float]:
+def swept_depths(sweep_mm: str) -> list[float]:
     """Return the depths of FIRST:LAST:COUNT."""
     parts = re.fullmatch(r"(\d+(?:\.\d*)?):(\d+(?:\.\d*)?):(\d+)", sweep_mm)
     if parts is None:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: give FIRST:LAST:COUNT, such as 400:900:64")
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give FIRST:LAST:COUNT, such as 400:900:64")
     first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
     if min(first, last) <= 0 or first == last or count < 2:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: two different positive depths and at least 2 planes are needed")
+        raise WrongUsage(
+            f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths and at least 2 planes"
+        )
     return [round(float(depth), 6) for depth in np.linspace(first, last, count)]
 
 

@@ -21,6 +21,7 @@ from recon.metrics import expected_snr_from_powers, photons_from_linear_snr, pho
 from rig.grid import grid_nodes
 from rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from rig.simulation.scene import TexturedPlane, render
+from rig.simulation.sensor import through_mosaic
 
 NOISE_FREE = "noise_free"
 
@@ -115,6 +116,36 @@ def simulate(
     return {"out": str(out), "views": rows * columns} | {name: getattr(truth, name) for name in shown}
 
 
+def write_ground_truth(
+    folder: Path,
+    experiment: SimulatedExperiment,
+    poses_rt_cam_ref: NDArray[np.float64],
+    white_e: float,
+    snr: float,
+    mosaic: tuple[str, ...] | None,
+) -> Truth:
+    """Write beside a capture of the simulated world what it cannot show: its views without noise, and the truth.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write, which exists.
+    experiment : SimulatedExperiment
+        The camera, and what stands before it.
+    poses_rt_cam_ref : array (view, 6)
+        Where the camera really was, in raster order.
+    white_e : float
+        Expected electrons of a white object on the axis.
+    snr : float
+        That was asked for.
+    mosaic : tuple of str, optional
+        Colour filters.
+    """
+    rendered = _render(experiment, poses_rt_cam_ref, mosaic, samples_per_px=1)  # as the simulated camera does
+    _write_noise_free_set(folder / NOISE_FREE, experiment, rendered, white_e, mosaic)
+    return _write_truth(folder, experiment, rendered, white_e, snr, "true", mosaic)
+
+
 def _experiment(
     rows: int, columns: int, pitch_mm: float, size_px: tuple[int, int], exposure_s: float
 ) -> SimulatedExperiment:
@@ -123,25 +154,22 @@ def _experiment(
     return SimulatedExperiment(paper.planes, paper.optics, paper.sensor, rows, columns, pitch_mm, exposure_s)
 
 
-def _render(experiment: SimulatedExperiment, poses: NDArray[np.float64], mosaic: tuple[str, ...] | None) -> _Rendered:
+def _render(
+    experiment: SimulatedExperiment,
+    poses: NDArray[np.float64],
+    mosaic: tuple[str, ...] | None,
+    samples_per_px: int = 2,
+) -> _Rendered:
     """Cast the rays of all views; through a mosaic each pixel keeps the colour of its filter."""
     planes = [plane if mosaic else plane.grey() for plane in experiment.planes]
     views = np.empty((len(poses), *experiment.optics.size_px[::-1]), np.float32)
     object_region = np.zeros(views.shape[1:], bool)
-    rendering = render(planes, experiment.optics, poses)
+    rendering = render(planes, experiment.optics, poses, samples_per_px=samples_per_px)
     for index, view in enumerate(progress(rendering, "rendering views", len(poses))):
-        views[index] = view.light if mosaic is None else _through_mosaic(view.light, mosaic)
+        views[index] = view.light if mosaic is None else through_mosaic(view.light, mosaic)
         if index == experiment.reference_view:
             object_region = np.sum(list(view.visible.values()), axis=0) > 0.5
     return _Rendered(poses, views, object_region)
-
-
-def _through_mosaic(light: NDArray[np.float32], mosaic: tuple[str, ...]) -> NDArray[np.float32]:
-    """Return for each pixel of (row, column, RGB) the colour that its filter lets pass."""
-    rows, columns = np.indices(light.shape[:2])
-    colours = np.array([["RGB".index(letter) for letter in row] for row in mosaic])
-    chosen = colours[rows % colours.shape[0], columns % colours.shape[1]]
-    return np.take_along_axis(light, chosen[:, :, np.newaxis], axis=2)[:, :, 0]
 
 
 def _write_dark_set(

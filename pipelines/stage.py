@@ -21,7 +21,11 @@ from rig.stages.gantry import Gantry
 from rig.stages.protocol import Identity, Point, Position
 from rig.stages.settings import StageSettings
 
-app = App(name="stage", help="Bring up a stage: ask it, home it, move it, try it.")
+app = App(
+    name="stage",
+    help="Bring up a stage: ask it, home it, move it, try it.",
+    help_epilogue="Example: faintfield stage test --port simulated:grbl",
+)
 
 
 @Parameter(name="*")
@@ -61,7 +65,9 @@ class Connection:
             if self.protocol is not None:
                 raise WrongUsage(f"--port {self.port} says what it speaks; leave out --protocol")
             if self.port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
-                raise WrongUsage(f"--port {self.port}: simulated are {', '.join(SIMULATED_FIRMWARE)}")
+                raise WrongUsage(
+                    f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
+                )
         return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
 
 
@@ -82,7 +88,7 @@ def stage_table(path: Path) -> StageSettings:
     return read_toml(path, _RigFile).stage
 
 
-@app.command
+@app.command(sort_key=1)
 def info(connection: Connection = Connection()) -> Identity:
     """Say who the controller is and how it is set; nothing moves."""
     with _connected(connection) as stage:
@@ -93,7 +99,7 @@ def info(connection: Connection = Connection()) -> Identity:
         return identity
 
 
-@app.command
+@app.command(sort_key=3)
 def home(connection: Connection = Connection()) -> Position:
     """Find the switches."""
     with _connected(connection) as stage:
@@ -102,7 +108,7 @@ def home(connection: Connection = Connection()) -> Position:
         return homing.position
 
 
-@app.command
+@app.command(sort_key=4)
 def goto(
     x_mm: float,
     y_mm: float,
@@ -130,7 +136,7 @@ def goto(
         return position
 
 
-@app.command
+@app.command(sort_key=2)
 def jog(
     dx_mm: float,
     dy_mm: float,
@@ -155,7 +161,7 @@ def jog(
         return position
 
 
-@app.command(name="test")
+@app.command(name="test", sort_key=5)
 def conform(connection: Connection = Connection()) -> list[Check]:
     """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves.
 
@@ -179,7 +185,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     return checks
 
 
-@app.command
+@app.command(sort_key=6)
 def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
     """Serve a simulated controller on a port, for other programs, until Ctrl-C ends it.
 

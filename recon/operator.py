@@ -189,12 +189,14 @@ class PlaneOperator:
 
     def _plane(self, plane: Image) -> Image:
         if plane.shape != self.grid.shape:
-            raise GeometryMismatch(f"plane has shape {plane.shape}, the operator {self.grid.shape}")
+            raise GeometryMismatch(f"plane has shape {plane.shape}, the operator {self.grid.shape}; give it that")
         return np.ascontiguousarray(plane, self.dtype)
 
     def _images(self, images: Image) -> Image:
         if images.shape != self.images_shape:
-            raise GeometryMismatch(f"images have shape {images.shape}, the operator {self.images_shape}")
+            raise GeometryMismatch(
+                f"images have shape {images.shape}, the operator {self.images_shape}; give them that"
+            )
         return np.ascontiguousarray(images, self.dtype)
 
     def _map(self, value: float | Image) -> Image:
@@ -202,7 +204,9 @@ class PlaneOperator:
         try:
             return np.array(np.broadcast_to(value, shape), self.dtype)
         except ValueError:
-            raise GeometryMismatch(f"a map has shape {np.shape(value)}, the operator's lattices {shape}") from None
+            raise GeometryMismatch(
+                f"a map has shape {np.shape(value)}, the operator's lattices {shape}; give one per lattice, or a number"
+            ) from None
 
     def _views(self, views: Sequence[int] | NDArray[np.intp] | None) -> NDArray[np.intp]:
         """Return the views to go over, each at most once: the kernels trust them."""
@@ -243,14 +247,17 @@ def _checked_geometry(
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     if plane_from_ray.shape != (views, 3, 3) or rays.shape != (lattices, *detector, 2) or views == 0:
         raise GeometryMismatch(
-            f"homographies {plane_from_ray.shape} and rays {rays.shape} do not fit: (view, 3, 3) wanted"
+            f"homographies {plane_from_ray.shape} and rays {rays.shape} do not fit; give (view, 3, 3), (row, column, 2)"
         )
     if valid.size and valid.shape != (views, *detector):
-        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}")
+        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}; give it that")
     if flat.shape not in ((1, *detector), (lattices, *detector)):
-        raise GeometryMismatch(f"flat {flat.shape} does not fit rays {rays.shape}")
+        raise GeometryMismatch(f"flat {flat.shape} does not fit rays {rays.shape}; give one per lattice, or one")
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
-        raise GeometryMismatch(f"lattice_of_view does not give each of the {views} views one of {lattices} lattices")
+        raise GeometryMismatch(
+            f"lattice_of_view has shape {lattice_of_view.shape} and values {np.unique(lattice_of_view).tolist()}; "
+            f"give each of the {views} views one of {lattices} lattices, counted from 0"
+        )
     if (flat < 0).any():
         raise GeometryMismatch(f"the flat field is negative somewhere, {flat.min():.3g} at least; measure it again")
     if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):

@@ -156,10 +156,12 @@ class Capture:
         self._here, self._repeated = None, False
         self._rig.stage.move_to(*target)
         self._since_check += 1
-        if self._settle_s is None and frame.kind in LIT:
+        usual = self._settle_s is not None or frame.kind not in LIT
+        if not usual:
             self._settle_s = self._find_settling(frame)
-        else:
-            self._rig.clock.sleep_s(self._session.plan.settle_s if self._settle_s is None else self._settle_s)
+        # Also where nothing was measured just now: the rest may be that of the plan, or of before an interruption
+        self._rig.clock.sleep_s(self._session.plan.settle_s if self._settle_s is None else self._settle_s)
+        if usual:
             self._pace.stopped(begun_s, start, target)
         self._here = target
 

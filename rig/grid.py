@@ -10,7 +10,7 @@ def grid_nodes(rows: int, columns: int) -> list[tuple[int, int]]:
 
 
 def centre_node(rows: int, columns: int) -> tuple[int, int]:
-    """Return the node whose camera is the reference."""
+    """Return the node whose camera is the reference; of two in the middle, the lower or right one."""
     return rows // 2, columns // 2
 
 

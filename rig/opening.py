@@ -1,5 +1,6 @@
 """From the configuration to the devices it names, real or simulated."""
 
+import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,6 +19,7 @@ from rig.plan import StepKind
 from rig.settings import RigSettings
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.grbl import SimulatedGrbl
+from rig.simulation.controller.link import PtyLink
 from rig.simulation.controller.marlin import SimulatedMarlin
 from rig.simulation.lab import SimulatedLab
 from rig.stages.gantry import Gantry
@@ -70,7 +72,7 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
             camera = FolderCamera(settings.camera, WallClock())
         case SimulatedSettings() if bench is not None:
             lab = _lab(settings, settings.camera, bench)
-            camera = SimulatedCamera(settings.camera, stage.clock, lab.expose)
+            camera = SimulatedCamera(settings.camera, stage.clock, lab)
             return Rig(stage, camera, stage.clock, lab.arrange)
         case SimulatedSettings():
             raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
@@ -100,7 +102,7 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench
     traffic = traffic or NoTrafficLog()
     if _is_simulated(settings):
         bench = bench or _simulated_bench(settings)
-        port = settings.port or bench.link.url
+        port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
         return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
     return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
 
@@ -111,22 +113,24 @@ def _is_simulated(settings: StageSettings) -> bool:
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:
-    """Return the bench of the simulated stage that `settings` name."""
-    name = settings.port.partition(":")[2] or "grbl"
-    if name not in SIMULATED_FIRMWARE:
-        raise PlanRefused(f"{settings.port}: no such stage is simulated; there are {', '.join(SIMULATED_FIRMWARE)}")
-    return Bench(SIMULATED_FIRMWARE[name])
+    """Return the bench of the simulated stage that `settings` name, such as `simulated:grbl` or `simulated:grbl:pty`.
+
+    With the latter, every byte goes through a pseudo-terminal and pyserial.
+    """
+    name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
+    if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
+        raise PlanRefused(
+            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, each "
+            "also with :pty behind it"
+        )
+    if not cable:
+        return Bench(SIMULATED_FIRMWARE[name or "grbl"])
+    link = PtyLink()
+    bench = Bench(SIMULATED_FIRMWARE[name], link)
+    weakref.finalize(bench, link.close)
+    return bench
 
 
 def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
     """Return the simulated lab around the simulated stage."""
-    return SimulatedLab(
-        settings.grid.centre().target,
-        bench.true_position,
-        bench.still_s,
-        settings.board,
-        size_px=camera.size_px,
-        lit_photons_per_s=camera.lit_photons_per_s,
-        unlit_photons_per_s=camera.unlit_photons_per_s,
-        seed=camera.seed,
-    )
+    return SimulatedLab(settings.grid.centre().target, bench.true_position, bench.still_s, settings.board, camera)

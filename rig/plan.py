@@ -1,12 +1,12 @@
 """What will be captured: every position and every frame, laid down before anything moves and never computed again."""
 
-import hashlib
 from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 from msgspec import Struct
 
+from rig.grid import centre_node
 from rig.stages.motion import one_sided, path_duration_s
 from rig.stages.protocol import MotionLimits, Point
 from rig.stages.workspace import Workspace
@@ -61,8 +61,8 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def centre(self) -> "Stop":
-        """Return the centre node, whose camera is the reference frame; of two, the upper or left one."""
-        row, column = (self.rows - 1) // 2, (self.columns - 1) // 2
+        """Return the centre node, whose camera is the reference frame."""
+        row, column = centre_node(self.rows, self.columns)
         return Stop((row, column), self.position(row, column))
 
 
@@ -174,7 +174,3 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         )
         moving_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
         return moving_s + stops * (_ARRIVAL_S + self.settle_s) + exposing_s
-
-    def fingerprint(self) -> str:
-        """Return the SHA-256 of the plan, in hexadecimal: two plans that differ anywhere differ here."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()

@@ -1,9 +1,11 @@
 """rig.toml: everything that a capture has to know about the rig, checked as it is read."""
 
+import math
+
 from msgspec import Struct
 
 from rig.boards import Board
-from rig.cameras.settings import CameraSettings
+from rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
 from rig.plan import Grid, Step, StepKind
 from rig.stages.settings import StageSettings
 
@@ -116,6 +118,22 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         return Step(self.kind, exposures, self.frames_per_node, "centre" if centred else "grid")
 
 
+class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """The `[scene]` table.
+
+    Parameters
+    ----------
+    depth_mm : tuple of float
+        How far from the camera the objects stand: where `faintfield run` reconstructs planes.
+    """
+
+    depth_mm: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if any(not 0.0 < depth < math.inf for depth in self.depth_mm):
+            raise ValueError(f"scene.depth_mm = {list(self.depth_mm)}; depths are positive")
+
+
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """A whole rig.toml."""
 
@@ -126,6 +144,7 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
     settle: SettleSettings = SettleSettings()
     checks: CheckSettings = CheckSettings()
     drift: DriftSettings = DriftSettings()
+    scene: SceneSettings = SceneSettings()
     board: tuple[Board, ...] = ()
 
     def __post_init__(self) -> None:
@@ -133,6 +152,11 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("there is no [[step]]; say what to capture")
         if not self.board and any(step.kind == "charuco" for step in self.step):
             raise ValueError("there is a charuco step but no [[board]]; describe the printed boards")
+
+    @property
+    def mosaic(self) -> Mosaic | None:
+        """The colour filters of a camera whose files do not say."""
+        return None if isinstance(self.camera, GPhoto2Settings) else self.camera.mosaic
 
     def steps(self) -> tuple[Step, ...]:
         """Return the steps of the plan."""

@@ -1,5 +1,8 @@
 """The bundle adjustment: one lens, the pose of every node, the pose of every board as it stood (mrcal)."""
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -114,7 +117,7 @@ def solve(problem: Problem, seed: Seed | None = None) -> Bundle:
             "do_apply_outlier_rejection": False,
             **stage,
         }
-        mrcal.optimize(**inputs)
+        _optimised(inputs)
     inputs["do_apply_outlier_rejection"] = False
     return Bundle(_polished(inputs))
 
@@ -179,8 +182,22 @@ def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.b
 
 
 def _optimised(inputs: dict[str, Any]) -> dict[str, Any]:
-    mrcal.optimize(**inputs)
+    with _c_library_silenced():
+        mrcal.optimize(**inputs)
     return inputs
+
+
+@contextmanager
+def _c_library_silenced() -> Iterator[None]:
+    """Keep off standard error what mrcal's C code writes there: it counts corners never seen as thrown out."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _polished(inputs: dict[str, Any]) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def doubtful_views(bundle: Bundle, observations: Observations) -> list[str]:
     if share > _MOST_OUTLIERS:
         raise PoorFit(
             f"{share:.0%} of the corners disagree with the fit, limit {_MOST_OUTLIERS:.0%}"
-            f"{', most at ' + ', '.join(named) + more if named else ''}: check that every image has its right node and "
+            f"{', most at ' + ', '.join(named) + more if named else ''}; check that every image has its right node and "
             "sweep, that columns and rows are those of the print, and that no board moved within a sweep"
         )
     if not named:

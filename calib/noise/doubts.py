@@ -54,7 +54,10 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
             )
     pixels = darks[0].pattern_dn.size
     if pixels < _LEAST_PIXELS or min(darks[0].pattern_dn.shape) < 8:
-        raise TooFewFrames(f"frames of {pixels} pixels: {_LEAST_PIXELS} and 8 rows and columns are the least")
+        raise TooFewFrames(
+            f"frames of {pixels} pixels: {_LEAST_PIXELS} and 8 rows and columns are the least; "
+            "record larger frames, or widen the region"
+        )
 
 
 def frame_doubts(fitted: Fitted) -> list[str]:

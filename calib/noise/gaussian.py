@@ -27,6 +27,8 @@ ROUNDING_DN2 = 1.0 / 12.0
 # All three are needed for silence; the solver tries points where a variance is negative, and backs off by itself.
 SILENT: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
+_SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -79,7 +81,13 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
     # The spreads over pixels may come out negative, as unbiased differences of variances do: a bound at zero would
     # push what contradicts it (a pickup whose phase turns from frame to frame, say) into the read noise.
     lower = [0.0 if name == "jitter_dn2" else -np.inf for name in names]
-    found = solver(x0=[start[name] / scale[name] for name in names], lbx=lower)
+    # From the spreads that the frames suggest, a first step may overshoot to where a variance vanishes; from less of
+    # them it does not.
+    for share in (1.0, 0.1, 0.01):
+        first = {name: start[name] * (share if name in _SPREADS else 1.0) for name in names}
+        found = solver(x0=[first[name] / scale[name] for name in names], lbx=lower)
+        if solver.stats()["success"]:
+            break
     if not solver.stats()["success"]:
         raise PoorFit(
             f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "

@@ -1,6 +1,6 @@
 """What a camera is: the vocabulary that drivers, capture and simulators share."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -8,7 +8,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 type Pixels = NDArray[Any]
-type Metadata = Mapping[str, str | int | float | None]
+type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
 
 
 class CameraReport(Struct, frozen=True):

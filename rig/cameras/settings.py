@@ -4,6 +4,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
+type Mosaic = tuple[str, ...]
+
 
 class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
     """A tethered camera that libgphoto2 knows.
@@ -42,12 +44,15 @@ class MicroManagerSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_
         Of the camera, set when it is opened, such as `Binning = "1"`.
     answer_s : float
         How long the camera may take for anything besides exposing.
+    mosaic : tuple of str, optional
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; without it, none.
     """
 
     configuration: str = ""
     adapters: str = ""
     properties: dict[str, str] = {}
     answer_s: float = 20.0
+    mosaic: Mosaic | None = None
 
 
 class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
@@ -63,12 +68,15 @@ class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
         Room for one file.
     arrival_s : float
         How long after the exposure the file may take to be complete.
+    mosaic : tuple of str, optional
+        As above; raw files say it themselves.
     """
 
     folder: str
     suffixes: tuple[str, ...] = (".tif", ".tiff", ".png", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf")
     frame_mb: float = 60.0
     arrival_s: float = 60.0
+    mosaic: Mosaic | None = None
 
     def __post_init__(self) -> None:
         if not Path(self.folder).name:
@@ -84,6 +92,14 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
         Width and height of a frame.
     lit_photons_per_s, unlit_photons_per_s : float
         On a pixel that sees a white object, with the lights on and almost off.
+    read_noise_e, gain_dn_per_e, saturation_dn : float, float, int
+        Of the sensor; the paper's without them.
+    mosaic : tuple of str, optional
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; without it, none.
+    position_error_mm, rotation_error_mrad : float
+        By how much the rails have the camera elsewhere than the motors are, on each axis: standard deviation.
+    scale_error, squareness_mrad : float
+        Of the stage: by which part of itself a way along x is too long, and by how much y is askew.
     seed : int
         Of all chance.
     """
@@ -91,11 +107,23 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
     size_px: tuple[int, int] = (640, 480)
     lit_photons_per_s: float = 400_000.0
     unlit_photons_per_s: float = 40.0
+    read_noise_e: float = 12.0**0.5
+    gain_dn_per_e: float = 2.0
+    saturation_dn: int = 65535
+    mosaic: Mosaic | None = None
+    position_error_mm: float = 0.0
+    rotation_error_mrad: float = 0.0
+    scale_error: float = 0.0
+    squareness_mrad: float = 0.0
     seed: int = 1
 
     def __post_init__(self) -> None:
         if min(self.size_px) < 8:
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
+        if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
+            raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
+        if self.mosaic is not None and (not self.mosaic or set("".join(self.mosaic)) - set("RGB")):
+            raise ValueError(f"camera.mosaic = {list(self.mosaic)}; give rows of the letters R, G and B")
 
 
 type CameraSettings = GPhoto2Settings | MicroManagerSettings | FolderSettings | SimulatedSettings

@@ -1,11 +1,13 @@
 """A camera in the simulated lab; its exposures take simulated time."""
 
-from collections.abc import Callable
-
-from rig.cameras.protocol import CameraReport, Exposure, Pixels
+from rig.cameras.protocol import CameraReport, Exposure
 from rig.cameras.settings import SimulatedSettings
 from rig.clock import Clock
 from rig.errors import CameraError
+from rig.simulation.lab import SimulatedLab
+
+# Under this name the record of a frame has the pose that only a simulated world can know.
+TRUE_POSE = "true_rt_cam_ref"
 
 _READOUT_S = 0.05
 _TIFF_HEADER_BYTES = 512
@@ -20,14 +22,14 @@ class SimulatedCamera:
         The `[camera]` table.
     clock : Clock
         The simulated world's.
-    view : callable
-        Renders a frame of an exposure time, with a number for its noise.
+    lab : SimulatedLab
+        What it looks at.
     """
 
-    def __init__(self, settings: SimulatedSettings, clock: Clock, view: Callable[[float, int], Pixels]) -> None:
+    def __init__(self, settings: SimulatedSettings, clock: Clock, lab: SimulatedLab) -> None:
         self._settings = settings
         self._clock = clock
-        self._view = view
+        self._lab = lab
         self._open = False
 
     def open(self) -> None:
@@ -43,9 +45,10 @@ class SimulatedCamera:
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Render the scene from where the camera is when the exposure begins."""
         self._require_open()
-        pixels = self._view(exposure_s, number)
+        truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
+        pixels = self._lab.expose(exposure_s, number)
         self._clock.sleep_s(exposure_s + _READOUT_S)
-        return Exposure(".tiff", pixels=pixels, metadata={"camera": "simulated camera"})
+        return Exposure(".tiff", pixels=pixels, metadata={"camera": "simulated camera", TRUE_POSE: truth})
 
     def close(self) -> None:
         """Disconnect."""

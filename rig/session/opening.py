@@ -138,7 +138,9 @@ def _reconcile(session: Session, progress: Progress) -> None:
 
 
 def refuse_other_rig(frozen: FrozenPlan, now: RigSettings) -> None:
-    """Refuse to go on with a session on another rig than it was planned for; the port's name may change.
+    """Refuse to go on with a session on another rig than it was planned for.
+
+    The port's name may change, and so may what is read after the capture only.
 
     Raises
     ------
@@ -146,7 +148,7 @@ def refuse_other_rig(frozen: FrozenPlan, now: RigSettings) -> None:
         With the first table that differs.
     """
     stage = msgspec.structs.replace(now.stage, port=frozen.rig.stage.port, baud=frozen.rig.stage.baud)
-    now = msgspec.structs.replace(now, stage=stage)
+    now = msgspec.structs.replace(now, stage=stage, scene=frozen.rig.scene)
     for name in now.__struct_fields__:
         if getattr(now, name) != getattr(frozen.rig, name):
             raise PlanRefused(

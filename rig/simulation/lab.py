@@ -2,16 +2,20 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rig.boards import Board
+from rig.cameras.settings import SimulatedSettings
 from rig.plan import StepKind
+from rig.simulation.carriage import Carriage
 from rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from rig.simulation.lab_boards import standing_board
 from rig.simulation.scene import TexturedPlane, render
+from rig.simulation.sensor import through_mosaic
 from rig.stages.protocol import Point
 
 # After a stop the carriage swings along both axes, as an undamped gantry does.
@@ -31,12 +35,13 @@ class SimulatedLab:
         How long ago they stopped.
     boards : sequence of Board
         What there is to put up for charuco sweeps.
-    size_px : (int, int)
-        Of a frame.
-    lit_photons_per_s, unlit_photons_per_s : float
-        On a pixel that sees a white object, with the lights on and almost off.
-    seed : int
-        Of all chance; every exposure's noise follows from it and the exposure's number alone.
+    settings : SimulatedSettings
+        The camera, the light and the rails.
+
+    Attributes
+    ----------
+    experiment : SimulatedExperiment
+        The paper's objects and the camera, drawn when they are first looked at.
     """
 
     def __init__(
@@ -45,58 +50,75 @@ class SimulatedLab:
         true_position: Callable[[], Point],
         still_s: Callable[[], float],
         boards: tuple[Board, ...],
-        *,
-        size_px: tuple[int, int],
-        lit_photons_per_s: float,
-        unlit_photons_per_s: float,
-        seed: int,
+        settings: SimulatedSettings,
     ) -> None:
-        self._centre = centre
         self._true_position = true_position
         self._still_s = still_s
         self._boards = boards
-        self._size_px = size_px
-        self._lit, self._unlit = lit_photons_per_s, unlit_photons_per_s
-        self._seed = seed
+        self._settings = settings
+        self._carriage = Carriage(
+            centre,
+            settings.position_error_mm,
+            settings.rotation_error_mrad * 1e-3,
+            settings.scale_error,
+            settings.squareness_mrad * 1e-3,
+            settings.seed,
+        )
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
 
     @cached_property
-    def _experiment(self) -> SimulatedExperiment:
-        """The paper's objects and camera, drawn when they are first looked at."""
-        return paper_experiment(*self._size_px).grey()
+    def experiment(self) -> SimulatedExperiment:
+        """What stands before the camera, and the camera."""
+        return lab_experiment(self._settings)
 
     @cached_property
     def _illumination(self) -> NDArray[np.float32]:
         """What the lens lets through."""
-        return self._experiment.optics.relative_illumination()
+        return self.experiment.optics.relative_illumination()
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
         """Do what the guide asks of a person: put things up or away, switch the light, cover the lens."""
-        objects = self._experiment.planes
-        self._planes = {
-            "charuco": tuple(standing_board(board, sweep, place) for place, board in enumerate(self._boards)),
-            "bright": objects,
-            "dark_scene": objects,
-        }.get(kind, ())
-        self._photons_per_s = self._unlit if kind == "dark_scene" else self._lit
+        self._planes = ()
+        if kind == "charuco":
+            optics = self.experiment.optics
+            self._planes = tuple(standing_board(board, sweep, at, optics) for at, board in enumerate(self._boards))
+        elif kind in ("bright", "dark_scene"):
+            self._planes = self.experiment.planes
+        settings = self._settings
+        self._photons_per_s = settings.unlit_photons_per_s if kind == "dark_scene" else settings.lit_photons_per_s
         self._flat = kind == "flat"
 
     def expose(self, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        """Return a frame in DN, taken now from where the camera is."""
+        """Return a frame in DN, taken now from where the camera is; its noise follows from its number alone."""
         light: NDArray[np.floating] = np.zeros_like(self._illumination)
         if self._flat:
             light = 0.5 * self._illumination
         elif self._planes:
-            light = next(render(self._planes, self._experiment.optics, self._pose(exposure_s), samples_per_px=1)).light
-        generator = np.random.default_rng([self._seed, number])
-        return self._experiment.sensor.expose(light * self._photons_per_s * exposure_s, exposure_s, generator)
+            pose = self.rt_cam_ref(exposure_s)[np.newaxis]
+            light = next(render(self._planes, self.experiment.optics, pose, samples_per_px=1)).light
+            if light.ndim == 3 and self._settings.mosaic is not None:
+                light = through_mosaic(light, self._settings.mosaic)
+        generator = np.random.default_rng([self._settings.seed, number])
+        return self.experiment.sensor.expose(light * self._photons_per_s * exposure_s, exposure_s, generator)
 
-    def _pose(self, exposure_s: float) -> NDArray[np.float64]:
-        """Return the pose (1, 6) in the middle of an exposure that begins now, swing included."""
+    def rt_cam_ref(self, exposure_s: float) -> NDArray[np.float64]:
+        """Return the true pose (6,) in the middle of an exposure that begins now, swing included."""
         x_mm, y_mm = self._true_position()
         after_s = self._still_s() + 0.5 * exposure_s
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
-        # A camera moved right and down by c maps reference points by −c
-        return np.array([[0, 0, 0, self._centre.x_mm - x_mm - swing_mm, self._centre.y_mm - y_mm - swing_mm, 0.0]])
+        return self._carriage.rt_cam_ref(x_mm + swing_mm, y_mm + swing_mm)
+
+
+def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:
+    """Return the objects and the camera of a simulated lab."""
+    paper = paper_experiment(*settings.size_px)
+    sensor = replace(
+        paper.sensor,
+        read_noise_e=settings.read_noise_e,
+        gain_dn_per_e=settings.gain_dn_per_e,
+        saturation_dn=settings.saturation_dn,
+    )
+    coloured = replace(paper, sensor=sensor)
+    return coloured if settings.mosaic else coloured.grey()

@@ -1,15 +1,28 @@
 """The boards of a simulated lab, as they come from the printer and stand before the camera."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 
 from rig.boards import Board
+from rig.simulation.boards import printed_board, six_boards
+from rig.simulation.optics import SimulatedOptics
 from rig.simulation.scene import TexturedPlane
 
-_TEXTURE_PITCH_MM = 0.5
-_MARGIN_SQUARES = 0.5
+_MARGIN_MM = 12.0
+
+# White paper reflects most of the light and black ink a little.
+_BLACK, _WHITE = 0.04, 0.9
+
+# The print is finer than the detector sees it, and blurred as the lens does, which keeps its edges from aliasing.
+_SAMPLES_PER_PX, _BLUR_PX = 2.0, 0.6
+
+# Boards beside one another stand this far apart, so that none hides another.
+_BESIDE_MM = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 40.0])
 
 
-def standing_board(board: Board, sweep: int, place: int) -> TexturedPlane:
+def standing_board(board: Board, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
     """Return a board as it stands in a sweep: turned and tilted differently in each, several beside one another.
 
     Parameters
@@ -20,16 +33,19 @@ def standing_board(board: Board, sweep: int, place: int) -> TexturedPlane:
         Which sweep.
     place : int
         Which of the boards.
+    optics : SimulatedOptics
+        The camera that will look at it.
     """
-    size_px = (
-        round(board.columns * board.square_mm / _TEXTURE_PITCH_MM),
-        round(board.rows * board.square_mm / _TEXTURE_PITCH_MM),
-    )
-    margin_px = round(_MARGIN_SQUARES * board.square_mm / _TEXTURE_PITCH_MM)
-    printed = board.in_opencv().generateImage(size_px).astype(np.float32) / 255.0
-    paper = np.pad(printed, margin_px, constant_values=1.0)
-    # White paper reflects most of the light and black ink a little
-    reflectance = (0.04 + 0.86 * paper).astype(np.float32)
-    tilt_rad = 0.25 if sweep % 2 else -0.2
-    pose = (0.5 * tilt_rad, tilt_rad, 0.1 * sweep, 180.0 * place, 20.0 * sweep, 620.0 + 60.0 * sweep + 40.0 * place)
-    return TexturedPlane(board.name, reflectance, np.ones_like(reflectance), _TEXTURE_PITCH_MM, pose)
+    places = six_boards(board.rows - 1, board.columns - 1, board.square_mm)
+    standing = places[sweep % len(places)]
+    standing = replace(standing, rt_ref_board=standing.rt_ref_board + place * _BESIDE_MM)
+    px_mm = float(standing.rt_ref_board[5]) / optics.fx_px
+    # A whole number of samples per square, or the print would not be true to size
+    samples = max(round(board.square_mm * _SAMPLES_PER_PX / px_mm), 8)
+    pitch_mm = board.square_mm / samples
+    margin = round(_MARGIN_MM / pitch_mm)
+    printed = board.in_opencv().generateImage((board.columns * samples, board.rows * samples)) / np.float32(255)
+    paper = _BLACK + (_WHITE - _BLACK) * np.pad(printed, margin, constant_values=1.0)
+    picture = cv2.GaussianBlur(paper.astype(np.float32), (0, 0), _BLUR_PX * px_mm / pitch_mm)
+    edge_mm = margin * pitch_mm + board.square_mm
+    return printed_board(board.name, picture, pitch_mm, standing, (edge_mm, edge_mm))

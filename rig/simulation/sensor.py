@@ -45,3 +45,11 @@ class SimulatedSensor:
         """Return electrons as whole DN within the converter's range."""
         dn = np.rint(electrons * self.gain_dn_per_e + self.offset_dn)
         return np.clip(dn, 0, self.saturation_dn).astype(np.uint16)
+
+
+def through_mosaic(light: NDArray[np.floating], mosaic: tuple[str, ...]) -> NDArray[np.floating]:
+    """Return for each pixel of (row, column, RGB) the colour that its filter lets pass, (row, column)."""
+    rows, columns = np.indices(light.shape[:2])
+    colours = np.array([["RGB".index(letter) for letter in row] for row in mosaic])
+    chosen = colours[rows % colours.shape[0], columns % colours.shape[1]]
+    return np.take_along_axis(light, chosen[:, :, np.newaxis], axis=2)[:, :, 0]

@@ -7,16 +7,16 @@ LOCKED = 9
 """The error of a command that the present state does not allow."""
 
 _ERRORS = {
-    2: "bad number format",
-    3: "unknown $ command",
-    5: "homing is not enabled",
-    8: "only allowed when idle",
-    9: "locked by an alarm or a jog in progress",
-    11: "line too long",
-    15: "jog target outside the travel",
-    16: "bad jog command",
-    20: "unsupported command",
-    22: "no feed rate",
+    2: ("bad number format", "check the serial line"),
+    3: ("unknown $ command", "flash GRBL 1.1 or grblHAL"),
+    5: ("homing is not enabled", "set $22=1"),
+    8: ("only allowed when idle", "wait until the stage stands, then try again"),
+    9: ("locked by an alarm or a jog in progress", "recover and home it"),
+    11: ("line too long", "check the serial line"),
+    15: ("jog target outside the travel", "choose one inside, or correct $130 and $131"),
+    16: ("bad jog command", "check the serial line"),
+    20: ("unsupported command", "flash GRBL 1.1 or grblHAL"),
+    22: ("no feed rate", "set stage.feed_mm_per_min"),
 }
 
 _ALARMS = {
@@ -46,8 +46,8 @@ _STATES = {
 
 def refusal(command: str, code: int) -> StageRejected:
     """Return the failure that stands for an error in answer to `command`."""
-    meaning = _ERRORS.get(code, "see the firmware's list of errors")
-    return StageRejected(f"the controller refused {command!r}: error:{code}, {meaning}; nothing moved by it")
+    meaning, remedy = _ERRORS.get(code, ("unknown here", "look it up in the firmware's list of errors"))
+    return StageRejected(f"the controller refused {command!r}: error:{code}, {meaning}; nothing moved by it; {remedy}")
 
 
 def alarm_failure(code: int) -> StageAlarm:

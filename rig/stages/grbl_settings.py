@@ -43,7 +43,9 @@ class GrblSettings:
         """
         version = self.build.get("VER", "")
         if not re.match(r"v?1\.1", version):
-            raise WrongFirmware(f"the controller is GRBL {version or 'of no version'!r}; 1.1 or grblHAL is needed")
+            raise WrongFirmware(
+                f"the controller is GRBL {version or 'of no version'!r}; 1.1 or grblHAL is needed; flash it"
+            )
         self._refuse_unsafe()
         x, y = axes
         return Identity(

@@ -93,11 +93,10 @@ class Capability:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The reachable positions: lower and upper x and y; `is_area` when they come from M115."""
+    """The reachable positions: lower and upper x and y."""
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
-    is_area: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +167,7 @@ def _parse_description(line: str) -> Message | None:
         return Capability(found[1], found[2] == "1")
     if found := _AREA.fullmatch(line) or _ENDSTOPS.fullmatch(line):
         x_min, y_min, x_max, y_max = (float(value) for value in found.groups())
-        return Limits((x_min, x_max), (y_min, y_max), is_area=line.startswith("area"))
+        return Limits((x_min, x_max), (y_min, y_max))
     if found := _SWITCH.fullmatch(line):
         return Switch(found[1], found[2] == "TRIGGERED")
     if found := _SETTING.fullmatch(line):

@@ -63,7 +63,10 @@ class MarlinSettings:
             It is not Marlin, or does not tell what is needed.
         """
         if "marlin" not in self.firmware.lower():
-            raise WrongFirmware(f"the controller is {self.firmware or 'of no stated name'!r}; Marlin is needed")
+            raise WrongFirmware(
+                f"the controller is {self.firmware or 'of no stated name'!r}; Marlin is needed; "
+                "flash it, or set stage.protocol"
+            )
         x, y = axes
         travel_acceleration = self._number("M204", "T")
         return Identity(

@@ -224,9 +224,18 @@ class TestNoiseJson:
         assert not load_set(folder).offset_from_files
 
     def test_a_value_that_could_not_be_identified_is_refused_with_the_reason(self, folder: Path) -> None:
-        self.write(folder, dark_current_e_per_s={"value": None, "why": "all exposures are equally long"})
-        with pytest.raises(BadValue, match=r"dark_current_e_per_s is not known \(all exposures are equally long\)"):
+        self.write(folder, read_noise_e={"value": None, "why": "one dark frame only"})
+        with pytest.raises(BadValue, match=r"read_noise_e is not known \(one dark frame only\)"):
             load_set(folder)
+
+    def test_an_unknown_dark_current_is_taken_for_none_and_said(
+        self, folder: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.write(folder, dark_current_e_per_s={"value": None, "why": "all exposures are equally long"})
+        assert load_set(folder).noise.dark_current_e_per_s == 0.0
+        assert (
+            "dark_current_e_per_s is not known (all exposures are equally long); 0 is taken" in capsys.readouterr().err
+        )
 
     def test_an_unknown_quantum_efficiency_hinders_nothing(self, folder: Path) -> None:
         self.write(folder, quantum_efficiency={"value": None, "why": "no photons were counted"})

@@ -18,10 +18,10 @@ from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_m
 from pipelines.elemental_set import load_set
 from pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from pipelines.geometry import geometry
-from pipelines.geometry_files import CORNERS_FILE, COVARIANCE_FILE, read_corners, read_geometry
+from pipelines.geometry_files import CORNERS_FILE, COVARIANCE_FILE, read_corners
 from pipelines.import_colmap import export_colmap, import_colmap
 from pipelines.import_mrcal import export_mrcal, import_mrcal
-from pipelines.measured_poses import with_measured_geometry
+from pipelines.measured_poses import read_geometry, with_measured_geometry
 from pipelines.simulate import simulate
 from pipelines.simulate_boards import simulate_board_set
 from pipelines.truth import read_truth

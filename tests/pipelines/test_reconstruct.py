@@ -214,7 +214,8 @@ def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done:
     total = tifffile.imread(tmp_path / "out" / plane["file"]).sum(dtype=float)
     assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
     stated = {"method": "pmlem", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
-    assert record["options"] == stated | {"poses": "stated", "penalty": "tv", "likelihood": "auto"}
+    others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "focus": False}
+    assert record["options"] == stated | others
 
 
 def test_running_twice_gives_the_same_planes(larger_scene: Path, results: Path, tmp_path: Path, done: Command) -> None:
@@ -375,7 +376,7 @@ def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> 
             "least squares has ratios below zero",
         ),
         (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
-        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: two different positive depths"),
+        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different positive depths"),
         (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),
         (("--sweep-mm", "400:900:1"), 2, "at least 2 planes"),
         (("--sweep-mm", "500:500.3:7"), 2, "would share a file name; keep them 0.1 mm apart"),

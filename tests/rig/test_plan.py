@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.errors import KeepOutCrossed, OutsideTravel
+from rig.grid import centre_node
 from rig.plan import CapturePlan, Grid, Step
 from rig.simulation.controller.bench import Bench
 from rig.simulation.controller.grbl import SimulatedGrbl
@@ -44,6 +45,7 @@ def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
     assert serpentine == [(0, 0), (0, 1), (0, 2), (1, 2), (1, 1), (1, 0)]
     assert raster == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
     assert Grid(7, 7, 50.0, Point(0.0, 0.0)).centre().node == (3, 3)
+    assert Grid(2, 4, 50.0, Point(0.0, 0.0)).centre().node == (1, 2) == centre_node(2, 4)
 
 
 def test_frames_and_room() -> None:
@@ -97,8 +99,6 @@ def test_a_plan_is_frozen_and_survives_a_file() -> None:
         plan.approach_mm = 1.0  # type: ignore[misc]  # that it cannot be assigned is what is tested
     again = msgspec.json.decode(msgspec.json.encode(plan), type=CapturePlan)
     assert again == plan
-    assert again.fingerprint() == plan.fingerprint()
-    assert plan_of(Grid(7, 7, 50.0, Point(10.0, 10.0), "raster")).fingerprint() != plan.fingerprint()
 
 
 def test_wrong_values() -> None:

@@ -16,9 +16,11 @@ from rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
 from rig.cameras.micromanager import MicroManagerCamera
 from rig.cameras.protocol import CameraReport, Exposure
 from rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
-from rig.cameras.simulated import SimulatedCamera
+from rig.cameras.simulated import TRUE_POSE, SimulatedCamera
 from rig.errors import CameraError, CameraTimeout, MissingExtra
 from rig.simulation.controller.clock import SimulatedClock
+from rig.simulation.lab import SimulatedLab
+from rig.stages.protocol import Point
 from tests.rig.cameras.contract import check_camera
 
 SEED = b"\xff\xd8 a picture, for all that the camera knows \xff\xd9"
@@ -26,11 +28,13 @@ SEED = b"\xff\xd8 a picture, for all that the camera knows \xff\xd9"
 
 def test_the_simulated_camera() -> None:
     clock = SimulatedClock()
-    camera = SimulatedCamera(
-        SimulatedSettings(size_px=(8, 8)), clock, lambda exposure_s, number: np.zeros((8, 8), np.uint16)
-    )
+    settings = SimulatedSettings(size_px=(8, 8))
+    lab = SimulatedLab(Point(0.0, 0.0), lambda: Point(10.0, 0.0), lambda: 60.0, (), settings)
+    camera = SimulatedCamera(settings, clock, lab)
     check_camera(camera, 0.1)
     assert clock.now_s() >= 6 * 0.1
+    camera.open()
+    assert camera.expose(0.1, 1).metadata[TRUE_POSE] == pytest.approx([0, 0, 0, -10, 0, 0], abs=1e-9)
 
 
 class Incoming(SimulatedClock):

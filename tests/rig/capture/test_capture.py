@@ -2,10 +2,12 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from unittest import mock
 
 import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from rig.boards import Board
 from rig.cameras.protocol import Pixels
@@ -25,6 +27,7 @@ from rig.settings import CheckSettings, RigSettings, SettleSettings, StepSetting
 from rig.settling import measure_settling
 from rig.simulation.controller.clock import SimulatedClock
 from rig.simulation.experiment import paper_experiment
+from rig.simulation.lab import SimulatedLab
 from rig.simulation.scene import render
 from rig.stages.protocol import Point
 from rig.survey import survey
@@ -98,7 +101,7 @@ def test_a_person_is_led_through_all_steps(tmp_path: Path) -> None:
     ]
     last = person.statuses[-1]
     assert (last.step, last.steps, last.done, last.total) == (3, 3, FRAMES - 1, FRAMES)
-    assert last.grid == ((-1.0, 0.75, -1.0), (-1.0, -1.0, -1.0))
+    assert last.grid == ((-1.0, -1.0, -1.0), (-1.0, 0.75, -1.0))
 
 
 def test_every_frame_has_its_record(tmp_path: Path) -> None:
@@ -107,7 +110,7 @@ def test_every_frame_has_its_record(tmp_path: Path) -> None:
         assert path.is_file()
         assert committed.detail["position_mm"] == pytest.approx(list(frame.stop.target), abs=0.02)
         assert committed.detail["exposure_s"] == frame.exposure_s
-        assert committed.detail["camera"] == {"camera": "simulated camera"}
+        assert committed.detail["camera"]["camera"] == "simulated camera"
         assert "median_dn" in committed.detail["checks"]
 
 
@@ -194,6 +197,22 @@ SWINGING = msgspec.structs.replace(
 )
 
 
+def test_every_frame_is_rested_for_the_first_ones_too(tmp_path: Path) -> None:
+    rested_s: list[float] = []
+    expose = SimulatedLab.expose
+
+    def watched(lab: SimulatedLab, exposure_s: float, number: int) -> NDArray[np.uint16]:
+        rested_s.append(lab._still_s())  # noqa: SLF001
+        return expose(lab, exposure_s, number)
+
+    settings = msgspec.structs.replace(SMALL_RIG, settle=SettleSettings(measure=False, wait_s=2.0))
+    with mock.patch.object(SimulatedLab, "expose", watched):
+        assert isinstance(run(tmp_path / "session", Person({}, {3: "stop"}), settings), CaptureStopped)
+        assert run(tmp_path / "session", Person(), settings) is None
+    assert len(rested_s) == FRAMES
+    assert min(rested_s) >= 2.0
+
+
 def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     folder = tmp_path / "session"
     assert isinstance(run(folder, Person({}, {2: "stop"}), SWINGING), CaptureStopped)
@@ -203,9 +222,9 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     assert len(found) == 1
     detail = found[0].detail
     assert detail["settled"] is True
-    # The swing of 1.5 mm along both axes, seen at 620 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
+    # The swing of 1.5 mm along both axes, seen at 540 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
     # controller's reports take 0.2 s to 0.4 s of it
-    shift_px = 2**0.5 * 1.5 * 200 / 620
+    shift_px = 2**0.5 * 1.5 * 200 / 540
     rest_s = 0.25 * np.log(shift_px / SWINGING.settle.limit_px)
     assert rest_s - 0.4 <= detail["wait_s"] <= rest_s - 0.2 + 0.2
     shifts = [shift for _, shift in detail["curve"]]

@@ -57,7 +57,7 @@ def test_marlin_lines_are_read() -> None:
         "Setting", "Limits", "Limits", "Switch", "Firmware",
     ]  # fmt: skip
     assert marlin.parse(MARLIN_LINES[3]) == marlin.PositionReport({"X": 10.0, "Y": 20.5, "Z": 0.0}, is_ok=False)
-    assert marlin.parse(MARLIN_LINES[12]) == marlin.Limits((1.0, 399.0), (2.0, 398.0), is_area=True)
+    assert marlin.parse(MARLIN_LINES[12]) == marlin.Limits((1.0, 399.0), (2.0, 398.0))
     assert marlin.parse(MARLIN_LINES[14]) == marlin.Firmware("Marlin 2.1.2.4 (Jun  1 2024 12:00:00)")
     assert marlin.parse("Error:checksum mismatch, Last Line: 6") == marlin.Error(
         "checksum mismatch, Last Line: 6", in_transmission=True

@@ -1,0 +1,93 @@
+"""Put the figures of a finished demo into docs/results.json and README.md: `python docs/collect_results.py demo`.
+
+README's table is made from results.json by `filled`, and a test holds the two together: no figure is typed.
+"""
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+_DOCS = Path(__file__).parent
+RESULTS, README = _DOCS / "results.json", _DOCS.parent / "README.md"
+_BLOCK = re.compile(
+    r"(?<=<!-- results: made by docs/collect_results.py -->\n).*?(?=<!-- end of results -->)", re.DOTALL
+)
+_METHODS = {
+    "backprojection": "mean of the views",
+    "mlem": "MLEM",
+    "pmlem": "PMLEM",
+    "pmlem-osl": "PMLEM, one-step-late",
+}
+
+_NOISE = {
+    "gain_dn_per_e": ("gain", "DN/e⁻"),
+    "read_noise_e": ("read noise", "e⁻"),
+    "dark_current_e_per_s": ("dark current", "e⁻/s"),
+}
+
+
+def collect(demo: Path) -> dict[str, Any]:
+    """Return what README says of the demo in a folder, rounded as it deserves."""
+    metrics = json.loads((demo / "metrics.json").read_text())
+    made = json.loads(next(demo.rglob("reconstruction.json")).read_text())
+    planes = [
+        {**{key: row[key] for key in ("depth_mm", "method", "poses")}, "mse_bright": float(f"{row['mse_bright']:.3g}")}
+        for row in metrics["planes"]
+    ]
+    results = {
+        "version": made["versions"]["faintfield"],
+        "snr": float(f"{metrics['snr']['measured']:.2g}"),
+        "photons_per_px": float(f"{metrics['photons_per_px']['from_moments']:.2g}"),
+        "planes": planes,
+    }
+    if "geometry" in metrics:
+        results["centre_rms_mm"] = float(f"{metrics['geometry']['centre_rms_mm']:.2g}")
+    if "noise" in metrics:
+        results["noise"] = {
+            name: {key: float(f"{metrics['noise'][name][key]:.4g}") for key in ("value", "se", "truth")}
+            for name in _NOISE
+        }
+    return results
+
+
+def table(results: dict[str, Any]) -> str:
+    """Return the results in Markdown."""
+    depths = sorted({row["depth_mm"] for row in results["planes"]})
+    lines = [
+        f"| mean square error at SNR {results['snr']:g}, {results['photons_per_px']:g} photons per pixel | "
+        + " | ".join(f"{depth:g} mm" for depth in depths)
+        + " |",
+        "|---|" + "---|" * len(depths),
+    ]
+    for method, poses in dict.fromkeys((row["method"], row["poses"]) for row in results["planes"]):
+        of_depth = {
+            row["depth_mm"]: f"{row['mse_bright']:.3f}"
+            for row in results["planes"]
+            if (row["method"], row["poses"]) == (method, poses)
+        }
+        cells = " | ".join(of_depth.get(depth, "–") for depth in depths)
+        lines.append(f"| {_METHODS.get(method, method)}, {poses} poses | {cells} |")
+    said = [
+        f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
+        for name, (words, unit) in _NOISE.items()
+        if (known := results.get("noise", {}).get(name))
+    ]
+    if "centre_rms_mm" in results:
+        said.insert(0, f"camera centres {results['centre_rms_mm']:g} mm rms off the true ones")
+    return "\n".join([*lines, *(["", f"Measured on the way: {'; '.join(said)}."] if said else [])]) + "\n"
+
+
+def filled(readme: str, results: dict[str, Any]) -> str:
+    """Return the text of README.md with its marked block made anew."""
+    made, count = _BLOCK.subn(lambda _: table(results), readme)
+    if count != 1:
+        raise ValueError(f"README.md has {count} marked blocks of results; one is wanted")
+    return made
+
+
+if __name__ == "__main__":
+    found = collect(Path(sys.argv[1]))
+    RESULTS.write_text(json.dumps(found, indent=2) + "\n")
+    README.write_text(filled(README.read_text(), found))

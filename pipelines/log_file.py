@@ -1,0 +1,72 @@
+"""The log that `--log FILE` asks for: who ran what when, all that was said, and the traceback of a bug.
+
+Everything goes through Python's `logging`, so that what libraries have to say is recorded too. The file is added to,
+line by line, unlike results: what happened before a crash is what a log is for.
+"""
+
+import logging
+import os
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from pipelines.errors import CannotWrite
+from pipelines.provenance import versions
+
+logger = logging.getLogger("faintfield")
+logger.setLevel(logging.INFO)
+logger.addHandler(logging.NullHandler())  # without a file nothing is printed either
+
+
+@contextmanager
+def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseException], ...]) -> Iterator[None]:
+    """Record in the file at `path` what happens while the block runs; without a path, do nothing.
+
+    Parameters
+    ----------
+    path : Path, optional
+        The file to add to; its folder must exist.
+    words : sequence of str
+        The command and its arguments.
+    one_line : tuple of exception types
+        Failures whose message says all; any other is recorded with its traceback.
+
+    Raises
+    ------
+    CannotWrite
+        The file cannot be opened.
+    """
+    if path is None:
+        yield
+        return
+    handler = _opened(path)
+    logging.getLogger().addHandler(handler)
+    logging.captureWarnings(capture=True)
+    begun_s = time.monotonic()
+    try:
+        logger.info("begins: faintfield %s (in %s)", " ".join(words), os.getcwd())
+        logger.info("versions: %s", ", ".join(f"{name} {number}" for name, number in versions().items()))
+        yield
+        logger.info("done in %.1f s", time.monotonic() - begun_s)
+    except BaseException as failure:
+        known = isinstance(failure, (KeyboardInterrupt, SystemExit, *one_line))
+        what = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
+        logger.error("ended after %.1f s by %s", time.monotonic() - begun_s, what, exc_info=not known)
+        raise
+    finally:
+        logging.captureWarnings(capture=False)
+        logging.getLogger().removeHandler(handler)
+        handler.close()
+
+
+def _opened(path: Path) -> logging.Handler:
+    """Return the handler that adds to the file, in universal time."""
+    try:
+        handler = logging.FileHandler(path, encoding="utf-8")
+    except OSError as failure:
+        raise CannotWrite(f"--log {path}: {failure.strerror}; name a file that can be written") from failure
+    handler.setFormatter(logging.Formatter("%(asctime)s.%(msecs)03dZ %(levelname)s %(message)s", "%Y-%m-%dT%H:%M:%S"))
+    assert handler.formatter is not None
+    handler.formatter.converter = time.gmtime
+    return handler

@@ -1,0 +1,73 @@
+"""What `--log FILE` records, and that nothing changes without it."""
+
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pytest
+
+from pipelines import cli
+
+type Command = Callable[..., CompletedProcess[str]]
+_LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) (.*)")
+
+
+def _entries(log: Path) -> list[tuple[str, str]]:
+    """Return level and words of each entry; lines of a traceback belong to none."""
+    found = [_LINE.fullmatch(line) for line in log.read_text().splitlines()]
+    return [(match[1], match[2]) for match in found if match]
+
+
+def test_a_command_that_succeeds_and_one_that_fails_share_a_log(tmp_path: Path, faintfield: Command) -> None:
+    log, rig = tmp_path / "day.log", tmp_path / "rig.toml"
+    first = faintfield("init", rig, "--log", log)
+    second = faintfield("--log", log, "init", rig)
+    assert (first.returncode, second.returncode) == (0, 1)
+    entries = _entries(log)
+    assert len(entries) == len(log.read_text().splitlines()) == 7
+    assert [level for level, _ in entries] == ["INFO"] * 6 + ["ERROR"]
+    words = [said for _, said in entries]
+    assert words[0].startswith(f"begins: faintfield init {rig} (in ")
+    assert re.search(r"versions: python \S+, faintfield \S+, numpy ", words[1])
+    assert words[2] == first.stderr.strip()
+    assert re.fullmatch(r"done in \d+\.\d s", words[3])
+    assert f"by OutputExists: {rig}: is there already" in words[6]
+
+
+def test_wrong_usage_is_recorded_in_a_line(tmp_path: Path, faintfield: Command) -> None:
+    log = tmp_path / "day.log"
+    assert faintfield("--log", log, "verify", "session", "--nonsense").returncode == 2
+    assert _entries(log)[-1][0] == "ERROR"
+    assert "Unknown option: --nonsense" in log.read_text().splitlines()[-1]
+
+
+def test_a_bug_leaves_its_traceback_and_a_warning_its_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        logging.getLogger("some.library").warning("the wind has turned")
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr("pipelines.report.write_report", fail)
+    log = tmp_path / "day.log"
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["report", "folder", "--log", str(log)])
+    assert ("WARNING", "the wind has turned") in _entries(log)
+    assert _entries(log)[-1][1].endswith("by ZeroDivisionError: a bug")
+    assert "Traceback (most recent call last)" in log.read_text()
+    assert log.read_text().splitlines()[-1] == "ZeroDivisionError: a bug"
+
+
+def test_the_log_is_let_go_in_the_end(tmp_path: Path, faintfield: Command) -> None:
+    before = list(logging.getLogger().handlers)
+    assert faintfield("--log", tmp_path / "day.log", "verify", tmp_path).returncode == 1
+    assert logging.getLogger().handlers == before
+
+
+def test_a_log_that_cannot_be_written_is_refused_before_the_command_runs(tmp_path: Path, faintfield: Command) -> None:
+    rig = tmp_path / "rig.toml"
+    ended = faintfield("init", rig, "--log", tmp_path / "absent" / "day.log")
+    assert ended.returncode == 1
+    assert ended.stderr.startswith("faintfield: CannotWrite: --log ")
+    assert "name a file that can be written" in ended.stderr
+    assert not rig.exists()

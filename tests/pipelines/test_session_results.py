@@ -1,0 +1,151 @@
+"""What is made of a session after its capture lies in it and leaves the session whole."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.board_set import load_board_set
+from pipelines.channels import channel_layouts, load_channel
+from pipelines.errors import BadValue, MissingFile, WrongUsage
+from pipelines.frames import read_frame
+from pipelines.geometry import geometry
+from pipelines.image_files import write_frame
+from pipelines.noise import noise
+from pipelines.reconstruct import reconstruct
+from pipelines.run import run
+from pipelines.session_set import load_session
+from rig.session.opening import taken_frames
+from rig.session.verify import verify
+from tests.pipelines.sessions import SWEEPS, captured, rig_toml
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A captured session without results, to be read only."""
+    return captured(tmp_path_factory.mktemp("recorded"), rig_toml())
+
+
+@pytest.fixture(scope="module")
+def session(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session to which results are added."""
+    return Path(shutil.copytree(recorded, tmp_path_factory.mktemp("results") / "session"))
+
+
+def test_the_geometry_of_a_session_is_where_its_camera_was(session: Path) -> None:
+    geometry(session)
+    assert verify(session).problems == ()
+    content = json.loads((session / "geometry.json").read_text())
+    assert len(list((session / "cameras").glob("*.cameramodel"))) == 9
+    assert content["reference_node"] == [1, 1]
+    frames = {f"frames/{path.name}" for planned, _, path in taken_frames(session) if planned.kind == "charuco"}
+    assert set(content["inputs"]) == frames | {"plan.json"}
+    for entry in content["nodes"]:
+        told_mm = -100.0 * (np.array(entry["node"][::-1]) - 1)  # the lab's gantry goes where it is told
+        np.testing.assert_allclose(entry["rt_cam_ref"][3:5], told_mm, atol=0.15)
+    assert {(board["name"], board["sweep"]) for board in content["boards"]} == {("large", sweep) for sweep in range(4)}
+    assert content["stage"]["scale_x"]["value"] == pytest.approx(1, abs=1e-3)
+
+
+def test_a_session_without_boards_is_told_from_one_whose_frames_are_gone(recorded: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadValue, match=r"has no charuco frame yet; capture"):
+        load_board_set(captured(tmp_path, rig_toml(["dark_scene"], rows=1, columns=2)))
+    session = Path(shutil.copytree(recorded, tmp_path / "copy"))
+    assert len(load_board_set(session).views) == 9 * len(SWEEPS)
+    next((session / "frames").glob("*_charuco_2_r1_c0_*")).unlink()
+    with pytest.raises(MissingFile, match=r"charuco_2_r1_c0.*restore it from a copy"):
+        load_board_set(session)
+
+
+def test_what_is_missing_is_named_with_the_command_that_makes_it(recorded: Path, tmp_path: Path) -> None:
+    session = Path(shutil.copytree(recorded, tmp_path / "copy"))
+    with pytest.raises(MissingFile, match=r"geometry.json: no such file; run `faintfield geometry"):
+        reconstruct(session, depth_mm=[500.0])
+    (session / "geometry.json").write_text("{}")
+    with pytest.raises(MissingFile, match=r"noise.json: no such file; run `faintfield noise"):
+        reconstruct(session, depth_mm=[500.0])
+    with pytest.raises(BadValue, match=r"no bright frame of the centre node \[1, 1\]"):
+        load_session(session, "bright")
+    next((session / "frames").glob("*_dark_scene_0_r0_c2_*")).unlink()
+    with pytest.raises(MissingFile, match=r"dark_scene_0_r0_c2.*restore it from a copy"):
+        load_session(session)
+
+
+class TestRun:
+    """`faintfield run`: only what is out of date, by hash."""
+
+    def ran(self, session: Path, depth_mm: float = 500.0) -> list[str]:
+        return [step["step"] for step in run(session, depth_mm=[depth_mm], passes=5)["steps"] if step["ran"]]
+
+    def test_exactly_the_dependent_steps_run_again(self, recorded: Path, tmp_path: Path) -> None:
+        session = Path(shutil.copytree(recorded, tmp_path / "copy"))
+        assert self.ran(session) == ["noise", "geometry", "reconstruct"]
+        assert verify(session).problems == ()
+        assert self.ran(session) == []
+        assert self.ran(session, 700.0) == ["reconstruct"]
+        next((session / "frames").glob("*_dark_scene_0_r0_c0_*")).touch()
+        assert self.ran(session, 700.0) == []
+
+    @pytest.mark.parametrize(
+        ("kind", "steps"),
+        [("dark_scene", ["reconstruct"]), ("charuco", ["geometry", "reconstruct"]), ("flat", ["noise", "reconstruct"])],
+    )
+    def test_a_frame_that_is_not_what_was_captured_is_named(
+        self, kind: str, steps: list[str], session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.ran(session, 700.0)
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+        frame = sorted((copy / "frames").glob(f"*_{kind}_0_*"))[0]
+        pixels = read_frame(frame).pixels_dn.copy()
+        pixels[10, 20] += 7
+        write_frame(frame, pixels)
+        assert self.ran(copy, 700.0) == steps
+        assert f"warning: frames/{frame.name} and 0 other frames are not what was captured" in capsys.readouterr().err
+
+    def test_what_fails_leaves_the_rest_and_says_how_to_go_on(
+        self, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        session = Path(shutil.copytree(recorded, tmp_path / "copy"))
+        frames = {path: path.read_bytes() for path in (session / "frames").glob("*_charuco_*")}
+        for path in frames:
+            path.unlink()
+        with pytest.raises(MissingFile, match=r"run `faintfield run .*still to be done: geometry, reconstruct, report"):
+            self.ran(session)
+        assert (session / "noise.json").is_file()
+        assert "reconstruct: left as it is, for it needs geometry" in capsys.readouterr().err
+        for path, content in frames.items():
+            path.write_bytes(content)
+        assert self.ran(session) == ["geometry", "reconstruct"]
+
+    def test_no_depth_at_all_is_wrong_usage(self, recorded: Path) -> None:
+        with pytest.raises(WrongUsage, match=r"give --depth-mm or --sweep-mm"):
+            run(recorded)
+
+    def test_a_folder_without_a_session_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(MissingFile, match="holds no session"):
+            run(tmp_path, depth_mm=[500.0])
+
+
+def test_repeated_frames_add_up(tmp_path: Path) -> None:
+    """Twice the frames: twice the electrons, twice the dark electrons and the read variance."""
+    session = captured(tmp_path, rig_toml([*SWEEPS, "dark_scene", "dark_scene", "dark"]))
+    geometry(session)
+    noise(session)
+    loaded = load_session(session)
+    assert loaded.frames_per_view == 2
+    assert loaded.settings.exposure_s == pytest.approx(0.2)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout)
+    frames = [path for it, _, path in taken_frames(session) if it.kind == "dark_scene" and it.stop.node == (0, 2)]
+    by_hand = sum((read_frame(path).pixels_dn - loaded.noise.offset_dn) / loaded.noise.gain_dn_per_e for path in frames)
+    np.testing.assert_allclose(images.electrons[2], by_hand, atol=1e-3)
+    variance_e2 = np.asarray(images.read_variance_e2)[0]
+    np.testing.assert_allclose(variance_e2, 2 * loaded.noise.read_variance_e2(), rtol=1e-5)
+    dark_e = 0.2 * np.asarray(loaded.noise.dark_current_e_per_s)
+    np.testing.assert_allclose(np.asarray(images.background_e)[0], dark_e, rtol=1e-5)
+    # What is known of the variance is what is there: of the pixels that see nothing, against the sum of both parts
+    unlit = images.electrons[2][:20, :40]
+    expected = np.mean(images.read_variance_e2) + np.mean(images.background_e)
+    assert np.var(unlit) == pytest.approx(float(expected), rel=5 * np.sqrt(2 / unlit.size))

@@ -1,0 +1,98 @@
+"""What documents say of the code, and of one another, is so."""
+
+import importlib.util
+import inspect
+import json
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import calib.errors
+import pipelines.errors
+import recon.errors
+import rig.errors
+
+_ROOT = Path(__file__).parents[1]
+_DOCUMENTS = [_ROOT / "README.md", *sorted((_ROOT / "docs").glob("*.md"))]
+# What a person meets under the name of a more special failure, or never by itself.
+_NEVER_BY_ITSELF = {"RigError", "StageError", "SessionError", "CalibrationError", "ReconstructionError", "InputError"}
+
+
+def _collect_results() -> ModuleType:
+    """Return docs/collect_results.py, which is a script and in no package."""
+    spec = importlib.util.spec_from_file_location("collect_results", _ROOT / "docs" / "collect_results.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_results_of_the_readme_are_those_of_the_file() -> None:
+    script = _collect_results()
+    readme = (_ROOT / "README.md").read_text()
+    results = json.loads((_ROOT / "docs" / "results.json").read_text())
+    assert script.filled(readme, results) == readme
+    results["planes"][0]["mse_bright"] += 0.5
+    assert script.filled(readme, results) != readme
+
+
+def test_results_are_collected_from_a_demo(tmp_path: Path) -> None:
+    script = _collect_results()
+    row = {"depth_mm": 500.0, "method": "pmlem", "poses": "measured", "mse_bright": 0.0123456, "psnr_db": 19.0}
+    metrics = {"planes": [row], "snr": {"measured": 0.1561}, "photons_per_px": {"from_moments": 1.9222}}
+    (tmp_path / "dark").mkdir()
+    (tmp_path / "dark" / "reconstruction.json").write_text(json.dumps({"versions": {"faintfield": "9.9"}}))
+    known = {"value": 3.46412, "se": 0.00123, "truth": 3.4641016}
+    measured = {"noise": dict.fromkeys(("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s"), known)}
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics | measured | {"geometry": {"centre_rms_mm": 0.03456}}))
+    results = script.collect(tmp_path)
+    assert results["planes"][0]["mse_bright"] == 0.0123
+    assert script.table(results) == (
+        "| mean square error at SNR 0.16, 1.9 photons per pixel | 500 mm |\n|---|---|\n"
+        "| PMLEM, measured poses | 0.012 |\n\nMeasured on the way: camera centres 0.035 mm rms off the true ones; "
+        "gain 3.464 ± 0.001 DN/e⁻ (true: 3.464); read noise 3.464 ± 0.001 e⁻ (true: 3.464); "
+        "dark current 3.464 ± 0.001 e⁻/s (true: 3.464).\n"
+    )
+
+
+@pytest.mark.parametrize("tree", [rig.errors, calib.errors, recon.errors, pipelines.errors], ids=lambda it: it.__name__)
+def test_the_guide_says_what_to_do_for_every_named_failure(tree: ModuleType) -> None:
+    guide = (_ROOT / "docs" / "guide.md").read_text()
+    table = guide[guide.index("## When you see this, do that") :]
+    named = {name for name, value in inspect.getmembers(tree, inspect.isclass) if issubclass(value, Exception)}
+    assert named
+    assert {name for name in named - _NEVER_BY_ITSELF if f"`{name}`" not in table} == set()
+
+
+@pytest.mark.parametrize("document", _DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
+        if not target.startswith("http"):
+            name, _, anchor = target.partition("#")
+            path = (document.parent / name).resolve() if name else document
+            assert path.exists(), target
+            if anchor:
+                assert anchor in _anchors(path), target
+
+
+def _anchors(document: Path) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", document.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def test_the_index_of_the_code_names_every_file() -> None:
+    index = (_ROOT / "docs" / "architecture.md").read_text()
+    for package in ("rig", "calib", "recon", "pipelines", "benchmarks"):
+        for path in sorted((_ROOT / package).rglob("*.py")):
+            if path.name not in ("__init__.py", "__main__.py"):
+                assert re.search(rf"\b{path.stem}\b", index), f"{path.relative_to(_ROOT)} is not in the index"
+
+
+def test_every_document_is_two_hops_from_the_readme() -> None:
+    readme = (_ROOT / "README.md").read_text()
+    for path in (_ROOT / "docs").glob("*.md"):
+        assert path.name in readme, path.name
