@@ -23,13 +23,12 @@ accumulator of its own: sums are deterministic for a given number of workers.
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from recon.elementary import compiled
+from recon.elementary import compiled, inlined
 from recon.pixel_models import WORK_ROWS, form_ratio
 
 BLOCK_PX = 64
@@ -54,8 +53,6 @@ _PRODUCTS = 5 * BLOCK_PX + _MARGIN
 _PLACES = 5 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * _PRODUCT_PX
 _COLUMN, _ROW, _WEIGHT = (row * BLOCK_PX for row in range(3))
 _PLACE_SIZE = 3 * BLOCK_PX
-
-_inlined = numba.njit(inline="always", error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"})
 
 # Unsigned: numba would test signed ones for being negative, which keeps loops from becoming vectors
 _index = np.uintp
@@ -168,7 +165,7 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
     return row_from, row_to, column_from, column_to
 
 
-@_inlined
+@inlined
 def _arrangement(row_from, row_to, column_from, column_to, start, stride, samples):
     """Return how a block lies on a plane.
 
@@ -181,13 +178,13 @@ def _arrangement(row_from, row_to, column_from, column_to, start, stride, sample
     return _IN_STEP if in_step and start >= 0 and end <= samples else _SCATTERED
 
 
-@_inlined
+@inlined
 def _tent(distance):
     height = type(distance)(1) - abs(distance)
     return height if height > type(distance)(0) else type(distance)(0)
 
 
-@_inlined
+@inlined
 def _row_weights(down):
     """Return the tents of the three rows; they sum to one."""
     number = type(down)
@@ -255,7 +252,7 @@ def _scatter_in_step(samples, start, stride, row_from, column_from, scratch, pla
         base += _index(COLUMN_TAPS) * size
 
 
-@_inlined
+@inlined
 def _corner(scratch, place, k, start, height, stride):
     """Return the upper left of the four samples around a pixel's point, and the fractions down and right of it."""
     number = type(scratch[0])
@@ -317,7 +314,7 @@ def _locate_on_all(homographies, matrix, views, layout, planes, samples, maps, l
     return meets
 
 
-@_inlined
+@inlined
 def _place(plane):
     return _index(_PLACES) + plane * _index(_PLACE_SIZE)
 
@@ -370,7 +367,7 @@ def _copy(source, at, target, to, count):
         target[to + k] = source[at + k]
 
 
-@_inlined
+@inlined
 def _aligned_scratch(planes, dtype_of):
     """Return zeros that begin with a cache line."""
     size, item = _PLACES + planes * _PLACE_SIZE, dtype_of.itemsize
