@@ -4,7 +4,7 @@ import re
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -32,7 +32,9 @@ from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
+from recon.images import LikelihoodName
 from recon.operator import PlaneOperator
+from recon.penalties import PenaltyName
 
 
 def reconstruct(
@@ -44,7 +46,9 @@ def reconstruct(
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
     method: list[Method] | None = None,
-    penalty_weight: NotNegative | None = None,
+    penalty_weight: NotNegative | Literal["auto"] = "auto",
+    penalty: PenaltyName = "tv",
+    likelihood: LikelihoodName | Literal["auto"] = "auto",
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
@@ -68,9 +72,17 @@ def reconstruct(
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
     method
-        backprojection, mlem or pmlem-osl (the default); give it once per method.
+        pmlem (the default; to its optimum, certified), pmlem-osl and mlem (the paper's iterations), or backprojection;
+        give it once per method.
     penalty_weight
-        The paper's β, in the unit of the number of views; chosen from the noise level by default.
+        The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
+        predict those held out, for pmlem-osl one from the noise level.
+    penalty
+        What pmlem holds against rough planes: total variation, the same with small differences squared (huber-tv),
+        squared differences (quadratic), or nothing.
+    likelihood
+        How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
+        above, which is faster. poisson ignores read noise; least-squares knows no counts.
     passes
         At most this many passes over the data.
     pitch_mm
@@ -79,10 +91,12 @@ def reconstruct(
         geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
     """
     started = time.monotonic()
-    methods: list[Method] = list(dict.fromkeys(method or ["pmlem-osl"]))
+    methods: list[Method] = list(dict.fromkeys(method or ["pmlem"]))
     swept = _swept_depths(sweep_mm) if sweep_mm else []
     if not (depth_mm or swept or disparity_px):
         raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
+        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     loaded = load_set(elemental_set)
     if geometry is not None:
         from pipelines.measured_poses import with_measured_geometry  # 100 MB of calibration that only this needs
@@ -92,7 +106,8 @@ def reconstruct(
     folders = {name: out if len(methods) == 1 else out / name for name in methods}
     run = _Run(loaded, depths, pitch_mm, folders)
     require_room(out, run.needed_bytes())
-    run.reconstruct(Settings(penalty_weight, passes), with_focus=bool(swept))
+    weight = None if penalty_weight == "auto" else penalty_weight
+    run.reconstruct(Settings(weight, passes, likelihood, penalty), with_focus=bool(swept))
     write_overview(loaded, out)
     metrics = assess(loaded, run.written)
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
@@ -102,6 +117,8 @@ def reconstruct(
     options: dict[str, Any] = {
         "depth_mm": depths,
         "penalty_weight": penalty_weight,
+        "penalty": penalty,
+        "likelihood": likelihood,
         "passes": passes,
         "pitch_mm": pitch_mm,
     }
@@ -117,6 +134,7 @@ def reconstruct(
         write_json(folder / RECONSTRUCTION_FILE, result)
     report = write_report(out)
     _say_what_oscillates(run.records)
+    _say_what_is_not_reached(run.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {"out": str(out), "report": str(report), "planes": run.records, "focus": run.focus(), "metrics": metrics}
 
@@ -266,10 +284,22 @@ def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[n
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     """Tell of planes on which the iteration swings to and fro."""
     certificates = [record["certificate"] for record in records if record["certificate"]]
+    certificates = [certificate for certificate in certificates if "oscillates" in certificate]
     swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
     if swings:
         say(
             f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
             f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
             "--penalty-weight calms it, and leaves more noise."
+        )
+
+
+def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
+    """Tell of planes whose certificate is not what was asked for."""
+    certificates = [record["certificate"] for record in records if record["method"] == "pmlem"]
+    missed = [certificate["value"] for certificate in certificates if not certificate["reached"]]
+    if missed:
+        say(
+            f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
+            f"{max(missed):.1%} from the optimum instead of {certificates[0]['tolerance']:.0%}; allow more --passes"
         )

@@ -28,7 +28,12 @@ REPORT_FILE = "report.html"
 _MOST_ROWS = 6
 _GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
 
-METHOD_NAMES = {"backprojection": "back-projection", "mlem": "MLEM", "pmlem-osl": "PMLEM (one-step-late, TV)"}
+METHOD_NAMES = {
+    "backprojection": "back-projection",
+    "mlem": "MLEM",
+    "pmlem-osl": "PMLEM (one-step-late, TV)",
+    "pmlem": "PMLEM",
+}
 
 
 @dataclass(frozen=True)

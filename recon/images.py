@@ -87,3 +87,7 @@ class ElementalImages:
             finite = np.isfinite(image) if self.valid is None else np.isfinite(image[self.valid[view]])
             if not finite.all():
                 raise ValueError(f"view {view} has {np.count_nonzero(~finite)} pixels that are not finite numbers")
+
+    def known_variance_e2(self) -> float | Image:
+        """Return b + σ², what a pixel's variance has beside that of the light, as far as the likelihood knows it."""
+        return self.background_e + (self.read_variance_e2 if self.likelihood.knows_read_noise else 0.0)
