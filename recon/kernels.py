@@ -23,6 +23,7 @@ accumulator of its own: sums are deterministic for a given number of workers.
 
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
@@ -367,17 +368,33 @@ def _copy(source, at, target, to, count):
         target[to + k] = source[at + k]
 
 
+class Workspace(NamedTuple):
+    """What a worker needs to itself: rows of a block's numbers, room for the pixel models, and how the block lies."""
+
+    scratch: NDArray[Any]
+    models: NDArray[Any]
+    blocks: NDArray[np.intp]
+
+
+def workspace(planes: int, dtype: np.dtype[Any]) -> Workspace:
+    """Return a workspace whose rows begin with a cache line: vectors that straddle two cost twice."""
+    size = _PLACES + planes * _PLACE_SIZE
+    raw = np.zeros(size + _LINE_BYTES // dtype.itemsize, dtype)
+    skipped = -raw.ctypes.data % _LINE_BYTES // dtype.itemsize
+    models = np.zeros((WORK_ROWS, BLOCK_PX), dtype)
+    return Workspace(raw[skipped : skipped + size], models, np.zeros(4 * planes, np.intp))
+
+
 @inlined
-def _aligned_scratch(planes, dtype_of):
-    """Return zeros that begin with a cache line."""
-    size, item = _PLACES + planes * _PLACE_SIZE, dtype_of.itemsize
-    raw = np.zeros(size + _LINE_BYTES // item, dtype_of.dtype)
-    skipped = (-raw.ctypes.data) % _LINE_BYTES // item
-    return raw[skipped : skipped + size]
+def _row(scratch, row):
+    """Return a row of the scratch as an array that is not counted."""
+    return numba.carray(_pointer(scratch[row : row + BLOCK_PX]), (BLOCK_PX,))
 
 
 @compiled
-def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, views, worker, workers):
+def sweep(
+    operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers
+):
     """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
@@ -394,18 +411,22 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
         What is written, and what is read; view v has image `image_of_view[v]`.
     pixels : PixelModel
         What is known of the pixels' numbers.
+    space : Workspace
+        The worker's own.
     """
     rows, columns, padded = geometry.detector
     count_of_planes, count_of_views = geometry.layout.shape[0], _index(geometry.lattice_of_view.size)
     samples = accumulator.size if operation == ADJOINT else planes.size
-    block_of = _aligned_scratch(count_of_planes, geometry.maps)
-    expected, counted = block_of[_EXPECTED:_COUNTED], block_of[_COUNTED:_OBSERVED]
-    observed, background = block_of[_OBSERVED:_BACKGROUND], block_of[_BACKGROUND:_VARIANCE]
-    variance = block_of[_VARIANCE : _VARIANCE + BLOCK_PX]
-    work = np.zeros((WORK_ROWS, BLOCK_PX), block_of.dtype)
-    lies = np.zeros(count_of_planes * 4, np.intp)
-    scratch, blocks, layout = _pointer(block_of), _pointer(lies), _pointer(geometry.layout)
+    expected, counted, observed = _row(space.scratch, _EXPECTED), _row(space.scratch, _COUNTED), _row(space.scratch, _OBSERVED)
+    background, variance = _row(space.scratch, _BACKGROUND), _row(space.scratch, _VARIANCE)
+    models = numba.carray(_pointer(space.models), space.models.shape)
+    scratch, blocks, layout = _pointer(space.scratch), _pointer(space.blocks), _pointer(geometry.layout)
     homographies, maps, layer = _pointer(geometry.homographies), _pointer(geometry.maps), _index(geometry.maps.size // 3)
+    planes_at, added_at, seen_at, images_at = _pointer(planes), _pointer(accumulator), _pointer(seen), _pointer(images)
+    background_at, variance_at = _pointer(pixels.background), _pointer(pixels.variance)
+    valid_at, transmission_at = _pointer(geometry.valid), _pointer(geometry.transmission)
+    masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
+    model, level = pixels.model, pixels.level
     value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
         for view in views:
@@ -425,31 +446,31 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                         continue
                     count = _index(min(BLOCK_PX, columns - first))
                     at = _index((view * rows + row) * columns + first)
-                    if geometry.valid.size:
+                    if masked:
                         for plane in range(_index(count_of_planes)):
-                            _weigh(_pointer(geometry.valid), at, count, scratch, _place(plane))
-                    if geometry.transmission.size:
+                            _weigh(valid_at, at, count, scratch, _place(plane))
+                    if occluded:
                         for plane in range(_index(count_of_planes)):
-                            _weigh(_pointer(geometry.transmission), at, count, scratch, _place(plane))
+                            _weigh(transmission_at, at, count, scratch, _place(plane))
                             at += count_of_views * _index(rows * columns)
                     pixel = _index((image * rows + row) * columns + first)
                     if operation == ADJOINT:
-                        _copy(_pointer(images), pixel, scratch, _index(_EXPECTED), count)
+                        _copy(images_at, pixel, scratch, _index(_EXPECTED), count)
                     else:
-                        _gather(_pointer(planes), layout, count_of_planes, scratch, blocks)
+                        _gather(planes_at, layout, count_of_planes, scratch, blocks)
                     if operation == FORWARD:
-                        _copy(scratch, _index(_EXPECTED), _pointer(seen), pixel, count)
+                        _copy(scratch, _index(_EXPECTED), seen_at, pixel, count)
                         continue
                     if operation != ADJOINT:
                         at = _index((lattice * rows + row) * columns + first)
-                        _copy(_pointer(images), pixel, scratch, _index(_OBSERVED), count)
-                        _copy(_pointer(pixels.background), at, scratch, _index(_BACKGROUND), count)
-                        _copy(_pointer(pixels.variance), at, scratch, _index(_VARIANCE), count)
+                        _copy(images_at, pixel, scratch, _index(_OBSERVED), count)
+                        _copy(background_at, at, scratch, _index(_BACKGROUND), count)
+                        _copy(variance_at, at, scratch, _index(_VARIANCE), count)
                         value += form_ratio(
-                            pixels.model, expected, observed, background, variance, counted, pixels.level, work
+                            model, expected, observed, background, variance, counted, level, models
                         )
                     if operation != VALUE:
-                        _scatter(_pointer(accumulator), layout, count_of_planes, scratch, blocks)
+                        _scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:
                     geometry.reach[view, row, 0], geometry.reach[view, row, 1] = met_from, met_to
     return value

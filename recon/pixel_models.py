@@ -14,7 +14,7 @@ negative log-likelihood with respect to (H f) is 1 − r, and that negative log-
 
 import numpy as np
 
-from recon.elementary import compiled, exponential, inlined, logarithm
+from recon.elementary import compiled, exponential, logarithm
 
 SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES = 0, 1, 2
 
@@ -30,7 +30,7 @@ _SPREADS, _EXTRA = 6.5, 4
 _NEWTON_STEPS = 6
 
 
-@inlined
+@compiled
 def form_ratio(model, expected, observed, background, variance, response, level, work):
     """Replace H f of a block of pixels by the ratio; return the block's negative log-likelihood.
 

@@ -159,6 +159,7 @@ class SceneOperator:
                 _read_only(image_of_view),
                 pixels or kernels.PixelModel(0, nothing, nothing, 0.0),
                 self._geometry,
+                kernels.workspace(len(self.grids), self.dtype),
                 _read_only(views),
                 worker,
                 self._workers,
