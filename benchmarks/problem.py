@@ -17,7 +17,7 @@ DEPTH_MM = 500.0
 
 @dataclass(frozen=True)
 class Problem:
-    """Views of a square detector whose every pixel has a response, background and noise of its own, and some are bad."""
+    """Views of a square detector: each pixel has a response, background and noise of its own, and some are bad."""
 
     lens: Lens
     poses: NDArray[np.float64]

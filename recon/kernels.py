@@ -298,11 +298,15 @@ def _scatter_scattered(samples, start, height, stride, scratch, place):
 def _locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, scratch, blocks):
     """Find where a block of pixels meets every plane; return whether it meets any.
 
-    `blocks` (plane × 4,) receives how the block lies there, the first sample it is in step with, and its row and column.
+    `blocks` (plane × 4,) receives how the block lies there, the first sample of its taps, and that one's row and column.
     """
     meets = False
     for plane in range(_index(planes)):
-        start, height, width = layout[_index(3) * plane], layout[_index(3) * plane + _index(1)], layout[_index(3) * plane + _index(2)]
+        start, height, width = (
+            layout[_index(3) * plane],
+            layout[_index(3) * plane + _index(1)],
+            layout[_index(3) * plane + _index(2)],
+        )
         row_from, row_to, column_from, column_to = _locate(
             homographies, matrix + _index(9) * plane * views, maps, layer, pixel, height, width, scratch, _place(plane)
         )
@@ -392,9 +396,7 @@ def _row(scratch, row):
 
 
 @compiled
-def sweep(
-    operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers
-):
+def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
     """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
@@ -417,11 +419,19 @@ def sweep(
     rows, columns, padded = geometry.detector
     count_of_planes, count_of_views = geometry.layout.shape[0], _index(geometry.lattice_of_view.size)
     samples = accumulator.size if operation == ADJOINT else planes.size
-    expected, counted, observed = _row(space.scratch, _EXPECTED), _row(space.scratch, _COUNTED), _row(space.scratch, _OBSERVED)
+    expected, counted, observed = (
+        _row(space.scratch, _EXPECTED),
+        _row(space.scratch, _COUNTED),
+        _row(space.scratch, _OBSERVED),
+    )
     background, variance = _row(space.scratch, _BACKGROUND), _row(space.scratch, _VARIANCE)
     models = numba.carray(_pointer(space.models), space.models.shape)
     scratch, blocks, layout = _pointer(space.scratch), _pointer(space.blocks), _pointer(geometry.layout)
-    homographies, maps, layer = _pointer(geometry.homographies), _pointer(geometry.maps), _index(geometry.maps.size // 3)
+    homographies, maps, layer = (
+        _pointer(geometry.homographies),
+        _pointer(geometry.maps),
+        _index(geometry.maps.size // 3),
+    )
     planes_at, added_at, seen_at, images_at = _pointer(planes), _pointer(accumulator), _pointer(seen), _pointer(images)
     background_at, variance_at = _pointer(pixels.background), _pointer(pixels.variance)
     valid_at, transmission_at = _pointer(geometry.valid), _pointer(geometry.transmission)
@@ -466,9 +476,7 @@ def sweep(
                         _copy(images_at, pixel, scratch, _index(_OBSERVED), count)
                         _copy(background_at, at, scratch, _index(_BACKGROUND), count)
                         _copy(variance_at, at, scratch, _index(_VARIANCE), count)
-                        value += form_ratio(
-                            model, expected, observed, background, variance, counted, level, models
-                        )
+                        value += form_ratio(model, expected, observed, background, variance, counted, level, models)
                     if operation != VALUE:
                         _scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:

@@ -16,7 +16,7 @@ class PlaneOperator:
     Hᵀ spreads each pixel to the same four samples with the same weights. The images themselves are never resampled.
     A pixel sees the plane when all four samples around its point exist; otherwise its row of H is zero.
 
-    Wherever `views` are asked for, all are meant by default. `recon.scene.SceneOperator` is the same for several planes.
+    Where `views` are asked for, all are meant by default. `recon.scene.SceneOperator` does the same for several planes.
 
     Parameters
     ----------

@@ -57,9 +57,7 @@ def planes_of(generator: np.random.Generator) -> list[Image]:
 def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.Generator) -> None:
     options = known(generator)
     transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE)) if occluded else np.ones((len(GRIDS), 1, 1, 1))
-    scene = SceneOperator(
-        HOMOGRAPHIES, LENS.rays(), GRIDS, **options, transmission=transmission if occluded else None
-    )
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options, transmission=transmission if occluded else None)
     alone = singles(options)
     planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
     expected = sum(t * one.forward(plane) for one, plane, t in zip(alone, planes, transmission, strict=True))
