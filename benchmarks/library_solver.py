@@ -18,7 +18,7 @@ _STEPS = 4000
 def primal_dual(
     operator: PlaneOperator, images: ElementalImages, start: Image, weight: float, optimum: Image
 ) -> Iterator[Image] | None:
-    """Return the iterates of Chambolle and Pock's algorithm for `min L(f) + β TV(f), f ≥ 0`, or None without pyproximal.
+    """Return iterates of Chambolle and Pock's algorithm for `min L(f) + β TV(f), f ≥ 0`; None without pyproximal.
 
     The data and the gradient of the plane are two blocks of one linear operator, scaled to norms alike. The ratio of
     its step lengths, which decides about its speed, is the best that theory knows: ‖f*‖/‖y*‖ of the solution itself.

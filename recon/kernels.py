@@ -298,7 +298,7 @@ def _scatter_scattered(samples, start, height, stride, scratch, place):
 def _locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, scratch, blocks):
     """Find where a block of pixels meets every plane; return whether it meets any.
 
-    `blocks` (plane × 4,) receives how the block lies there, the first sample of its taps, and that one's row and column.
+    `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that one's row and column.
     """
     meets = False
     for plane in range(_index(planes)):
@@ -325,10 +325,13 @@ def _place(plane):
 
 
 @compiled
-def _weigh(factors, pixel, count, scratch, place):
-    """Multiply the weights of a block's pixels."""
-    for k in range(count):
-        scratch[place + _index(_WEIGHT) + k] *= type(scratch[0])(factors[pixel + k])
+def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
+    """Multiply the weights of a block's pixels on every plane."""
+    for plane in range(_index(planes)):
+        weight = _place(plane) + _index(_WEIGHT)
+        for k in range(count):
+            scratch[weight + k] *= type(scratch[0])(factors[pixel + k])
+        pixel += to_next_plane
 
 
 @compiled
@@ -436,6 +439,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     background_at, variance_at = _pointer(pixels.background), _pointer(pixels.variance)
     valid_at, transmission_at = _pointer(geometry.valid), _pointer(geometry.transmission)
     masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
+    per_plane = count_of_views * _index(rows * columns)
     model, level = pixels.model, pixels.level
     value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
@@ -457,12 +461,9 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     count = _index(min(BLOCK_PX, columns - first))
                     at = _index((view * rows + row) * columns + first)
                     if masked:
-                        for plane in range(_index(count_of_planes)):
-                            _weigh(valid_at, at, count, scratch, _place(plane))
+                        _weigh(valid_at, at, _index(0), count_of_planes, count, scratch)
                     if occluded:
-                        for plane in range(_index(count_of_planes)):
-                            _weigh(transmission_at, at, count, scratch, _place(plane))
-                            at += count_of_views * _index(rows * columns)
+                        _weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
                     pixel = _index((image * rows + row) * columns + first)
                     if operation == ADJOINT:
                         _copy(images_at, pixel, scratch, _index(_EXPECTED), count)
