@@ -1,4 +1,4 @@
-"""Finding boards: markers first, corners between them, then each corner's saddle point."""
+"""Finding boards: markers first, corners between them, then each corner to a small part of a pixel."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.board import Board, predefined_dictionary
-from calib.saddle import refine_saddles
+from calib.corner_fit import refine_corners
 
 # The darkest and brightest shares of pixels that a stretch may lose.
 _STRETCH_QUANTILES = (0.002, 0.998)
@@ -21,10 +21,8 @@ _STRETCH_SAMPLES = 60_000
 _WANTED_CONTRAST_OVER_NOISE = 14.0
 _LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX = 0.6, 2.5
 
-_SADDLE_RADIUS_PX = (3, 11)
-
-# Of the distance to the nearest marker, which lies on the squares' diagonals: beyond it the fit's weights are small.
-_SADDLE_REACH = 1.15
+# A marker that lies farther than this from where the others put it is a wrong one; a lens moves them by less.
+_WRONG_MARKER_PX = 10.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +65,10 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
     """
     light = np.asarray(image, np.float32)
     stretched = stretch(light)
-    markers = {name: _markers(stretched, name) for name in {board.dictionary for board in boards}}
+    markers = {}
+    for dictionary in {board.dictionary for board in boards}:
+        ids = tuple(sorted({i for board in boards if board.dictionary == dictionary for i in board.marker_ids}))
+        markers[dictionary] = _markers(stretched, dictionary, ids)
     found = (_detect_board(light, stretched, markers[board.dictionary], board) for board in boards)
     return [corners for corners in found if corners is not None]
 
@@ -121,7 +122,10 @@ def _detect_board(
     if best is None:
         return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
     guesses, ids, legacy = best
-    pixels, sigma_px = refine_saddles(light, guesses, _saddle_radius_px(board, marker_corners))
+    clear = (1 - board.marker_mm / board.square_mm) / 2
+    pixels, sigma_px = refine_corners(
+        light, guesses, _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids), clear
+    )
     kept = np.isfinite(sigma_px)
     return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
 
@@ -139,23 +143,37 @@ class _Markers:
         return [self.corners[index] for index in own], self.ids[own]
 
 
-def _markers(stretched: NDArray[np.uint8], dictionary: str) -> _Markers:
-    """Find the markers of a dictionary."""
-    corners, ids, _ = _marker_detector(dictionary).detectMarkers(stretched)
-    return _Markers(corners, np.empty((0, 1), np.int32) if ids is None else np.reshape(ids, (-1, 1)).astype(np.int32))
+def _markers(stretched: NDArray[np.uint8], dictionary: str, wanted: tuple[int, ...]) -> _Markers:
+    """Find the wanted markers of a dictionary."""
+    corners, found, _ = _marker_detector(dictionary, wanted).detectMarkers(stretched)
+    indices = np.empty(0, int) if found is None else np.ravel(found)
+    return _Markers(corners, np.array(wanted, np.int32)[indices].reshape(-1, 1))
 
 
-def _saddle_radius_px(board: Board, marker_corners: Sequence[NDArray[np.float32]]) -> int:
-    """Return the radius that stays about clear of the markers, judged by how large these are seen."""
-    outlines = [np.reshape(corners, (4, 2)) for corners in marker_corners]
-    sides_px = [np.linalg.norm(outline - np.roll(outline, 1, axis=0), axis=1).min() for outline in outlines]
-    gap_px = float(np.median(sides_px)) / board.marker_mm * (board.square_mm - board.marker_mm) / 2
-    return int(np.clip(np.floor(_SADDLE_REACH * np.sqrt(2) * gap_px), *_SADDLE_RADIUS_PX))
+def _squares_px(
+    printed: Any,
+    marker_corners: Sequence[NDArray[np.float32]],
+    marker_ids: NDArray[np.int32],
+    corners: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """Return how one square along a row and one along a column are seen at corners (corner, 2, 2), from the markers."""
+    known = list(np.ravel(printed.getIds()))
+    flat = np.concatenate([printed.getObjPoints()[known.index(marker)][:, :2] for marker in np.ravel(marker_ids)])
+    seen = np.concatenate([np.reshape(outline, (4, 2)) for outline in marker_corners])
+    homography, _ = cv2.findHomography(flat / printed.getSquareLength(), seen, cv2.RANSAC, _WRONG_MARKER_PX)
+    row, column = np.divmod(corners, printed.getChessboardSize()[0] - 1)
+    x, y, depth = homography @ np.stack([column + 1, row + 1, np.ones(len(row))])
+    by_column, by_row = homography[:, 0], homography[:, 1]
+    steps = [[(by[0] - x / depth * by[2]) / depth, (by[1] - y / depth * by[2]) / depth] for by in (by_column, by_row)]
+    return np.moveaxis(np.array(steps), -1, 0)
 
 
 @cache
-def _marker_detector(dictionary: str) -> Any:
-    return cv2.aruco.ArucoDetector(predefined_dictionary(dictionary), cv2.aruco.DetectorParameters())
+def _marker_detector(dictionary: str, wanted: tuple[int, ...]) -> Any:
+    """Return a detector that knows the wanted markers alone: what it sees is compared with every marker it knows."""
+    whole = predefined_dictionary(dictionary)
+    few = cv2.aruco.Dictionary(whole.bytesList[list(wanted)], whole.markerSize, whole.maxCorrectionBits)
+    return cv2.aruco.ArucoDetector(few, cv2.aruco.DetectorParameters())
 
 
 @cache

@@ -44,7 +44,9 @@ for _name in (
     "simulate",
     "darken",
     "reconstruct",
+    "figures",
     "report",
+    "view",
 ):
     app.command(f"pipelines.{_name}:{_name}")
 app.command(App(name="import", help="Make a set of images and poses, or of frames, from other people's files."))

@@ -77,6 +77,9 @@ def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
     """Write cameras, images and an empty list of points, in text or binary."""
     images = [(number, image, _quaternion(image)) for number, image in enumerate(model.images, start=1)]
     if not binary:
+        spaced = [image.name for image in model.images if len(image.name.split()) > 1]
+        if spaced:
+            raise BadValue(f"'{spaced[0]}': of a name in a text model COLMAP reads what precedes a space; use --binary")
         lines = [
             f"{n} {name} {w} {h} {' '.join(map(repr, p))}" for n, name, w, h, p in map(_camera, model.lenses.items())
         ]
@@ -130,10 +133,14 @@ def _quaternion(image: ColmapImage) -> list[float]:
     return [w, x, y, z]
 
 
-def _model_name(number: int) -> str:
+def _model_name(path: Path, model: str | int) -> str:
+    """Return the name of a camera model of which we know the name or COLMAP's number."""
+    number = _NUMBERS.get(model) if isinstance(model, str) else model
     if number not in _MODELS:
-        known = ", ".join(name for name, _ in _MODELS.values())
-        raise ValueError(f"camera model {number} has no counterpart here; undistort the images, or use {known}")
+        raise BadValue(
+            f"{path}: camera model {model} has no counterpart here; let COLMAP undistort the images "
+            f"(image_undistorter), or fit {', '.join(_NUMBERS)}"
+        )
     return _MODELS[number][0]
 
 
@@ -145,9 +152,8 @@ def _cameras_text(path: Path) -> dict[int, Lens]:
     lenses = {}
     for line in filter(str.strip, _lines(path)):
         number, model, width, height, *numbers = line.split()
-        if model not in _NUMBERS:
-            raise ValueError(f"camera model {model} has no counterpart here; use {', '.join(_NUMBERS)}")
-        lenses[int(number)] = _lens(model, int(width), int(height), [float(text) for text in numbers])
+        name = _model_name(path, model)
+        lenses[int(number)] = _lens(name, int(width), int(height), [float(text) for text in numbers])
     return lenses
 
 
@@ -166,7 +172,7 @@ def _cameras_binary(path: Path) -> dict[int, Lens]:
     with path.open("rb") as file:
         for _ in range(int(_take(file, "Q")[0])):
             number, model, width, height = _take(file, "iiQQ")
-            name = _model_name(int(model))
+            name = _model_name(path, int(model))
             numbers = _take(file, f"{_MODELS[int(model)][1]}d")
             lenses[int(number)] = _lens(name, int(width), int(height), list(numbers))
     return lenses

@@ -13,10 +13,11 @@ from pipelines.arguments import Fraction, NotNegative, Positive, Seed
 from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION, brightness
 from pipelines.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from pipelines.console import progress, say
-from pipelines.elemental_set import LoadedSet, Noise, load_set, write_set
+from pipelines.elemental_set import LoadedSet, load_set, write_set
 from pipelines.errors import BadValue
+from pipelines.exposures import stated_noise, write_exposures
 from pipelines.files import building_folder, write_json
-from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
+from pipelines.image_files import mask_picture, write_plane, write_png
 from pipelines.provenance import provenance
 from recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
 from rig.simulation.sensor import SimulatedSensor
@@ -76,14 +77,8 @@ def darken(
         read_noise_e=read_noise_e, dark_current_e_per_s=dark_current_e_per_s, quantum_efficiency=quantum_efficiency
     )
     reference_light = _light(loaded, loaded.image_paths[loaded.reference_view], layouts)
-    region = object_region(reference_light)
-    if not region.any():
-        raise BadValue(f"{elemental_set}: cannot be darkened: its reference view is black; is it the bright set?")
     dark_e = dark_current_e_per_s * exposure_s
-    try:
-        scale = signal_scale_for_snr(reference_light[region], snr, dark_e, read_noise_e)
-    except ValueError as failure:
-        raise BadValue(f"{elemental_set}: cannot be darkened: {failure}; is it the bright set?") from failure
+    region, scale = _region_and_scale(elemental_set, reference_light, snr, dark_e, read_noise_e)
     generator = np.random.default_rng(seed)
     with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=loaded.folder) as folder:
         _write_dark_views(loaded, layouts, folder, sensor, exposure_s, scale, generator)
@@ -93,7 +88,8 @@ def darken(
         write_json(folder / "provenance.json", record | {"scale_e": scale, "photons_on_object": photons})
     figures = brightness(load_set(out))
     known = {"quantum_efficiency": quantum_efficiency, "read_noise_e": read_noise_e}
-    result = {
+    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
+    return {
         "out": str(out),
         "views": len(loaded.image_paths),
         "snr": snr,
@@ -103,8 +99,19 @@ def darken(
         "photons_from_moments": photons_from_moments(snr, dark_e=dark_e, **known),
         "scale_e": scale,
     }
-    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
-    return result
+
+
+def _region_and_scale(
+    elemental_set: Path, light: NDArray[np.floating], snr: float, dark_e: float, read_noise_e: float
+) -> tuple[NDArray[np.bool_], float]:
+    """Return the object region (row, column) of the reference view, and the factor that makes its light dark."""
+    region = object_region(light)
+    if not region.any():
+        raise BadValue(f"{elemental_set}: cannot be darkened: its reference view is black; is it the bright set?")
+    try:
+        return region, signal_scale_for_snr(light[region], snr, dark_e, read_noise_e)
+    except ValueError as failure:
+        raise BadValue(f"{elemental_set}: cannot be darkened: {failure}; is it the bright set?") from failure
 
 
 def object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -148,24 +155,16 @@ def _write_dark_views(
     generator: np.random.Generator,
 ) -> None:
     """Expose every view anew and write the set; a mosaic stays one."""
-    views = []
     names = _names(loaded)
-    for view, name in zip(progress(loaded.settings.view, "exposing views"), names, strict=True):
-        photons = _light(loaded, loaded.folder / view.image, layouts) * (scale_e / sensor.quantum_efficiency)
-        write_frame(folder / name, sensor.expose(photons, exposure_s, generator))
-        views.append(msgspec.structs.replace(view, image=name))
-    write_frame(folder / NOISE_REFERENCE, sensor.expose(np.zeros(photons.shape), exposure_s, generator))
+    paths = progress(loaded.image_paths, "exposing views")
+    signal_e = (_light(loaded, path, layouts) * scale_e for path in paths)
+    write_exposures(folder, names, signal_e, sensor, exposure_s, generator)
     camera = loaded.settings.camera
     if loaded.flat is not None:
         write_plane(folder / _FLAT, loaded.flat, pitch_mm=1.0)
         camera = msgspec.structs.replace(camera, flat=_FLAT)
-    noise = Noise(
-        gain_dn_per_e=sensor.gain_dn_per_e,
-        read_noise_e=sensor.read_noise_e,
-        offset_dn=sensor.offset_dn,
-        dark_current_e_per_s=sensor.dark_current_e_per_s,
-        quantum_efficiency=sensor.quantum_efficiency,
-        saturation_dn=float(sensor.saturation_dn),
+    views = [msgspec.structs.replace(view, image=name) for view, name in zip(loaded.settings.view, names, strict=True)]
+    settings = msgspec.structs.replace(
+        loaded.settings, exposure_s=exposure_s, camera=camera, noise=stated_noise(sensor), view=views
     )
-    settings = msgspec.structs.replace(loaded.settings, exposure_s=exposure_s, camera=camera, noise=noise, view=views)
     write_set(folder, settings)

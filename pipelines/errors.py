@@ -8,6 +8,7 @@ InputError
 ├── BadValue
 │   └── UnknownKey
 ├── OutputExists
+├── MissingPackage
 └── CannotWrite
     └── DiskFull
 
@@ -47,6 +48,10 @@ class UnknownKey(BadValue):
 
 class OutputExists(InputError):
     """The place to write to holds something already."""
+
+
+class MissingPackage(InputError):
+    """A command needs a package that is not installed with the rest."""
 
 
 class CannotWrite(InputError):

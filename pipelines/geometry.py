@@ -60,7 +60,7 @@ def geometry(
     record = provenance("geometry", options, dict(board_set.input_hashes()))
     boards = list(board_set.boards.values())
     content = write_geometry(out, measured, settings, boards, observations, stage, record)
-    page = write_stage_page(out, measured, stage, content)
+    page = write_stage_page(out, measured, content)
     _say_result(board_set, measured, stage, content)
     return {"out": str(out), "report": str(page), **{name: content[name] for name in _RETURNED}}
 
@@ -104,9 +104,11 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
         if len(seen.corners)
     ]
     if not observations or size_px is None:
+        markers = sum(board.markers for _, seen in per_view for board in seen)
         raise TooFewViews(
-            f"{board_set.source}: no corner was found in {len(board_set.views)} views; "
-            "compare [[board]] (columns, rows, dictionary, first_marker_id) with the print, or expose longer"
+            f"{board_set.source}: {markers} markers of the boards and no corner between them in {len(board_set.views)} "
+            f"views; compare [[board]] ({'columns, rows' if markers else 'dictionary'}, first_marker_id) with the print"
+            ", or expose longer"
         )
     return observations, size_px
 
@@ -132,6 +134,8 @@ def _say_result(board_set: BoardSet, measured: RigGeometry, stage: StageReport, 
         say(f"without a pose, since no board ties them to the rest: nodes {sorted(missing)}; take them again")
     if stage.node_residual_rms_mm.value is not None:
         say(f"nodes lie {stage.node_residual_rms_mm.value:.3f} mm rms off the regular grid that fits best")
+    for doubt in (*measured.doubts, *stage.doubts):
+        say(doubt)
     repeatability = measured.repeatability
     if repeatability is not None and repeatability.sd_mm > _MOST_REPEATABILITY_MM:
         say(

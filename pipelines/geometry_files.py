@@ -132,6 +132,7 @@ def _summary(geometry: RigGeometry, settings: GeometrySettings) -> dict[str, Any
         "corners": geometry.corners,
         "outliers": geometry.outliers,
         "holdout_ratio": geometry.holdout_ratio,
+        "doubts": geometry.doubts,
         "transfer_sigma_px": {
             f"{depth:g}": rms_over_views(transfer_sigma_at(geometry, depth)) for depth in settings.depths_mm
         },

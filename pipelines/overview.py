@@ -25,7 +25,7 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
     """Write the pictures of a set and `overview.json` into `out`; all views share one grey scale."""
     camera = loaded.settings.camera
     reference = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
-    black, white = (float(level) for level in np.quantile(reference, (0.001, 0.999)))
+    black, white = grey_scale_dn(reference)
     columns = _columns(loaded)
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
     small = [_as_seen(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
@@ -44,9 +44,18 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
             "exposure_s": loaded.settings.exposure_s,
             "read_noise_e": float(np.sqrt(np.mean(np.square(loaded.noise.read_noise_e)))),
             "has_noise_reference": has_noise_reference,
+            "quantum_efficiency": loaded.noise.quantum_efficiency,
+            "dark_e": float(np.mean(loaded.noise.background_e(loaded.settings.exposure_s))),
+            "grey_scale_dn": [black, white],
             "brightness": asdict(brightness(loaded)),
         },
     )
+
+
+def grey_scale_dn(reference_dn: NDArray[Any]) -> tuple[float, float]:
+    """Return black and white of the one scale on which a set is shown: nearly all of its reference view's values."""
+    black, white = np.quantile(reference_dn, (0.001, 0.999))
+    return float(black), float(max(white, black + 1))
 
 
 def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
@@ -57,7 +66,7 @@ def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
 
 def _as_seen(pixels_dn: NDArray[Any], white: float, black: float) -> Picture:
     """Return a frame as 8-bit levels."""
-    return grey_levels(pixels_dn, white=max(white, black + 1), black=black)
+    return grey_levels(pixels_dn, white=white, black=black)
 
 
 def _columns(loaded: LoadedSet) -> int:

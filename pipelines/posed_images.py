@@ -44,13 +44,17 @@ def write_posed_set(
     Raises
     ------
     MissingFile, BadValue
-        An image is missing, or the reference is none of them.
+        An image is missing, two have one name, or the reference is none of them.
     """
     for image in images:
         if not image.path.is_file():
             raise MissingFile(
                 f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
             )
+    names = [image.path.stem for image in images]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:  # they are copied into one folder
+        raise BadValue(f"two images are named {twice}; give each image a name of its own, whatever folder it lies in")
     index = _reference(images, reference)
     exposure_s = exposure_s or read_frame(images[index].path).exposure_s
     if exposure_s is None:

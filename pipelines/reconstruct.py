@@ -30,6 +30,7 @@ from pipelines.overview import write_overview
 from pipelines.planes import Method, Settings, solve
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
+from pipelines.stacks import write_stack
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.images import LikelihoodName
@@ -132,6 +133,8 @@ def reconstruct(
             **provenance("reconstruct", {"method": name, **options}, inputs),
         }
         write_json(folder / RECONSTRUCTION_FILE, result)
+        if swept:
+            write_stack(folder, result["planes"])
     report = write_report(out)
     _say_what_oscillates(run.records)
     _say_what_is_not_reached(run.records)

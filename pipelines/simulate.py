@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
-from pipelines.brightness import NOISE_REFERENCE, OBJECT_REGION
+from pipelines.brightness import OBJECT_REGION
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
 from pipelines.errors import BadValue
+from pipelines.exposures import stated_noise, write_exposures
 from pipelines.files import building_folder, write_json
 from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
 from pipelines.provenance import provenance
@@ -156,20 +157,9 @@ def _write_dark_set(
     sensor = experiment.sensor
     nodes = grid_nodes(experiment.rows, experiment.columns)
     names = [f"view_r{row}_c{column}.tiff" for row, column in nodes]
-    for name, light in zip(names, rendered.views, strict=True):
-        photons = light * (scale_e / sensor.quantum_efficiency)
-        write_frame(folder / name, sensor.expose(photons, experiment.exposure_s, generator))
-    nothing = np.zeros(rendered.views.shape[1:])
-    write_frame(folder / NOISE_REFERENCE, sensor.expose(nothing, experiment.exposure_s, generator))
-    noise = Noise(
-        offset_dn=sensor.offset_dn,
-        gain_dn_per_e=sensor.gain_dn_per_e,
-        read_noise_e=sensor.read_noise_e,
-        dark_current_e_per_s=sensor.dark_current_e_per_s,
-        quantum_efficiency=sensor.quantum_efficiency,
-        saturation_dn=float(sensor.saturation_dn),
-    )
-    _write_toml(folder, experiment, names, poses, noise, mosaic)
+    signal_e = (light * scale_e for light in rendered.views)
+    write_exposures(folder, names, signal_e, sensor, experiment.exposure_s, generator)
+    _write_toml(folder, experiment, names, poses, stated_noise(sensor), mosaic)
 
 
 def _write_noise_free_set(

@@ -13,9 +13,8 @@ from rich.table import Table
 from pipelines.console import console, say
 from pipelines.errors import BadValue, WrongUsage
 from pipelines.toml_files import read_toml
-from rig.opening import open_stage
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
+from rig.errors import StageUnfit
+from rig.opening import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from rig.simulation.controller.server import serving
 from rig.stages.conformance import Check, conformance
 from rig.stages.gantry import Gantry
@@ -35,27 +34,35 @@ class Connection:
     port
         Serial device, pyserial URL, or simulated:grbl, simulated:marlin.
     protocol
-        What the controller speaks.
+        What the controller at the port speaks; grbl by default.
     baud
-        Bits per second.
+        Bits per second; 115200 by default.
     rig
         Take the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
     """
 
     port: str | None = None
-    protocol: Literal["grbl", "marlin"] = "grbl"
-    baud: int = 115200
+    protocol: Literal["grbl", "marlin"] | None = None
+    baud: int | None = None
     rig: Path | None = None
 
     def settings(self) -> StageSettings:
         """Return the settings of the stage that is meant."""
+        stated = [name for name in ("port", "protocol", "baud") if getattr(self, name) is not None]
         if self.rig is not None:
+            if stated:
+                raise WrongUsage(f"--rig says all there is to say of the stage; leave out --{stated[0]}, or --rig")
             return stage_table(self.rig)
         if self.port is None:
             raise WrongUsage(
                 "no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml"
             )
-        return StageSettings(protocol=self.protocol, port=self.port, baud=self.baud)
+        if self.port.startswith(SIMULATED):
+            if self.protocol is not None:
+                raise WrongUsage(f"--port {self.port} says what it speaks; leave out --protocol")
+            if self.port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
+                raise WrongUsage(f"--port {self.port}: simulated are {', '.join(SIMULATED_FIRMWARE)}")
+        return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
 
 
 class _RigFile(msgspec.Struct):
@@ -150,13 +157,25 @@ def jog(
 
 @app.command(name="test")
 def conform(connection: Connection = Connection()) -> list[Check]:
-    """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves."""
+    """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves.
+
+    Raises
+    ------
+    StageUnfit
+        Something was not as it must be; the table says what.
+    """
     with _connected(connection) as stage:
         checks = []
         for check in conformance(stage):
-            say(f"{'passed' if check.passed else 'FAILED'}: {check.name}")
+            say(f"tried: {check.name}")
             checks.append(check)
     console.print(_table(checks))
+    failed = [check for check in checks if not check.passed]
+    if failed:
+        raise StageUnfit(
+            "; ".join(f"{check.name}: {check.measured}, and {check.limit} is asked for" for check in failed)
+            + "; mend that before a capture (docs/stage.md)"
+        )
     return checks
 
 
@@ -171,7 +190,7 @@ def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0
     speed
         How many simulated seconds pass in a real one.
     """
-    with serving(SimulatedGrbl if protocol == "grbl" else SimulatedMarlin) as server:
+    with serving(SIMULATED_FIRMWARE[protocol]) as server:
         say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
         with suppress(KeyboardInterrupt):
             server.run(speed)

@@ -66,15 +66,16 @@ class DataFit:
         """Return about `Hᵀ[ (H 1)/(H f + b + σ²) ]` > 0 (row, column), without a pass over the data.
 
         These are the row sums of the Hessian that L has on average, and bound it: `xᵀ(∇²L)x ≤ Σ w x²`, because the
-        weights of H are not negative. Data scatter about their average, and light is taken for what the plane has at
-        the sample and its neighbours, so that a solver still has to see to its descent.
+        weights of H are not negative. The inverse variance is averaged over a sample's neighbours, which is no less
+        than what pixels between them have. Data scatter about their average, so that a solver still has to see to its
+        descent.
         """
         likelihood = self._images.likelihood
         fixed = likelihood.name == "least-squares"
-        light_e = likelihood.level_e if fixed else np.maximum(blurred(plane, (1,)), self._least_light_e)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            response = np.where(self.sensitivity > 0, self._coverage / self.sensitivity, 1)
-        metric = self._coverage / (light_e * response + self._known_e2)
+        light_e = np.full_like(plane, likelihood.level_e) if fixed else np.maximum(plane, self._least_light_e)
+        response = np.ones_like(self._coverage)
+        np.divide(self._coverage, self.sensitivity, out=response, where=self.sensitivity > 0)
+        metric = self._coverage * blurred(1 / (light_e * response + self._known_e2), (1,))
         return np.asarray(np.maximum(metric, _LEAST_METRIC * np.median(metric)), plane.dtype)
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:

@@ -16,6 +16,9 @@ from recon.solvers import smooth_start
 # One view in so many is held out.
 _HELD_OUT = 7
 
+# So many numbers are predicted at least, by several folds if need be: the score of a few is mostly chance.
+_LEAST_PREDICTED = 2e6
+
 # With fewer views than this there is too little to predict, and too little to predict it from.
 LEAST_VIEWS = 4
 
@@ -35,7 +38,7 @@ class Scored:
     weight : float
         β for all views.
     held_out : float
-        Negative log-likelihood of the views held out, under the plane of the others.
+        Negative log-likelihood of the views held out, under the plane of the others; the sum over the folds.
     """
 
     weight: float
@@ -70,10 +73,15 @@ def held_out_views(views: int, fold: int = 0) -> NDArray[np.intp]:
     In every seven views one is held out, three places further on each time: on a grid of seven columns, one in each row
     and one in each column.
     """
-    folds = max(2, min(_HELD_OUT, views // 2))
+    folds = _folds(views)
     index = np.arange(views)
     stride = 1 if folds % 3 == 0 else 3
     return np.flatnonzero(index % folds == (stride * (index // folds) + fold) % folds)
+
+
+def _folds(views: int) -> int:
+    """Return into how many folds views are divided."""
+    return max(2, min(_HELD_OUT, views // 2))
 
 
 def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float, penalty: Penalty) -> ChosenWeight:
@@ -100,8 +108,10 @@ def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float
     count = len(operator.all_views)
     if count < LEAST_VIEWS:
         raise ValueError(f"need at least {LEAST_VIEWS} views to hold some out, got {count}")
-    out = held_out_views(count)
-    search = _Search(operator, images, guess, penalty, np.setdiff1d(operator.all_views, out), out)
+    pixels_of_fold = images.electrons.size / _folds(count)
+    needed = min(int(np.ceil(_LEAST_PREDICTED / pixels_of_fold)), _folds(count))
+    outs = [held_out_views(count, fold) for fold in range(needed)]
+    search = _Search([_Fold(operator, images, penalty, out) for out in outs], guess)
     step = 1
     search.score(step)
     while step > -_STEPS and search.best() <= step + 1:
@@ -114,43 +124,51 @@ def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float
     return search.result()
 
 
-class _Search:
-    """Candidates β = guess · factorⁿ, and how they score."""
+class _Fold:
+    """The views that are kept, those held out, and the solutions so far."""
 
     def __init__(
-        self,
-        operator: PlaneOperator,
-        images: ElementalImages,
-        guess: float,
-        penalty: Penalty,
-        kept: NDArray[np.intp],
-        out: NDArray[np.intp],
+        self, operator: PlaneOperator, images: ElementalImages, penalty: Penalty, out: NDArray[np.intp]
     ) -> None:
-        start = smooth_start(operator, images, kept)
-        level_e = float(start.mean(dtype=np.float64))
+        kept = np.setdiff1d(operator.all_views, out)
+        self._start = smooth_start(operator, images, kept)
+        level_e = float(self._start.mean(dtype=np.float64))
         self._kept, self._out = (DataFit(operator, images, level_e, views) for views in (kept, out))
-        self._share = len(kept) / (len(kept) + len(out))
-        self._guess, self._penalty = guess, penalty
-        self._passes = self._share
-        self._solutions: dict[int, PmlemIterate] = {}
-        self._start = start
-        self.scores: dict[int, float] = {}
+        self._penalty = penalty
+        self._share = len(kept) / len(operator.all_views)
+        self.passes = self._share
+        self.solutions: dict[int, PmlemIterate] = {}
 
-    def score(self, step: int) -> None:
-        """Try the candidate of a step."""
-        weight = self._guess * _FACTOR**step * self._share**0.5
-        near = self._solutions.get(step + 1) or self._solutions.get(step - 1)
-        start = self._start if near is None else np.maximum(near.plane, 1e-3 * self._start)
-        dual = None if near is None else near.dual
+    def score(self, step: int, weight: float) -> float:
+        """Return how well the candidate of a step predicts, solving from its neighbour's solution."""
+        near = self.solutions.get(step + 1) or self.solutions.get(step - 1)
         iterates = pmlem(
-            self._kept, start, penalty_weight=weight, penalty=self._penalty, tolerance=_TOLERANCE, dual=dual
+            self._kept,
+            self._start if near is None else np.maximum(near.plane, 1e-3 * self._start),
+            penalty_weight=weight * self._share**0.5,
+            penalty=self._penalty,
+            tolerance=_TOLERANCE,
+            dual=None if near is None else near.dual,
         )
         for iterate in iterates:
             if iterate.certificate.distance <= _TOLERANCE or iterate.passes >= _PASSES:
                 break
-        self._solutions[step] = iterate
-        self.scores[step] = self._out.value(iterate.plane)
-        self._passes += iterate.passes * self._share + (1 - self._share)
+        self.solutions[step] = iterate
+        self.passes += iterate.passes * self._share + (1 - self._share)
+        return self._out.value(iterate.plane)
+
+
+class _Search:
+    """Candidates β = guess · factorⁿ, and how they score."""
+
+    def __init__(self, folds: list[_Fold], guess: float) -> None:
+        self._folds, self._guess = folds, guess
+        self.scores: dict[int, float] = {}
+
+    def score(self, step: int) -> None:
+        """Try the candidate of a step."""
+        weight = self._guess * _FACTOR**step
+        self.scores[step] = sum(fold.score(step, weight) for fold in self._folds)
 
     def best(self) -> int:
         """Return the step of the candidate that predicts best."""
@@ -162,7 +180,7 @@ class _Search:
         offset = _lowest_offset([self.scores.get(best + n) for n in (-1, 0, 1)])
         tried = tuple(Scored(self._guess * _FACTOR**step, score) for step, score in sorted(self.scores.items()))
         weight = self._guess * _FACTOR ** (best + offset)
-        return ChosenWeight(weight, tried, self._passes, self._solutions[best])
+        return ChosenWeight(weight, tried, sum(fold.passes for fold in self._folds), self._folds[0].solutions[best])
 
 
 def _lowest_offset(scores: Sequence[float | None]) -> float:

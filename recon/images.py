@@ -29,10 +29,14 @@ class Likelihood:
         "poisson" ignores the read noise, and takes negative numbers for zero.
     level_e : float
         Electrons of light at which least squares takes the variance of a pixel of response one; the others ignore it.
+    read_noise_share : float
+        What part of σ² counts as variance where the exact model tells counts apart: a pixel informs of its mean as if
+        its variance were `λ + share · σ²`. Solvers take their metric from it; the likelihood itself does not need it.
     """
 
     name: LikelihoodName = "shifted-poisson"
     level_e: float = 0.0
+    read_noise_share: float = 1.0
 
     @property
     def model(self) -> int:
@@ -89,5 +93,6 @@ class ElementalImages:
                 raise ValueError(f"view {view} has {np.count_nonzero(~finite)} pixels that are not finite numbers")
 
     def known_variance_e2(self) -> float | Image:
-        """Return b + σ², what a pixel's variance has beside that of the light, as far as the likelihood knows it."""
-        return self.background_e + (self.read_variance_e2 if self.likelihood.knows_read_noise else 0.0)
+        """Return b + σ², the variance of a pixel beside that of the light, as far as the likelihood counts it."""
+        share = self.likelihood.read_noise_share if self.likelihood.knows_read_noise else 0.0
+        return self.background_e + share * self.read_variance_e2

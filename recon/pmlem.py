@@ -26,6 +26,9 @@ _ROUNDING = 1e-7
 # The metric is not changed after so many passes, so that the iteration has a limit.
 _PASSES_WITH_NEW_METRIC = 4
 
+# What is left, after a step that was good, of a metric that had to be made larger.
+_RELAXED = 0.7
+
 # A metric this many times the likelihood's curvature is none: the objective must fall long before.
 _LARGEST_SCALE = 2.0**10
 
@@ -170,6 +173,7 @@ class _Pmlem:
                 certificate = self._certificate(plane, gradient, metric, dual)
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
+                self._scale = max(self._scale * _RELAXED, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
                     metric = self._fit.metric(plane)
             else:

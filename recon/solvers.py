@@ -60,5 +60,5 @@ def universal_penalty_weight(operator: PlaneOperator, images: ElementalImages, p
     """
     sensitivity = operator.sensitivity()
     seen = well_seen_samples(sensitivity)
-    per_view_e = plane[seen].mean() + np.mean(images.background_e) + np.mean(images.read_variance_e2)
+    per_view_e = plane[seen].mean() + np.mean(images.known_variance_e2())
     return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))

@@ -6,6 +6,7 @@ RigError
 │   ├── StageTimeout
 │   ├── StageLost
 │   ├── StageRejected
+│   ├── StageUnfit
 │   └── PositionLost
 │       └── PositionDrifted
 ├── PlanRefused
@@ -69,6 +70,12 @@ class StageLost(StageError):
 
 class StageRejected(StageError):
     """The controller refused a command; nothing moved."""
+
+    position_kept = True
+
+
+class StageUnfit(StageError):
+    """The stage does what it is told, but not well enough for a capture."""
 
     position_kept = True
 

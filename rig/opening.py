@@ -25,7 +25,9 @@ from rig.stages.opening import stage_from
 from rig.stages.settings import StageSettings
 from rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
 
-_SIMULATED = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+# A port that begins so is a simulated stage; what follows names its controller.
+SIMULATED = "simulated:"
+SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 
 
 @dataclass(frozen=True)
@@ -105,15 +107,15 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench
 
 def _is_simulated(settings: StageSettings) -> bool:
     """Return whether the stage that `settings` describe exists in the computer alone."""
-    return settings.protocol == "simulated" or settings.port.startswith("simulated:")
+    return settings.protocol == "simulated" or settings.port.startswith(SIMULATED)
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:
     """Return the bench of the simulated stage that `settings` name."""
     name = settings.port.partition(":")[2] or "grbl"
-    if name not in _SIMULATED:
-        raise PlanRefused(f"{settings.port}: no such stage is simulated; there are {', '.join(_SIMULATED)}")
-    return Bench(_SIMULATED[name])
+    if name not in SIMULATED_FIRMWARE:
+        raise PlanRefused(f"{settings.port}: no such stage is simulated; there are {', '.join(SIMULATED_FIRMWARE)}")
+    return Bench(SIMULATED_FIRMWARE[name])
 
 
 def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:

@@ -1,7 +1,7 @@
 """Geometry of the rig from corners: solve, state the uncertainty, and refuse what the corners cannot carry."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,16 @@ from calib.board import Board
 from calib.errors import PoorFit, TooFewViews
 from calib.geometry.bundle import LENS_MODELS, Bundle, Problem, solve
 from calib.geometry.covariance import Uncertainty, uncertainty
-from calib.geometry.gates import require_determined
+from calib.geometry.doubts import doubtful_views
+from calib.geometry.gates import lacks, require_determined
 from calib.geometry.holdout import holdout_ratio
-from calib.geometry.observations import BoardObservation, Node, gather
+from calib.geometry.observations import BoardObservation, Node, Observations, gather
 from calib.geometry.rig_geometry import BoardPose, RigGeometry
 from calib.lens import Lens
 
-# Every corner thrown away is one the model did not explain.
-_MOST_OUTLIERS = 0.1
+# Larger residuals are of no board.
+_MOST_RESIDUAL_PX = 5.0
+_REMEDY = "check columns, rows and first_marker_id of every [[board]] against the print, and the node of every image"
 
 
 @dataclass(frozen=True)
@@ -89,11 +91,14 @@ def calibrate_geometry(
     one_shape = len({board.corner_shape for board in named}) == 1
     problem = Problem(gathered, size_px, _square_mm(named), settings.lens_model, with_warp=one_shape)
     bundle = _solved(problem)
+    doubts = doubtful_views(bundle, gathered)
     known = uncertainty(bundle, gathered)
-    geometry = _geometry(problem, bundle, known, holdout=None)
+    geometry = replace(_geometry(problem, bundle, known), doubts=doubts)
+    if not lacks(geometry, gathered, max(settings.depths_mm)):  # a set that lacks something may end anywhere
+        _require_residuals(bundle, gathered)
     require_determined(geometry, gathered, settings.depths_mm, settings.most_transfer_sigma_px)
-    geometry = _geometry(problem, bundle, known, holdout_ratio(bundle, gathered))
-    _require_fit(geometry, settings.most_holdout_ratio)
+    geometry = replace(geometry, holdout_ratio=holdout_ratio(bundle, gathered))
+    _require_fit(geometry.holdout_ratio, settings.most_holdout_ratio)
     return geometry
 
 
@@ -106,14 +111,26 @@ def _square_mm(boards: Sequence[Board]) -> float:
 
 def _solved(problem: Problem) -> Bundle:
     try:
-        return solve(problem)
+        bundle = solve(problem)
     except RuntimeError as failure:
+        raise PoorFit(f"the bundle adjustment does not converge ({failure}); {_REMEDY}") from failure
+    if not (np.isfinite(bundle.intrinsics).all() and bundle.intrinsics[:2].min() > 0):
+        raise PoorFit(f"the corners fit no lens (focal length {bundle.intrinsics[:2].min():.3g} px); {_REMEDY}")
+    return bundle
+
+
+def _require_residuals(bundle: Bundle, observations: Observations) -> None:
+    """Refuse residuals that no board leaves, and name the worst view."""
+    square = np.square(bundle.residuals()).sum(axis=(1, 2, 3)) / (2 * np.maximum(bundle.inlier.sum(axis=(1, 2)), 1))
+    rms_px = float(np.sqrt(np.square(bundle.residuals()[bundle.inlier]).mean()))
+    if not rms_px <= _MOST_RESIDUAL_PX:
+        worst = observations.view_name(int(np.argmax(square)))
         raise PoorFit(
-            f"the bundle adjustment does not converge ({failure}); check rows, columns and node of every image"
-        ) from failure
+            f"the corners fit to {rms_px:.3g} px only, limit {_MOST_RESIDUAL_PX:g} px, worst at {worst}; {_REMEDY}"
+        )
 
 
-def _geometry(problem: Problem, bundle: Bundle, known: Uncertainty, holdout: float | None) -> RigGeometry:
+def _geometry(problem: Problem, bundle: Bundle, known: Uncertainty) -> RigGeometry:
     """Put the solution in raster order of the nodes."""
     observations = problem.observations
     order = sorted(range(len(observations.nodes)), key=lambda index: observations.nodes[index])
@@ -134,7 +151,7 @@ def _geometry(problem: Problem, bundle: Bundle, known: Uncertainty, holdout: flo
         rms_mrcal_px=float(np.sqrt(squares / bundle.inlier.size)),
         corners=inliers,
         outliers=observations.corner_count - inliers,
-        holdout_ratio=holdout,
+        holdout_ratio=None,
         repeatability=known.repeatability,
     )
 
@@ -154,15 +171,8 @@ def _lens_and_poses(bundle: Bundle, covariance: NDArray[np.float64], order: list
     return result
 
 
-def _require_fit(geometry: RigGeometry, most_holdout_ratio: float) -> None:
-    """Refuse a fit that throws many corners away or does not explain boards that it has not seen."""
-    share = geometry.outliers / (geometry.outliers + geometry.corners)
-    if share > _MOST_OUTLIERS:
-        raise PoorFit(
-            f"{share:.0%} of the corners disagree with the fit, limit {_MOST_OUTLIERS:.0%}; "
-            "check that every image has its right node and sweep, and that no board moved within a sweep"
-        )
-    ratio = geometry.holdout_ratio
+def _require_fit(ratio: float | None, most_holdout_ratio: float) -> None:
+    """Refuse a fit that does not explain boards that it has not seen."""
     if ratio is not None and ratio > most_holdout_ratio:
         raise PoorFit(
             f"boards left out of the fit are off by {ratio:.2f} times its residual, limit {most_holdout_ratio}; "

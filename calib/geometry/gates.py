@@ -17,6 +17,7 @@ _LEAST_TILT_RAD = np.radians(15)
 _LEAST_COVERAGE = 0.5
 _FARTHEST_OVER_DEPTH = 2.0
 _COVERAGE_CELLS = 6
+_MORE = "show more boards, nearer and tilted about both axes, or raise --limit-px"
 
 
 def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.float64]:
@@ -52,11 +53,11 @@ def require_determined(
             raise NotIdentifiable(
                 f"plane at {depth_mm:g} mm: its transfer between views is known to {sigma_px:.3g} px only, "
                 f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
-                f"{'; '.join(_lacks(geometry, observations, depth_mm))}"
+                f"{'; '.join(lacks(geometry, observations, depth_mm) or [_MORE])}"
             )
 
 
-def _lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
+def lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
     """Return what the set lacks, each with what to add."""
     found = []
     boards = geometry.boards
@@ -78,7 +79,7 @@ def _lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -
     coverage = _coverage(observations, geometry.lens.size_px)
     if coverage < _LEAST_COVERAGE:
         found.append(f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones")
-    return found or ["show more boards, nearer and tilted about both axes, or raise --limit-px"]
+    return found
 
 
 def _tilt_rad(rt_ref_board: NDArray[np.float64]) -> float:

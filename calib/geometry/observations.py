@@ -77,16 +77,11 @@ class Observations:
         """How many corners were seen."""
         return int((self.weights > 0).sum())
 
-    def of_views(self, chosen: NDArray[np.bool_]) -> "Observations":
-        """Return the same nodes and targets with only some of the views (view,)."""
-        return Observations(
-            self.nodes,
-            self.targets,
-            self.node_of[chosen],
-            self.target_of[chosen],
-            self.pixels[chosen],
-            self.weights[chosen],
-        )
+    def view_name(self, view: int) -> str:
+        """Return words for one of the views."""
+        target = self.targets[self.target_of[view]]
+        sweep = f", sweep {target.sweep}" if len({one.sweep for one in self.targets}) > 1 else ""
+        return f"node {self.nodes[self.node_of[view]]}, board '{target.board}'{sweep}"
 
 
 def gather(
@@ -107,6 +102,8 @@ def gather(
     ------
     TooFewViews
         The reference node saw no board.
+    ValueError
+        A corner is none of its board.
     """
     useful = [seen for seen in observations if len(seen.corners) >= _FEWEST_CORNERS and _spread(seen, corner_shapes)]
     nodes = _connected_nodes(useful, reference)
@@ -123,6 +120,10 @@ def gather(
     typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in kept])))
     for view, seen in enumerate(kept):
         row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
+        if row.max() >= corner_shapes[seen.target.board][0]:
+            raise ValueError(
+                f"board '{seen.target.board}' has no corner {seen.corners.max()}; give the board as printed"
+            )
         pixels[view, row, column] = seen.pixels
         weights[view, row, column] = typical_px / seen.sigma_px
     node_of = np.array([nodes.index(seen.node) for seen in kept], np.int32)

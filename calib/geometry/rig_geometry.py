@@ -1,6 +1,6 @@
 """The result: the lens, the poses, the boards, and the covariance of all that a reconstruction uses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -68,6 +68,8 @@ class RigGeometry:
         Residual of boards that had no part in the fit over that of the fit; None with a single board pose.
     repeatability : Repeatability, optional
         Of the gantry between sweeps; None with a single sweep.
+    doubts : list of str
+        Views that disagree with the rest, and what to do about them.
     """
 
     lens: Lens
@@ -85,6 +87,7 @@ class RigGeometry:
     outliers: int
     holdout_ratio: float | None
     repeatability: Repeatability | None
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:

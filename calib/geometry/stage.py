@@ -1,11 +1,12 @@
 """What the poses say of the gantry: scale, squareness, backlash, tilt, and where each node really was."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.geometry.doubts import doubtful_scale, nodes_elsewhere
 from calib.geometry.observations import Node
 from calib.geometry.rig_geometry import RigGeometry
 
@@ -44,6 +45,8 @@ class StageReport:
         Of the nodes from the regular grid that fits best, in three dimensions.
     residuals_mm : list of (float, float, float)
         The same per node, in the grid's x, y and normal.
+    doubts : list of str
+        Nodes that lie where others belong, and distances that no stage gets so wrong.
     """
 
     pitch_x_mm: Estimate
@@ -56,6 +59,7 @@ class StageReport:
     tilt_rad: Estimate
     node_residual_rms_mm: Estimate
     residuals_mm: list[tuple[float, float, float]]
+    doubts: list[str] = field(default_factory=list)
 
 
 def approach_directions(visits: Sequence[tuple[Node, int]]) -> dict[Node, tuple[float, float]]:
@@ -119,18 +123,29 @@ def stage_report(
     pitch_x, pitch_y = (_pitch(estimate, axis) for axis in (0, 1))
     freedom = max(residuals.size - solution.size, 1)
     rms_mm = float(np.sqrt(3 * (residuals**2).sum() / freedom))
+    scales = [_scale(pitch, pitch_mm) for pitch in (pitch_x, pitch_y)]
     return StageReport(
         pitch_x_mm=pitch_x,
         pitch_y_mm=pitch_y,
-        scale_x=_scale(pitch_x, pitch_mm),
-        scale_y=_scale(pitch_y, pitch_mm),
+        scale_x=scales[0],
+        scale_y=scales[1],
         squareness_rad=estimate(_squareness_rad),
         backlash_x_mm=_backlash(estimate, 0, told),
         backlash_y_mm=_backlash(estimate, 1, told),
         tilt_rad=estimate(_tilt_rad),
         node_residual_rms_mm=Estimate(rms_mm, float(rms_mm / np.sqrt(2 * freedom))),
         residuals_mm=[(x, y, z) for x, y, z in (residuals @ _grid_axes(solution).T).tolist()],
+        doubts=nodes_elsewhere(geometry.nodes, centres) or _doubtful_scales(scales),
     )
+
+
+def _doubtful_scales(scales: Sequence[Estimate]) -> list[str]:
+    """Return a word on each axis along which the stage cannot be so wrong."""
+    words = []
+    for axis, scale in zip(_AXES, scales, strict=True):
+        if scale.value is not None and scale.sigma is not None:
+            words += doubtful_scale(axis, scale.value, scale.sigma)
+    return words
 
 
 class _Propagated:

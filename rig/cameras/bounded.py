@@ -1,8 +1,8 @@
 """Calls into camera libraries that may never come back, with an end to the waiting."""
 
-import queue
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 
 from rig.errors import CameraTimeout
 
@@ -22,21 +22,18 @@ def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
     what : str
         What it does, for the message.
     """
-    outcome: queue.SimpleQueue[tuple[T | None, BaseException | None]] = queue.SimpleQueue()
+    outcome: Future[T] = Future()
 
     def work() -> None:
         try:
-            outcome.put((call(), None))
+            outcome.set_result(call())
         except BaseException as failure:
-            outcome.put((None, failure))
+            outcome.set_exception(failure)
 
     threading.Thread(target=work, daemon=True, name="camera").start()
-    try:
-        value, failure = outcome.get(timeout=bound_s)
-    except queue.Empty:
+    wait([outcome], bound_s)
+    if not outcome.done():
         raise CameraTimeout(
             f"the camera did not finish {what} within {bound_s:g} s; check its cable and battery, switch it off and on"
-        ) from None
-    if failure is not None:
-        raise failure
-    return value  # type: ignore[return-value]
+        )
+    return outcome.result()

@@ -1,5 +1,6 @@
 """Scientific cameras through Micro-Manager's device adapters."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ class MicroManagerCamera:
 
     def report(self) -> CameraReport:
         """Return name, frame size and the camera's properties."""
-        return self._bounded(self._read_report, "reporting its properties")  # type: ignore[no-any-return]
+        return self._bounded(self._read_report, "reporting its properties")
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
@@ -63,7 +64,7 @@ class MicroManagerCamera:
             except (CameraError, RuntimeError):
                 pass  # whatever is wrong with it was reported when it was used
 
-    def _bounded(self, call: Any, what: str, bound_s: float = 0.0) -> Any:
+    def _bounded[T](self, call: Callable[[], T], what: str, bound_s: float = 0.0) -> T:
         """Make a call within its bound, its failures in words."""
         if self._core is None:
             raise CameraError("the camera is not connected; open it first")

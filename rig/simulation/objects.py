@@ -1,4 +1,4 @@
-"""The toys of the simulated experiment, drawn with their markings: a truck from the side, an airplane from above."""
+"""The objects of the simulated experiments: toys with their markings, a chart of fine detail, a ball of soft shades."""
 
 import cv2
 import numpy as np
@@ -113,3 +113,28 @@ def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
     canvas.text("FAINT", -42, 4.2, 8, _BLUE)
     canvas.ellipse(126, 0, 7, 8, _RED)
     return canvas.plane("airplane", x_mm, y_mm, depth_mm, shading=0.2)
+
+
+def star_chart(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.0, spokes: int = 24) -> TexturedPlane:
+    """Return a Siemens star on a white disc, at x, y and a depth: full contrast at every fineness."""
+    canvas = _Canvas(2.1 * radius_mm, 2.1 * radius_mm)
+    canvas.ellipse(0, 0, radius_mm, radius_mm, _WHITE)
+    for angle in 2 * np.pi * np.arange(spokes) / spokes:
+        edges = angle + np.pi / spokes * np.array([-0.5, 0.5])
+        corners = [(0.92 * radius_mm * np.cos(edge), 0.92 * radius_mm * np.sin(edge)) for edge in edges]
+        canvas.polygon([(0.0, 0.0), *corners], _DARK)
+    return canvas.plane("star", x_mm, y_mm, depth_mm, shading=0.0)
+
+
+def shaded_ball(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.0) -> TexturedPlane:
+    """Return the picture of a ball lit from the upper left, at x, y and a depth: soft shades, no edge but its rim."""
+    side = round(2.1 * radius_mm / _TEXTURE_PITCH_MM)
+    y, x = (np.mgrid[:side, :side] - (side - 1) / 2) * (_TEXTURE_PITCH_MM / radius_mm)
+    squared = x**2 + y**2
+    towards = np.sqrt(np.maximum(1 - squared, 0))
+    lit = np.maximum((-0.45 * x - 0.45 * y + 0.77 * towards), 0)
+    reflectance = np.clip(0.12 + 0.72 * lit + 0.16 * lit**12, 0, 1).astype(np.float32)
+    rim = (1 - np.sqrt(squared)) * radius_mm / _TEXTURE_PITCH_MM + 0.5
+    colour = np.repeat(reflectance[:, :, np.newaxis], 3, axis=2)
+    opacity = np.clip(rim, 0, 1).astype(np.float32)
+    return TexturedPlane("ball", colour, opacity, _TEXTURE_PITCH_MM, (0, 0, 0, x_mm, y_mm, depth_mm))

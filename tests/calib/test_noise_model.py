@@ -75,4 +75,5 @@ def test_numbers_of_no_sensor_are_refused_by_name(name: str, value: Any) -> None
 
 
 def test_the_limits_themselves_are_allowed() -> None:
-    NoiseModel(-5.0, 1e-3, 0.0, 0.0, quantum_efficiency=1.0)
+    model = NoiseModel(-5.0, 1e-3, 0.0, 0.0, quantum_efficiency=1.0)
+    assert (model.offset_dn, model.gain_dn_per_e, model.quantum_efficiency) == (-5.0, 1e-3, 1.0)

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from pipelines import cli
+from rig.stages.conformance import Check
 
 RIG = """
 [stage]
@@ -74,7 +75,6 @@ def test_goto_needs_homing(shell: Shell) -> None:
         (("jog", "1", "1"), "StageAlarm"),
         (("jog", "50", "0", "--unlock"), "OutsideTravel"),
         (("home", "--port", "/dev/no-such-port"), "StageLost"),
-        (("home", "--port", "simulated:plotter"), "PlanRefused"),
         (("home", "--rig", "no-such.toml"), "MissingFile"),
     ],
 )
@@ -96,6 +96,22 @@ def test_wrong_usage(shell: Shell) -> None:
     assert shell.run("info", "--protocol", "klipper", "--port", "x") == 2
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--port", "simulated:plotter"), "grbl, marlin"),
+        (("--port", "simulated:grbl", "--protocol", "marlin"), "leave out --protocol"),
+        (("--rig", "rig.toml", "--port", "/dev/ttyUSB0"), "leave out --port"),
+        (("--rig", "rig.toml", "--baud", "9600"), "leave out --baud"),
+    ],
+)
+def test_options_that_contradict_each_other_are_wrong_usage(
+    shell: Shell, arguments: tuple[str, ...], said: str
+) -> None:
+    assert shell.run("info", *arguments) == 2
+    assert said in shell.words
+
+
 def test_jog(shell: Shell) -> None:
     position = shell.result("jog", "-1", "-2", "--unlock", "--port", "simulated:grbl")
     assert position["point"] == [-1.0, -2.0]
@@ -110,6 +126,13 @@ def test_the_conformance_list(shell: Shell, stage: str) -> None:
     ]  # fmt: skip
     assert all(check["passed"] for check in checks)
     assert "repeatability" in shell.words
+
+
+def test_a_stage_that_fails_a_check_ends_with_a_named_failure(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Check("homing", True, "2 s", "60 s"), Check("speed", False, "3 mm/s", "at least 50 mm/s")]
+    monkeypatch.setattr("pipelines.stage.conformance", lambda stage: iter(found))
+    assert shell.run("test", "--port", "simulated:grbl") == 1
+    assert "StageUnfit: speed: 3 mm/s, and at least 50 mm/s is asked for" in shell.words
 
 
 def test_a_rig_file_brings_its_limits(shell: Shell, tmp_path: Path) -> None:

@@ -224,3 +224,52 @@ def test_settings_that_cannot_be_are_refused() -> None:
         GeometrySettings(lens_model="fisheye")
     with pytest.raises(ValueError, match="positive"):
         GeometrySettings(depths_mm=(0.0,))
+
+
+def test_a_shaken_view_is_named_and_does_not_pull() -> None:
+    given, generator = simulated(14), np.random.default_rng(1)
+    shaken = [
+        replace(one, pixels=one.pixels + generator.normal([3.0, 1.0], 1.5, one.pixels.shape))
+        if (one.node, one.target.board) == ((0, 0), "board-1")
+        else one
+        for one in given.observations
+    ]
+    geometry = calibrated(replace(given, observations=shaken))
+    (doubt,) = geometry.doubts
+    assert "at node (0, 0), board 'board-1' (" in doubt
+    assert "node (0, 0), board 'board-2'" not in doubt
+    assert np.abs(centres_mm(geometry.rt_cam_ref) - centres_mm(given.poses)).max() < 0.5
+    assert calibrated(given).doubts == []
+
+
+def test_one_view_of_another_node_is_named() -> None:
+    given = simulated(15)
+    elsewhere = next(one for one in given.observations if (one.node, one.target.board) == ((2, 2), "board-3"))
+    labelled = [
+        replace(elsewhere, node=one.node) if (one.node, one.target.board) == ((0, 1), "board-3") else one
+        for one in given.observations
+    ]
+    with pytest.raises(PoorFit, match=r"worst at node \(0, 1\), board 'board-3'; check .*the node of every image"):
+        calibrated(replace(given, observations=labelled))
+
+
+def test_nodes_swapped_in_one_sweep_are_refused_by_name() -> None:
+    given, other = simulated(16), {(0, 0): (0, 1), (0, 1): (0, 0)}
+    swapped = [
+        replace(one, node=other.get(one.node, one.node)) if one.target.board == "board-0" else one
+        for one in given.observations
+    ]
+    with pytest.raises(
+        PoorFit, match=r"% of the corners disagree .*node \(0, [01]\).*check that every image has its right"
+    ):
+        calibrated(replace(given, observations=swapped))
+
+
+def test_a_board_that_is_not_the_print_is_refused() -> None:
+    given = simulated(17)
+    wider = {name: replace(board, columns=10) for name, board in BOARDS.items()}
+    with pytest.raises(PoorFit, match=r"check columns, rows and first_marker_id of every \[\[board\]\]"):
+        calibrate_geometry(wider, given.observations, OPTICS.size_px, given.reference)
+    narrower = {name: replace(board, columns=8) for name, board in BOARDS.items()}
+    with pytest.raises(ValueError, match="has no corner 47; give the board as printed"):
+        calibrate_geometry(narrower, given.observations, OPTICS.size_px, given.reference)

@@ -1,0 +1,220 @@
+"""Where the corner of a chessboard is, to a small part of a pixel, and how well that is known.
+
+Two edges cross in a corner, each blurred by lens and pixel. With t along an edge and n across it, from the corner,
+
+    I(u) = a + c f₁ f₂,      fᵢ = erf(dᵢ / √2 s),      dᵢ = nᵢ − κᵢ tᵢ² / 2,
+
+is fitted to the pixels beside the edges by weighted least squares: nine numbers per corner, its place, the directions
+and bends of its edges, the blur, and two levels. Every pixel weighs by its own noise, which grows with the light; the
+inverse of the normal matrix is the covariance.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import erf
+
+type Array = NDArray[np.float64]
+type Pixels = NDArray[np.floating]  # single precision: a fit corrects its own rounding in the next step
+
+# A corner's numbers: x, y, two directions (rad), two bends (1/px), the blur's logarithm (px), a, c.
+_PLACE, _ANGLES, _BENDS, _BLUR, _LEVEL, _CONTRAST = slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, 8
+_COUNT = 9
+
+# The window: along an edge, and to its sides. Longer, and what lens and print do to edges counts more than noise.
+_MOST_ALONG_PX, _MOST_ACROSS_PX, _LEAST_ACROSS_PX = 10.0, 5.0, 1.5
+_CLEAR_OF_NEXT_CORNER = 0.75  # in squares
+_BLUR_OF_MARKERS_PX = 1.0
+
+# What is known before the fit: edges turn by this over the image's width (rad), and lenses blur by about this.
+_BEND_SD = 0.25
+_BLUR_PX, _LOG_BLUR_SD = 0.7, 0.6
+_FIRST_BLUR_PX = 1.2  # wider than most, so that edges which are still apart attract each other
+_PIXEL_VARIANCE = 1 / 12  # px²: a pixel is the mean over its area
+
+# First in windows about the guesses, then about what was found there.
+_MOST_STEPS = (8, 4)
+_SETTLED_PX = 1e-4
+_LARGEST_STEP = np.array([0.7, 0.7, 0.1, 0.1, 0.01, 0.01, 0.25, np.inf, np.inf])
+
+# A corner that is farther than this from its guess, or whose contrast is less than this over its own σ, is none.
+_FARTHEST_PX, _FAINTEST = 4.0, 4.0
+_FEWEST_PIXELS = 24
+
+_FLAT = 0.9  # from where on |f₁ f₂| is one of the two levels
+_LEAST_NOISE = 1e-3  # of the contrast, for pictures without any
+
+# Below this, what counts is the lens and the print, not the noise.
+_FLOOR_PX = 0.01
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Pixels about each corner: where they are (corner, pixel, 2), their values, and which count (corner, pixel)."""
+
+    places: Pixels
+    values: Pixels
+    counts: NDArray[np.bool_]
+
+
+def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array, clear: float) -> tuple[Array, Array]:
+    """Return where corners are, and their standard deviations per axis.
+
+    Parameters
+    ----------
+    image : array (row, column)
+        Linear in the light, in any unit.
+    guesses : array (corner, 2)
+        Column, row, within a few pixels of the corners.
+    squares_px : array (corner, 2, 2)
+        How one square is seen there: the step along the board's rows, then that along its columns.
+    clear : float
+        To how far from an edge nothing but its two squares is seen, in squares.
+
+    Returns
+    -------
+    points : array (corner, 2)
+        NaN where no corner is found near the guess.
+    sigma_px : array (corner,)
+        From the noise of the flat pixels beside the edges; NaN likewise.
+    """
+    if not len(guesses):
+        return np.empty((0, 2)), np.empty(0)
+    state = _start(guesses, squares_px)
+    for index, most_steps in enumerate(_MOST_STEPS):
+        windows = _windows(image, guesses, state[:, _PLACE], squares_px, clear)
+        if index == 0:
+            _set_levels(state, windows)
+        for _ in range(most_steps):
+            step, normal = _step(state, windows, image.shape[1])
+            state += np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
+            if np.abs(step[:, _PLACE]).max() < _SETTLED_PX:
+                break
+    points = guesses + state[:, _PLACE]
+    variances = np.diagonal(np.linalg.inv(normal), axis1=1, axis2=2)
+    found = (
+        (np.abs(state[:, _PLACE]).max(axis=1) <= _FARTHEST_PX)
+        & (np.abs(state[:, _CONTRAST]) >= _FAINTEST * np.sqrt(variances[:, _CONTRAST]))
+        & (windows.counts.sum(axis=1) >= _FEWEST_PIXELS)
+        & ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
+    )
+    sigma_px = np.hypot(np.sqrt(variances[:, _PLACE].mean(axis=1)), _FLOOR_PX)
+    return np.where(found[:, np.newaxis], points, np.nan), np.where(found, sigma_px, np.nan)
+
+
+def _start(guesses: Array, squares_px: Array) -> Array:
+    """Return each corner's numbers (corner, 9) before the fit, its place counted from the guess."""
+    state = np.zeros((len(guesses), _COUNT))
+    state[:, _ANGLES] = np.arctan2(squares_px[..., 1], squares_px[..., 0])
+    state[:, _BLUR] = np.log(_FIRST_BLUR_PX)
+    return state
+
+
+def _windows(image: Pixels, guesses: Array, found: Array, squares_px: Array, clear: float) -> _Windows:
+    """Cut a cross of pixels along the edges about what was found (corner, 2), counted from the guesses."""
+    sides = np.linalg.norm(squares_px, axis=2)
+    heights = np.abs(np.linalg.det(squares_px))[:, np.newaxis] / sides
+    along = np.minimum(_CLEAR_OF_NEXT_CORNER * sides, _MOST_ALONG_PX)
+    across = np.clip(clear * heights - _BLUR_OF_MARKERS_PX, _LEAST_ACROSS_PX, _MOST_ACROSS_PX)
+    reach = np.arange(-int(along.max()) - 1, int(along.max()) + 2)
+    offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
+    whole = np.rint(guesses + np.clip(found, -_FARTHEST_PX, _FARTHEST_PX)).astype(int)[:, np.newaxis] + offsets
+    limits = np.array(image.shape[::-1]) - 1
+    columns, rows = np.moveaxis(np.clip(whole, 0, limits), -1, 0)
+    places = whole - guesses[:, np.newaxis]
+    cos, sin = np.moveaxis(squares_px / sides[..., np.newaxis], -1, 0)[..., np.newaxis]
+    x, y = np.moveaxis(places - found[:, np.newaxis], -1, 0)[:, :, np.newaxis]
+    beside = (np.abs(x * cos + y * sin) <= along[..., np.newaxis]) & (
+        np.abs(y * cos - x * sin) <= across[..., np.newaxis]
+    )
+    inside = ((whole >= 0) & (whole <= limits)).all(axis=2)
+    return _Windows(places.astype(np.float32), image[rows, columns], beside.any(axis=1) & inside)
+
+
+def _set_levels(state: Array, windows: _Windows) -> None:
+    """Set a and c to the line through pixels against pattern."""
+    pattern = _edges(state, windows).pattern
+    share = windows.counts / np.maximum(windows.counts.sum(axis=1, keepdims=True), 1)
+    middle, level = ((share * what).sum(axis=1, keepdims=True) for what in (pattern, windows.values))
+    slope = (share * (pattern - middle) * windows.values).sum(axis=1)
+    state[:, _CONTRAST] = slope / np.maximum((share * np.square(pattern - middle)).sum(axis=1), 1e-12)
+    state[:, _LEVEL] = level[:, 0] - state[:, _CONTRAST] * middle[:, 0]
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Of both edges of each corner (2, corner, pixel): distance along, across, f and its derivative by d."""
+
+    along: Pixels
+    across: Pixels
+    rise: Pixels
+    slope: Pixels
+    cos: Pixels
+    sin: Pixels
+
+    @property
+    def pattern(self) -> Pixels:
+        """Return f₁ f₂ (corner, pixel)."""
+        return np.asarray(self.rise[0] * self.rise[1])
+
+
+def _edges(state: Array, windows: _Windows) -> _Edges:
+    numbers = state.astype(np.float32)[..., np.newaxis]
+    x, y = (windows.places[..., axis] - numbers[:, axis] for axis in (0, 1))
+    angles, bends = (np.swapaxes(numbers[:, which], 0, 1) for which in (_ANGLES, _BENDS))
+    blur = np.sqrt(np.exp(2 * numbers[:, _BLUR]) + np.float32(_PIXEL_VARIANCE))
+    cos, sin = np.cos(angles), np.sin(angles)
+    along = x * cos + y * sin
+    across = y * cos - x * sin - bends * along * along / 2
+    blurs = across / (np.float32(np.sqrt(2)) * blur)
+    slope = np.exp(-np.square(blurs)) * (np.float32(np.sqrt(2 / np.pi)) / blur)
+    return _Edges(along, across, erf(blurs), slope, cos, sin)
+
+
+def _step(state: Array, windows: _Windows, width_px: int) -> tuple[Array, Array]:
+    """Return the Gauss-Newton step of each corner (corner, 9), and its normal matrix (corner, 9, 9)."""
+    edges = _edges(state, windows)
+    pattern = edges.pattern
+    level, contrast = (state[:, which, np.newaxis].astype(np.float32) for which in (_LEVEL, _CONTRAST))
+    residuals = windows.values - level - contrast * pattern
+    tilt = contrast * edges.slope * edges.rise[::-1]  # ∂I/∂dᵢ
+    by_blur = -(tilt * edges.across).sum(axis=0) / (1 + _PIXEL_VARIANCE * np.exp(-2 * state[:, _BLUR, np.newaxis]))
+    by_place = (tilt * edges.sin).sum(axis=0), -(tilt * edges.cos).sum(axis=0)
+    by_angle = -tilt * edges.along
+    by_bend = by_angle * edges.along / 2
+    flat = np.ones_like(pattern)
+    slopes = np.stack([*by_place, *by_angle, *by_bend, by_blur, flat, pattern], axis=1, dtype=np.float32)
+    weighted = slopes * (windows.counts / _variances(state, windows, pattern, residuals))[:, np.newaxis]
+    normal = (weighted @ np.swapaxes(slopes, 1, 2)).astype(np.float64)
+    right = (weighted @ residuals[..., np.newaxis])[..., 0].astype(np.float64)
+    known, weights = _prior(width_px)
+    normal[:, range(_COUNT), range(_COUNT)] += weights
+    return np.linalg.solve(normal, (right + weights * (known - state))[..., np.newaxis])[..., 0], normal
+
+
+def _prior(width_px: int) -> tuple[Array, Array]:
+    """Return what is known of a corner's numbers before the fit, and the inverse of its variance."""
+    known, weights = np.zeros(_COUNT), np.full(_COUNT, 1e-12)  # so that a window without pixels is no error
+    weights[_BENDS] = (width_px / _BEND_SD) ** 2
+    known[_BLUR], weights[_BLUR] = np.log(_BLUR_PX), _LOG_BLUR_SD**-2
+    return known, weights
+
+
+def _variances(state: Array, windows: _Windows, pattern: Pixels, residuals: Pixels) -> Pixels:
+    """Return the variance of each pixel (corner, pixel): a line in the light through that of dark and white squares.
+
+    Both are medians over the corners, so that a corner which is none does not matter.
+    """
+    counts = windows.counts.sum(axis=1)
+    freedom = np.maximum(counts - _COUNT, 1) / np.maximum(counts, 1)
+    light = np.sign(state[:, _CONTRAST, np.newaxis]) * pattern
+    found = []
+    for side in (-light, light):
+        flat = windows.counts & (side > _FLAT)
+        corners = flat.any(axis=1)
+        squares = np.square(residuals[corners]).sum(axis=1, where=flat[corners]) / flat[corners].sum(axis=1)
+        found.append(float(np.median(squares / freedom[corners])) if corners.any() else 0.0)
+    dark, white = found[0], max(found)  # light adds noise; where whites are clipped they seem to have none
+    least = (_LEAST_NOISE * float(np.median(np.abs(state[:, _CONTRAST])))) ** 2
+    return np.asarray(np.maximum(dark + (white - dark) * (1 + light) / 2, least) + np.float32(1e-30), np.float32)

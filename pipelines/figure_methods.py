@@ -1,0 +1,79 @@
+"""The reconstructions that figure 4 compares, in one list; a further one is a further entry of `METHODS`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+
+import numpy as np
+
+from pipelines.planes import Method, Settings, solve
+from recon.images import ElementalImages, Image
+from recon.operator import PlaneOperator
+from recon.solvers import back_projection
+
+
+@dataclass(frozen=True)
+class FigureMethod:
+    """One way from dark views to a plane.
+
+    Attributes
+    ----------
+    name, title : str
+        In files, and on figures.
+    plane : callable
+        Of operator, images and, where the method has one, a weight; gives the plane (row, column) in electrons.
+    weights : tuple of float
+        The weights that are tried where the best one is found from the true object, which no experiment can do; empty
+        where the method finds its own.
+    """
+
+    name: str
+    title: str
+    plane: Callable[..., Image]
+    weights: tuple[float, ...] = ()
+
+
+def _solved(method: Method, operator: PlaneOperator, images: ElementalImages, weight: float | None = None) -> Image:
+    """Return the plane that `reconstruct --method` would write."""
+    return solve(operator, images, method, Settings(penalty_weight=weight)).plane
+
+
+def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
+    """Return what a naive reading of eq. (2) gives: negative pixels clipped at zero, read noise not modelled."""
+    floor = np.maximum(images.electrons, 0)
+    return _solved("pmlem-osl", operator, replace(images, electrons=floor, read_variance_e2=0.0))
+
+
+def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
+    """Return the back-projection, denoised by total variation (Chambolle 2004, as scikit-image has it)."""
+    from skimage.restoration import denoise_tv_chambolle  # loading it takes a second
+
+    plane = back_projection(operator, images)
+    return np.asarray(denoise_tv_chambolle(plane, weight=weight, max_num_iter=100), np.float32)
+
+
+def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
+    """Return the back-projection, denoised by BM3D with a standard deviation of `weight` electrons."""
+    import bm3d  # an extra
+
+    return np.asarray(bm3d.bm3d(back_projection(operator, images), sigma_psd=weight), np.float32)
+
+
+_DENOISING_WEIGHTS_E = tuple(np.geomspace(0.1, 3.2, 9).tolist())
+
+# What stands first is drawn as the reference that the others have to beat.
+METHODS = (
+    FigureMethod("backprojection", "back-projection", back_projection),
+    FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _DENOISING_WEIGHTS_E),
+    *(
+        [FigureMethod("bm3d", "back-projection + BM3D, best weight", _bm3d_denoised, _DENOISING_WEIGHTS_E)]
+        if find_spec("bm3d")
+        else []
+    ),
+    FigureMethod("pmlem-clipped", "PMLEM, negative data clipped", _clipped),
+    FigureMethod("pmlem-osl", "PMLEM, one-step-late, weight from the noise", partial(_solved, "pmlem-osl")),
+)
+
+# The reconstruction that stands for the paper's.
+OURS: Method = "pmlem-osl"

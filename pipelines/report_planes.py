@@ -1,0 +1,159 @@
+"""The planes of a report: read from disk, on one grey scale, side by side and on sliders, with their focus curve."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import MissingFile
+from pipelines.frames import read_frame
+from pipelines.image_files import encoded, grey_levels, shrunk, white_level
+from pipelines.pages import INK, data_uri, inked, svg
+
+# So many depths stand side by side; more of them are shown on a slider only.
+_MOST_ROWS = 6
+_GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
+
+_OF_A_SESSION = "reconstructions"
+
+METHOD_NAMES = {
+    "backprojection": "back-projection",
+    "mlem": "MLEM",
+    "pmlem-osl": "PMLEM (one-step-late, TV)",
+    "pmlem": "PMLEM",
+}
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One plane of one method on disk."""
+
+    column: str
+    method: str
+    depth_mm: float
+    path: Path
+    records: list[dict[str, Any]]
+
+    def pixels(self) -> NDArray[Any]:
+        """Return the plane (row, column[, colour]) in electrons."""
+        return read_frame(self.path).pixels_dn
+
+
+def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_file: str) -> list[Plane]:
+    """Return all planes, in the order of folders and depths; a colour plane has one record per channel."""
+    planes = []
+    for folder, result in results.items():
+        by_file: dict[str, list[dict[str, Any]]] = {}
+        for record in result["planes"]:
+            by_file.setdefault(record["file"], []).append(record)
+        where = folder.relative_to(directory)
+        for name, records in by_file.items():
+            path = folder / Path(name).name
+            if not path.is_file():
+                raise MissingFile(f"{path}: is recorded in {folder / record_file} but missing; reconstruct again")
+            method = records[0]["method"]
+            # The folder of a method says no more than its name, and that of a session's reconstructions nothing.
+            parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
+            column = f"{parts[-1]}/{method}" if parts else method
+            planes.append(Plane(column, method, records[0]["depth_mm"], path, records))
+    order = list(METHOD_NAMES)
+    return sorted(
+        planes, key=lambda p: (p.column.rpartition("/")[0], order.index(p.method) if p.method in order else 9)
+    )
+
+
+def column_title(column: str) -> str:
+    """Return what stands above a column: the set's folder, where there are several, and the method."""
+    where, _, method = column.rpartition("/")
+    name = METHOD_NAMES.get(method, method)
+    return f"{where} set: {name}" if where else name
+
+
+def shared_white(planes: list[Plane], columns: list[str]) -> float:
+    """Return the white of the one grey scale: that of the least noisy column, so that noise may clip but planes not."""
+    brightest = [max(white_level(plane.pixels()) for plane in planes if plane.column == column) for column in columns]
+    positive = [level for level in brightest if level > 0]
+    return min(positive) if positive else 1.0
+
+
+def shown_depths(depths: list[float], focus: dict[str, Any] | None) -> list[float]:
+    """Return the depths that stand side by side: all when they are few, else where something is sharp."""
+    if len(depths) <= _MOST_ROWS:
+        return depths
+    sharp = focus["sharp_mm"] if focus else []
+    marked = {min(depths, key=lambda depth: abs(depth - mark)) for mark in sharp}
+    if not marked:
+        marked = {depths[round(index)] for index in np.linspace(0, len(depths) - 1, 3)}
+    return sorted(marked)[:_MOST_ROWS]
+
+
+def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], white: float) -> list[dict[str, Any]]:
+    """Return the pictures side by side, a row per depth and a cell per column."""
+    by_place = {(plane.depth_mm, plane.column): plane for plane in planes}
+    rows = []
+    for depth in depths:
+        found = [by_place.get((depth, column)) for column in columns]
+        cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
+        rows.append({"depth_mm": depth, "cells": cells})
+    return rows
+
+
+def slider(planes: list[Plane], columns: list[str], white: float) -> list[dict[str, Any]]:
+    """Return the pictures of the sliders: per column the planes by depth."""
+    return [
+        {
+            "title": column_title(column),
+            "planes": [
+                _slide(plane, white)
+                for plane in sorted(planes, key=lambda plane: plane.depth_mm)
+                if plane.column == column
+            ],
+        }
+        for column in columns
+    ]
+
+
+def _slide(plane: Plane, white: float) -> dict[str, Any]:
+    """Return one picture of the sliders, and how many samples across the plane has."""
+    pixels = plane.pixels()
+    picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
+    return {"depth_mm": plane.depth_mm, "samples": pixels.shape[1], "src": picture}
+
+
+def first_column(columns: list[str]) -> int:
+    """Return which column the slider shows first: one that was penalised, where there is one."""
+    return next((index for index, name in enumerate(columns) if "pmlem" in name), 0)
+
+
+def first_depth(depths: list[float], focus: dict[str, Any] | None) -> int:
+    """Return which depth the slider shows first: where the focus curve is highest, the first without a curve."""
+    if focus is None:
+        return 0
+    best = max(zip(focus["detail_e2"], focus["depth_mm"], strict=True))[1]
+    return min(range(len(depths)), key=lambda index: abs(depths[index] - best))
+
+
+def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
+    return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)
+
+
+def focus_curve(focus: dict[str, Any]) -> str:
+    """Return the focus curve as SVG that takes its colour from the page."""
+    from matplotlib.figure import Figure  # loading it costs most of a second, and most reports have no curve
+
+    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(focus["depth_mm"], focus["detail_e2"], "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
+    top = max(focus["detail_e2"])
+    for depth in focus["sharp_mm"]:
+        axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
+        axes.annotate(
+            f"{depth:.0f} mm", (depth, top), xytext=(4, -2), textcoords="offset points", color="#d95f02", va="top"
+        )
+    axes.set_xlabel("depth (mm)", color=INK)
+    axes.set_ylabel("detail both halves\nof the views agree on (e⁻²)", color=INK)
+    axes.ticklabel_format(axis="y", scilimits=(-3, 3))
+    inked(axes)
+    return svg(figure)

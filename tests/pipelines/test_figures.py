@@ -1,0 +1,206 @@
+"""`figures`: the paper's figures with their numbers, and the page that shows them."""
+
+import csv
+import json
+import statistics
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipelines import figure4
+from pipelines.cli import run
+from pipelines.figure4 import SNRS, Error, Stage, curves, is_monotone, staged
+from pipelines.figure_methods import METHODS, FigureMethod
+from recon.metrics import expected_snr_from_powers
+from rig.simulation.objects import shaded_ball, star_chart
+
+type Command = Callable[..., CompletedProcess[str]]
+
+FEW_SNRS = figure4.SNRS[::3]
+OBJECTS = {"truck", "airplane", "star", "ball"}
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All figures, small; to be read only."""
+    out = tmp_path_factory.mktemp("figures") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figure4, "SNRS", FEW_SNRS)
+        assert run(["figures", str(out), "--size-px", "128", "96", "--seeds", "1"]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def errors(made: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = json.loads((made / "figure4.json").read_text())
+    return rows
+
+
+@pytest.fixture(scope="session")
+def star() -> Stage:
+    return staged(star_chart(0.0, 0.0, 600.0).grey(), (120, 90))
+
+
+def test_figure_4_has_every_object_snr_method_and_draw(errors: list[dict[str, Any]]) -> None:
+    found = [(row["object"], row["snr"], row["method"], row["seed"]) for row in errors]
+    wanted = {
+        (name, snr, method.name, seed) for name in OBJECTS for snr in FEW_SNRS for method in METHODS for seed in (1,)
+    }
+    assert len(found) == len(wanted)
+    assert set(found) == wanted
+
+
+def test_the_snrs_are_the_papers() -> None:
+    assert SNRS == (0.16, 0.17, 0.18, 0.19, 0.20, 0.21, 0.22, 0.23)
+
+
+@pytest.mark.parametrize("method", ["backprojection", "pmlem-clipped", "pmlem-osl"])
+def test_the_mean_error_falls_with_the_snr(method: str, errors: list[dict[str, Any]]) -> None:
+    for name in OBJECTS:
+        means = [
+            np.mean([row["mse"] for row in errors if (row["object"], row["snr"], row["method"]) == (name, snr, method)])
+            for snr in FEW_SNRS
+        ]
+        assert all(after < before for before, after in pairwise(means)), (name, means)
+
+
+def test_penalised_errors_lie_on_the_papers_axis_and_clipped_ones_above(errors: list[dict[str, Any]]) -> None:
+    by_method = {method.name: [row["mse"] for row in errors if row["method"] == method.name] for method in METHODS}
+    assert max(by_method["pmlem-osl"]) < 0.12
+    assert min(by_method["pmlem-clipped"]) > 0.12
+
+
+def test_only_denoisers_are_given_their_best_weight(errors: list[dict[str, Any]]) -> None:
+    given = {row["method"] for row in errors if row["weight"] is not None}
+    assert given == {method.name for method in METHODS if method.weights}
+    assert "tv" in given
+    assert "pmlem-osl" not in given
+
+
+@pytest.mark.parametrize("number", [2, 3, 4])
+def test_the_table_holds_what_the_json_holds(number: int, made: Path) -> None:
+    content = json.loads((made / f"figure{number}.json").read_text())
+    rows = content if number == 4 else content["planes"]
+    with (made / f"figure{number}.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert len(table) == len(rows)
+    for row, cells in zip(rows, table, strict=True):
+        assert {name: "" if value is None else str(value) for name, value in row.items()} == cells
+
+
+@pytest.mark.parametrize("number", [2, 3, 4])
+def test_each_figure_is_a_picture_fit_for_print(number: int, made: Path) -> None:
+    picture = cv2.imread(str(made / f"figure{number}.png"))
+    assert picture is not None
+    assert picture.shape[1] >= 2000
+    assert picture.std() > 10
+
+
+def test_each_back_projection_is_sharp_on_its_own_object(made: Path) -> None:
+    rows = json.loads((made / "figure2.json").read_text())["planes"]
+    assert {(row["plane_depth_mm"], row["object"]) for row in rows} == {
+        (depth, name) for depth in (500.0, 700.0) for name in ("truck", "airplane")
+    }
+    for row in rows:
+        if row["plane_depth_mm"] == row["object_depth_mm"]:
+            assert row["detail"] > 0.5
+        else:
+            assert abs(row["detail"]) < 0.2
+
+
+def test_figure_3_tells_how_dark_it_is(made: Path) -> None:
+    content = json.loads((made / "figure3.json").read_text())
+    assert content["snr"]["asked"] == pytest.approx(0.16)
+    assert content["photons_per_px"]["linear"] == pytest.approx(0.16 * 12 / 0.5)
+    assert [row["depth_mm"] for row in content["planes"]] == [500.0, 700.0]
+
+
+def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    done("figures", out, "--only", 2, "--size-px", 64, 48)
+    assert sorted(path.name for path in out.glob("figure?.png")) == ["figure2.png"]
+    before = (out / "figure2.png").read_bytes()
+    said = json.loads(done("--json", "figures", out, "--only", 3, "--size-px", 64, 48).stdout)
+    assert list(said["figures"]) == ["figure3"]
+    assert (out / "figure2.png").read_bytes() == before
+    page = (out / "figures.html").read_text()
+    assert 'id="figure2"' in page
+    assert 'id="figure3"' in page
+    assert 'id="figure4"' not in page
+    whole = (made / "figures.html").read_text()
+    for words in ("In the paper", "Here", "from 0 to 0.12", *(method.title for method in METHODS)):
+        assert words in whole
+    assert "http" not in whole.split("</head>")[1]
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, faintfield: Command) -> None:
+    (tmp_path / "thesis.tex").touch()
+    ended = faintfield("figures", tmp_path)
+    assert ended.returncode == 1
+    assert "OutputExists" in ended.stderr
+
+
+def test_exposures_have_the_snr_they_are_named_by(star: Stage) -> None:
+    view = star.experiment.reference_view
+    signal = star.light[view][star.region]
+    for snr, images, scale_e in star.exposures(seed=3):
+        assert expected_snr_from_powers(signal * scale_e, 0.02, 12**0.5) == pytest.approx(snr)
+        # The sum over all pixels of all views is a Poisson number and a sum of read noises
+        expected = float(star.light.sum() * scale_e + 0.02 * star.light.size)
+        deviation = np.sqrt(expected + (12 + 1 / 48) * star.light.size)
+        assert images.electrons.sum(dtype=np.float64) == pytest.approx(expected, abs=4 * deviation)
+
+
+def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: Stage) -> None:
+    frames = [images.electrons for _, images, _ in star.exposures(seed=3)]
+    for darker, brighter in pairwise(frames):
+        more = brighter - darker
+        np.testing.assert_array_equal(more, np.rint(more))
+        assert more.min() >= 0
+    other = next(star.exposures(seed=4))[1].electrons
+    assert np.corrcoef(frames[0].ravel(), other.ravel())[0, 1] < 0.2
+
+
+def test_the_best_weight_is_the_best(star: Stage) -> None:
+    _, images, scale_e = next(star.exposures(seed=1))
+    tv = next(method for method in METHODS if method.name == "tv")
+    tried = [star.errors(tv.plane(star.operator, images, weight), scale_e)[0] for weight in tv.weights]
+    assert 0 < int(np.argmin(tried)) < len(tried) - 1
+
+
+def test_a_method_without_noise_has_no_error_but_that_of_sampling() -> None:
+    ball = staged(shaded_ball(0.0, 0.0, 600.0).grey(), (120, 90))
+    assert ball.errors(ball.bright * np.float32(2.0), 2.0)[0] == pytest.approx(0.0, abs=1e-12)
+    assert ball.errors(ball.bright, 1.0)[1] < 2e-3
+
+
+def test_a_point_is_the_mean_of_its_draws_with_its_standard_error() -> None:
+    draws = [Error("star", 0.16, "tv", mse, seed, 2 * mse, None) for seed, mse in enumerate((0.01, 0.02, 0.06))]
+    (point,) = curves(draws)
+    assert (point["mse"], point["mse_texture"]) == pytest.approx((0.03, 0.06))
+    assert point["standard_error"] == pytest.approx(statistics.stdev((0.01, 0.02, 0.06)) / 3**0.5)
+    assert curves(draws[:1])[0]["standard_error"] is None
+
+
+@pytest.mark.parametrize(
+    ("errors", "falls"), [((3.0, 2.0, 1.0), True), ((3.0, 3.0, 1.0), False), ((3.0, 1.0, 2.0), False)]
+)
+def test_monotone_means_that_every_step_is_down(errors: tuple[float, ...], falls: bool) -> None:
+    points = [
+        {"object": name, "method": "tv", "snr": snr, "mse": mse}
+        for name, curve in (("star", (3.0, 2.0, 1.0)), ("ball", errors))
+        for snr, mse in zip((0.16, 0.17, 0.18), curve, strict=True)
+    ]
+    assert is_monotone(points, "tv") == falls
+
+
+def test_methods_have_names_of_their_own() -> None:
+    names = [method.name for method in METHODS]
+    assert len(set(names)) == len(names)
+    assert all(isinstance(method, FigureMethod) for method in METHODS)

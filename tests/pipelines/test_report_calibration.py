@@ -1,0 +1,217 @@
+"""What a report says of light, noise and geometry, and of what it is worth to know the poses."""
+
+import base64
+import hashlib
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.cli import run
+from pipelines.frames import read_frame
+from pipelines.image_files import write_png
+from pipelines.report import write_report
+from pipelines.report_calibration import find_beside, photon_budget
+
+type Command = Callable[..., CompletedProcess[str]]
+
+KNOWN = {"value": 3.4641, "se": 0.0022, "ci95": [3.4597, 3.4685]}
+NOISE: dict[str, Any] = {
+    "offset_dn": {"value": 100.0031, "se": 0.0029, "ci95": [99.9974, 100.0088]},
+    "gain_dn_per_e": {"value": 2.00026, "se": 0.0012, "ci95": [1.9979, 2.0026]},
+    "read_noise_e": KNOWN,
+    "dark_current_e_per_s": {"value": None, "why": "all darks have one exposure time"},
+    "likelihood": "marginal Gaussian",
+    "frames": [{"file": "dark.tiff", "kind": "dark", "exposure_s": 0.1}] * 12,
+    "hot_pixels": [[1, 2]],
+    "temperature_c": -20.0,
+    "warnings": ["the darks drift"],
+}
+
+
+def _geometry() -> dict[str, Any]:
+    figure = {"value": 50.0, "sigma": 0.01, "why": None}
+    names = ("pitch_x_mm", "pitch_y_mm", "scale_x", "scale_y", "squareness_rad", "backlash_x_mm", "tilt_rad")
+    stage: dict[str, Any] = dict.fromkeys((*names, "node_residual_rms_mm"), figure)
+    stage["backlash_y_mm"] = {"value": None, "sigma": None, "why": "approached from one side"}
+    stage["residuals_mm"] = [[0.1 * k, -0.1, 0.05] for k in range(9)]
+    nodes = [{"node": [r, c], "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4} for r in range(3) for c in range(3)]
+    return {
+        "nodes": nodes,
+        "reference_node": [1, 1],
+        "stage": stage,
+        "transfer_sigma_px": {"500": 0.0134},
+        "rms_inlier_px": 0.018,
+        "corners": 5450,
+        "outliers": 3,
+    }
+
+
+@pytest.fixture(scope="session")
+def drawn(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One plane by one method; to be read only."""
+    out = tmp_path_factory.mktemp("drawn") / "out"
+    words = ["--depth-mm", "500", "--method", "backprojection"]
+    assert run(["reconstruct", str(simulated_scene), "--out", str(out), *words]) == 0
+    return out
+
+
+@pytest.fixture
+def session(drawn: Path, tmp_path: Path) -> Path:
+    """A folder as a session is: calibrations in it, planes two folders down."""
+    shutil.copytree(drawn, tmp_path / "session" / "reconstructions" / "scene")
+    (tmp_path / "session" / "noise.json").write_text(json.dumps(NOISE))
+    (tmp_path / "session" / "geometry.json").write_text(json.dumps(_geometry()))
+    return tmp_path / "session"
+
+
+@pytest.mark.parametrize("place", ["", "reconstructions", "reconstructions/scene"])
+def test_a_session_shows_its_noise_and_geometry_wherever_the_page_stands(
+    place: str, session: Path, done: Command
+) -> None:
+    done("report", session / place)
+    text = (session / place / "report.html").read_text()
+    assert "3.464" in text
+    assert "3.4597 … 3.4685" in text
+    assert "all darks have one exposure time" in text
+    assert "1 hot" in text
+    assert "the darks drift" in text
+    assert "-20.0 °C" in text
+    assert "5450 corners" in text
+    assert "approached from one side" in text
+    assert text.count("<svg") == 2
+    assert "http-equiv" in text
+
+
+def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_path: Path, done: Command) -> None:
+    for where in ("", "backprojection", "bright/backprojection"):
+        session = tmp_path / f"session-{where.replace('/', '-')}"
+        shutil.copytree(drawn, session / "reconstructions" / where)
+        done("report", session)
+        title = "bright set: back-projection" if "bright" in where else "back-projection"
+        assert f'alt="{title} at 500.0 mm"' in (session / "report.html").read_text()
+
+
+def test_a_page_says_whether_its_planes_were_made_with_the_calibration(session: Path, done: Command) -> None:
+    folder = session / "reconstructions" / "scene"
+    done("report", folder)
+    assert "It is not among the inputs of these planes" in (folder / "report.html").read_text()
+    record = json.loads((folder / "reconstruction.json").read_text())
+    for name in ("noise.json", "geometry.json"):
+        record["inputs"][name] = hashlib.sha256((session / name).read_bytes()).hexdigest()
+    (folder / "reconstruction.json").write_text(json.dumps(record))
+    done("report", folder)
+    assert "It is not among the inputs of these planes" not in (folder / "report.html").read_text()
+
+
+def test_only_pages_that_are_there_are_linked(session: Path, done: Command) -> None:
+    folder = session / "reconstructions" / "scene"
+    done("report", folder)
+    assert 'href="../../geometry.html"' not in (folder / "report.html").read_text()
+    (session / "geometry.html").touch()
+    done("report", folder)
+    assert 'href="../../geometry.html"' in (folder / "report.html").read_text()
+    done("report", session)
+    text = (session / "report.html").read_text()
+    assert 'href="geometry.html"' in text
+    assert 'href="reconstructions/scene/report.html"' in text
+
+
+def test_calibrations_can_be_named(drawn: Path, session: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(drawn, tmp_path / "elsewhere" / "a" / "b" / "c"))
+    assert find_beside(folder, "noise.json") is None
+    text = write_report(folder, noise=session / "noise.json").read_text()
+    assert 'id="noise"' in text
+    assert 'id="geometry"' not in text
+
+
+@pytest.mark.parametrize("name", ["noise.json", "geometry.json"])
+def test_a_damaged_calibration_is_named(name: str, session: Path, faintfield: Command) -> None:
+    (session / name).write_text("{}")
+    ended = faintfield("report", session)
+    assert ended.returncode == 1
+    assert "BadValue" in ended.stderr
+    assert f"{name}: is not a result that can be shown" in ended.stderr
+
+
+def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, done: Command) -> None:
+    content = _geometry()
+    content["stage"] |= {"residuals_mm": [], "pitch_x_mm": {"value": None, "sigma": None, "why": "one column only"}}
+    (session / "geometry.json").write_text(json.dumps(content))
+    done("report", session)
+    text = (session / "report.html").read_text()
+    assert text.count("<svg") == 1
+    assert "one column only" in text
+
+
+def _overview(**light: Any) -> dict[str, Any]:
+    brightness = {"mean_signal_e": 0.96, "photons_linear": 3.84, "photons_from_moments": 1.92} | light
+    whole = {"views": 49, "exposure_s": 0.1, "read_noise_e": 12**0.5, "quantum_efficiency": 0.5, "dark_e": 0.02}
+    return whole | {"brightness": brightness}
+
+
+def test_the_photon_budget_is_that_of_the_papers_equations() -> None:
+    budget = photon_budget(_overview())
+    assert budget is not None
+    linear, moments, counted = budget["photons"]
+    # Eq. (7): 0.16 · 12 / 0.5 photons; at 0.1 s ten times as many per second; 49 views see 49 times as many
+    assert (linear["per_px"], linear["flux"]) == pytest.approx((0.16 * 12 / 0.5, 38.4))
+    assert linear["all_views"] == pytest.approx(3.84 * 49)
+    # (4) with a Poisson signal: μ² + μ = 0.16 · 12 e⁻², less the little that dark current does
+    mu_e = moments["per_px"] * 0.5
+    assert mu_e**2 + mu_e == pytest.approx(0.16 * 12, rel=0.03)
+    assert counted["per_px"] == pytest.approx(0.96 / 0.5)
+    # Eq. (6)
+    assert budget["variance_e2"] == pytest.approx(0.96 + 0.02 + 12)
+    assert {part["words"]: part["share"] for part in budget["shares"]} == pytest.approx(
+        {"read noise": 12 / 12.98, "light": 0.96 / 12.98, "dark current": 0.02 / 12.98}
+    )
+
+
+@pytest.mark.parametrize(
+    "overview",
+    [_overview(mean_signal_e=-0.1), _overview() | {"quantum_efficiency": None}, {**_overview(), "dark_e": None}],
+)
+def test_without_light_or_efficiency_there_is_no_budget(overview: dict[str, Any]) -> None:
+    assert photon_budget(overview) is None
+
+
+def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> None:
+    folder = session / "reconstructions" / "scene"
+    path = folder / "metrics.json"
+    content = json.loads(path.read_text())
+    (row,) = content["planes"]
+    errors = {"true": 0.0101, "nominal": 0.0404, "measured": 0.0102}
+    content["planes"] = [row | {"poses": kind, "mse_bright": error} for kind, error in errors.items()]
+    path.write_text(json.dumps(content))
+    done("report", folder)
+    text = (folder / "report.html").read_text()
+    table = text[text.index("What it is worth to know the poses") : text.index("All planes")]
+    assert [table.index(f"{kind} poses") for kind in ("nominal", "measured", "true")] == sorted(
+        table.index(f"{kind} poses") for kind in errors
+    )
+    for words in ("0.0404", "0.0102", "0.0101", f"{0.0102 / 0.0404:.2f}", f"{0.0102 / 0.0101:.2f}"):
+        assert words in table
+
+
+def test_one_set_reconstructed_twice_is_shown_once(session: Path, done: Command) -> None:
+    shutil.copytree(session / "reconstructions" / "scene", session / "reconstructions" / "again")
+    done("report", session)
+    assert (session / "report.html").read_text().count("What the camera saw:") == 1
+
+
+def test_views_are_shown_pixel_for_pixel_and_large_ones_cropped(session: Path, done: Command) -> None:
+    folder = session / "reconstructions" / "scene"
+    picture = np.random.default_rng(1).integers(0, 256, (700, 900), np.uint8)
+    write_png(folder / "reference_view.png", picture)
+    done("report", folder)
+    text = (folder / "report.html").read_text()
+    before = 'class="pixels" src="data:image/png;base64,'
+    start = text.index(before) + len(before)
+    (folder / "shown.png").write_bytes(base64.b64decode(text[start : text.index('"', start)]))
+    np.testing.assert_array_equal(read_frame(folder / "shown.png").pixels_dn, picture[30:670, 130:770])
