@@ -22,7 +22,7 @@ _MEANING = {
     "pass_s": "one pass over the data: H, ratio, Hᵀ (s)",
     "scipy_csr_over_ours": "scipy CSR matrices over ours",
     "cv2_warp_pair_over_ours": "a pair of OpenCV warps (no lens, no mask, no adjoint) over ours",
-    "scipy_csr_over_ours_computing": "scipy CSR over ours, in computing seconds of all threads (a busy machine matters less)",
+    "scipy_csr_over_ours_computing": "scipy CSR over ours, in computing seconds of all threads together",
     "cv2_warp_pair_over_ours_computing": "a pair of OpenCV warps over ours, likewise",
     "ours_over_reading_the_images": "ours over the floor: reading the images once with all threads",
     "bandwidth_gb_per_s": "memory bandwidth of that reading (GB/s)",
