@@ -14,7 +14,11 @@ from numba.extending import intrinsic, overload
 
 # Options of everything compiled here: sums may be reordered, but infinities and NaN keep their meaning, for callers
 # test for them.
-compiled = numba.njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz", "arcp", "reassoc"})
+_OPTIONS = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}}
+compiled = numba.njit(nogil=True, cache=True, **_OPTIONS)
+
+# For what is small and called per pixel or block: handing over arrays costs more than it does.
+inlined = numba.njit(inline="always", **_OPTIONS)
 
 _HALF_ROOT_BITS = np.int32(0x3F3504F3)  # √½ as float32
 _LN2, _LN2_HIGH, _LN2_LOW = np.float32(0.6931472), np.float32(0.693359375), np.float32(-2.12194440e-4)
