@@ -44,7 +44,8 @@ def checked_geometry(
     _check_pixels(flat, valid, transmission, (planes, views, lattices, *detector))
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(
-            f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} lattices, counted from 0"
+            f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} "
+            "lattices, counted from 0"
         )
     if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat, transmission)):
         raise GeometryMismatch(
