@@ -1,6 +1,6 @@
 """From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from recon.errors import GeometryMismatch
 from recon.images import ElementalImages
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
+from recon.scene import SceneOperator
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
@@ -238,16 +239,36 @@ class OperatorFactory:
 
     def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
         """Return H of the plane across the reference camera's axis at a depth."""
+        return PlaneOperator(self._homographies(depth_mm), self._rays, grid, **self._shared())
+
+    def of_scene(
+        self, grids: Mapping[float, PlaneGrid], transmission: NDArray[np.float32] | None = None
+    ) -> SceneOperator:
+        """Return H of all planes together, in the order of `grids` by depth.
+
+        Parameters
+        ----------
+        grids : mapping of float to PlaneGrid
+            The samples at each depth in mm.
+        transmission : float array (plane, view, row, column), optional
+            How much of each plane's light reaches each pixel; all by default.
+        """
+        homographies = np.stack([self._homographies(depth) for depth in grids])
+        return SceneOperator(
+            homographies, self._rays, list(grids.values()), transmission=transmission, **self._shared()
+        )
+
+    def _homographies(self, depth_mm: float) -> NDArray[np.float64]:
+        """Return the way from the rays of each view, and each phase of its mosaic, to the plane at a depth."""
         rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
-        return PlaneOperator(
-            np.repeat(homographies, self._phases, axis=0),
-            self._rays,
-            grid,
-            flat=self._response,
-            valid=self._images.valid,
-            lattice_of_view=np.tile(np.arange(self._phases), len(homographies)),
-        )
+        return np.repeat(homographies, self._phases, axis=0)
+
+    def _shared(self) -> dict[str, Any]:
+        """Return what the operators of all planes have in common."""
+        views = len(self._loaded.settings.view)
+        lattices = np.tile(np.arange(self._phases), views)
+        return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:

@@ -6,18 +6,20 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.data_fit import DataFit
 from recon.held_out import LEAST_VIEWS, chosen_weight
 from recon.images import ElementalImages, Image, LikelihoodName
 from recon.likelihoods import likelihood_of, negative_log_likelihood
 from recon.one_step_late import Step, oscillates, pmlem_one_step_late, settled, updated_samples
 from recon.operator import PlaneOperator
 from recon.penalties import Penalty, PenaltyName, total_variation
-from recon.pmlem import PmlemIterate, pmlem
-from recon.proximal import DualField
+from recon.pmlem import Dual, PmlemIterate, pmlem
+from recon.posed import PosedPlane, PosedScene
 from recon.solvers import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
 
-type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl"]
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint"]
+
+# Methods that find all planes together, by `pipelines.joint`.
+TOGETHER: tuple[Method, ...] = ("joint",)
 
 # Passes over the data that are made at most. MLEM is stopped early on purpose: carried on, it fits the noise.
 _PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
@@ -73,20 +75,25 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
     if method == "backprojection":
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
+    if method == "pmlem":
+        posed = PosedPlane(operator, images)
+        iterate, record = certified(posed, settings)
+        return Solution(iterate.plane, record)
     start = smooth_start(operator, images)
     images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
-    if method == "pmlem":
-        return _pmlem(operator, images, start, settings)
     return _one_step_late(operator, images, start, method, settings)
 
 
-def _pmlem(operator: PlaneOperator, images: ElementalImages, start: Image, settings: Settings) -> Solution:
-    """Run PMLEM to its certificate."""
-    fit = DataFit(operator, images, _level_e(operator, start))
-    seen = well_seen_samples(fit.sensitivity)
-    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[seen])))
+def certified(posed: PosedPlane | PosedScene, settings: Settings) -> tuple[PmlemIterate, dict[str, Any]]:
+    """Run PMLEM to its certificate, and return where it ended and the record of how it came there."""
+    start = posed.start()
+    level_e = posed.level_e(start)
+    likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
+    posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
+    fit = posed.fit(level_e)
+    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[posed.well_seen()])))
     penalty = Penalty.for_noise(settings.penalty, noise_e)
-    choice = _chosen(operator, images, start, penalty, settings)
+    choice = _chosen(posed, start, penalty, settings)
     iterates = pmlem(
         fit, choice.start, penalty_weight=choice.weight, penalty=penalty, tolerance=_TOLERANCE, dual=choice.dual
     )
@@ -99,10 +106,10 @@ def _pmlem(operator: PlaneOperator, images: ElementalImages, start: Image, setti
         "passes_before": 1 + choice.passes,
         "penalty_weight_curve": choice.curve,
         "penalty": asdict(penalty),
-        "likelihood": images.likelihood.name,
+        "likelihood": likelihood.name,
         "certificate": _certificate(iterate),
     }
-    return Solution(iterate.plane, record)
+    return iterate, record
 
 
 def _certificate(iterate: PmlemIterate) -> dict[str, Any]:
@@ -128,23 +135,21 @@ class _Choice:
     weight: float
     how: str
     start: Image
-    dual: DualField | None = None
+    dual: Dual
     passes: float = 0.0
     curve: list[dict[str, float]] | None = None
 
 
-def _chosen(
-    operator: PlaneOperator, images: ElementalImages, start: Image, penalty: Penalty, settings: Settings
-) -> _Choice:
+def _chosen(posed: PosedPlane | PosedScene, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
     """Return the penalty weight for PMLEM."""
     if settings.penalty == "none":
-        return _Choice(0.0, "none: no penalty", start)
+        return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
-        return _Choice(settings.penalty_weight, "given", start)
-    guess = universal_penalty_weight(operator, images, start)
-    if len(operator.all_views) < LEAST_VIEWS:
-        return _Choice(guess, "from the noise level: too few views to hold some out", start)
-    found = chosen_weight(operator, images, guess, penalty)
+        return _Choice(settings.penalty_weight, "given", start, posed.dual())
+    guess = posed.usual_weight(start)
+    if len(posed.views) < LEAST_VIEWS:
+        return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
+    found = chosen_weight(posed, guess, penalty)
     curve = [{"weight": tried.weight, "held_out": tried.held_out} for tried in found.tried]
     nearest = np.maximum(found.nearest.plane, 1e-3 * start)
     return _Choice(found.weight, "predicts held-out views best", nearest, found.nearest.dual, found.passes, curve)
@@ -208,5 +213,10 @@ def _record(
         "passes": passes,
         "objective": objective,
         "certificate": None,
-        "mean_e": float(np.mean(plane, dtype=np.float64)),
+        "mean_e": mean_e(plane),
     }
+
+
+def mean_e(plane: Image) -> float:
+    """Return the mean of a plane, summed in float64."""
+    return float(np.mean(plane, dtype=np.float64))

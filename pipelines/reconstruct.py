@@ -25,10 +25,11 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room, write_json
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.joint import solve_joint
 from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
-from pipelines.planes import Method, Settings, solve
+from pipelines.planes import TOGETHER, Method, Settings, Solution, solve
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
@@ -77,6 +78,7 @@ def reconstruct(
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
     method: list[Method] | None = None,
+    joint: bool = False,
     penalty_weight: NotNegative | Literal["auto"] = "auto",
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
@@ -105,8 +107,10 @@ def reconstruct(
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
     method
-        pmlem (the default; to its optimum, certified), pmlem-osl and mlem (the paper's iterations), or backprojection;
-        give it once per method.
+        pmlem (the default; to its optimum, certified), joint (the same for all planes together), pmlem-osl and mlem
+        (the paper's iterations), or backprojection; give it once per method.
+    joint
+        Short for --method joint: all planes are found together, so that none holds the blur of what stands in another.
     penalty_weight
         The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
         predict those held out, for pmlem-osl one from the noise level.
@@ -141,7 +145,9 @@ def reconstruct(
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty)
-    return reconstruct_set(loaded, out, Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)))
+    together: list[Method] = ["joint"] if joint else []
+    methods = [*(method or []), *together] or [DEFAULT_METHOD]
+    return reconstruct_set(loaded, out, Request(depths, methods, settings, pitch_mm, bool(swept)))
 
 
 def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str, Any]:
@@ -245,12 +251,19 @@ class _Run:
                 halves = _halves(self._loaded, len(layout.lattices))
                 self._add_focus(depth, focus_measure(operator, images, halves))
             for method in self._folders:
-                solution = solve(operator, images, method, settings)
-                self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
-                colours = self._colours.setdefault((method, depth), [])
-                colours.append(solution.plane)
-                if len(colours) == len(self._layouts):
-                    self._write(method, depth)
+                if method not in TOGETHER:
+                    self._keep(depth, method, layout, solve(operator, images, method, settings))
+                elif depth == list(self._grids)[-1]:
+                    for each, solution in solve_joint(factory, images, self._grids, settings).items():
+                        self._keep(each, method, layout, solution)
+
+    def _keep(self, depth: float, method: Method, layout: ChannelLayout, solution: Solution) -> None:
+        """Record a plane of one channel, and write it once all its colours are there."""
+        self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
+        colours = self._colours.setdefault((method, depth), [])
+        colours.append(solution.plane)
+        if len(colours) == len(self._layouts):
+            self._write(method, depth)
 
     def focus(self) -> dict[str, Any] | None:
         """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
@@ -358,7 +371,7 @@ def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
 
 def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
     """Tell of planes whose certificate is not what was asked for."""
-    certificates = [record["certificate"] for record in records if record["method"] == "pmlem"]
+    certificates = [record["certificate"] for record in records if record["method"] in ("pmlem", *TOGETHER)]
     missed = [certificate["value"] for certificate in certificates if not certificate["reached"]]
     if missed:
         say(

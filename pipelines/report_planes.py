@@ -23,6 +23,7 @@ METHOD_NAMES = {
     "mlem": "MLEM",
     "pmlem-osl": "PMLEM (one-step-late, TV)",
     "pmlem": "PMLEM",
+    "joint": "PMLEM, all planes together",
 }
 
 

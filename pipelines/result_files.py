@@ -53,6 +53,7 @@ class ErrorRow(msgspec.Struct):
     mse_bright: float
     mse_texture: float
     psnr_db: float | None
+    mse_plane: float | None = None
 
 
 class Errors(msgspec.Struct):
