@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 from pipelines.channels import OperatorFactory
-from pipelines.planes import Settings, Solution, certified, mean_e
+from pipelines.planes import Settings, Solution, certified
 from recon.images import ElementalImages
 from recon.plane import PlaneGrid
 from recon.posed import PosedScene
@@ -24,9 +24,5 @@ def solve_joint(
     mapping of float to Solution
         By depth. All records tell of the one iteration: its penalty weight, passes, objective and certificate.
     """
-    operator = factory.of_scene(grids)
-    iterate, record = certified(PosedScene(operator, images), settings)
-    planes = operator.planes_of(iterate.plane)
-    return {
-        depth: Solution(plane, record | {"mean_e": mean_e(plane)}) for depth, plane in zip(grids, planes, strict=True)
-    }
+    solutions = certified(PosedScene(factory.of_scene(grids), images), settings)
+    return dict(zip(grids, solutions, strict=True))

@@ -15,6 +15,7 @@ from recon.penalties import Penalty, PenaltyName, total_variation
 from recon.pmlem import Dual, PmlemIterate, pmlem
 from recon.posed import PosedPlane, PosedScene
 from recon.solvers import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
+from recon.uncertainty import standard_deviation
 
 type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint"]
 
@@ -29,6 +30,9 @@ _SETTLED = 1e-3
 
 # PMLEM is carried on until its plane is this close to the optimum, in root mean square relative to the plane.
 _TOLERANCE = 0.01
+
+# Standard deviations are estimated by draws, the same every time.
+_SEED = 1
 
 # ε of eq. (3) relative to the square of the image's scale; the paper asks for less than 1 %.
 _EPSILON_OF_SCALE = 0.005
@@ -48,20 +52,24 @@ class Settings:
         How pixels are judged; "auto" chooses by their read noise.
     penalty : str
         What PMLEM holds against a plane; one-step-late knows the smoothed total variation of eq. (3) only.
+    uncertainty : bool
+        Whether the standard deviation of PMLEM's planes is asked for.
     """
 
     penalty_weight: float | None = None
     passes: int | None = None
     likelihood: LikelihoodName | Literal["auto"] = "auto"
     penalty: PenaltyName = "tv"
+    uncertainty: bool = False
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A plane (row, column) in expected electrons, and the record of how it came about."""
+    """A plane (row, column) in expected electrons, the record of how it came about, and its standard deviation."""
 
     plane: NDArray[np.floating]
     record: dict[str, Any]
+    sigma_e: NDArray[np.floating] | None = None
 
 
 def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:
@@ -76,16 +84,14 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
     if method == "pmlem":
-        posed = PosedPlane(operator, images)
-        iterate, record = certified(posed, settings)
-        return Solution(iterate.plane, record)
+        return certified(PosedPlane(operator, images), settings)[0]
     start = smooth_start(operator, images)
     images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
     return _one_step_late(operator, images, start, method, settings)
 
 
-def certified(posed: PosedPlane | PosedScene, settings: Settings) -> tuple[PmlemIterate, dict[str, Any]]:
-    """Run PMLEM to its certificate, and return where it ended and the record of how it came there."""
+def certified(posed: PosedPlane | PosedScene, settings: Settings) -> list[Solution]:
+    """Run PMLEM to its certificate, and return the planes; the record of each is that of the one iteration."""
     start = posed.start()
     level_e = posed.level_e(start)
     likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
@@ -109,7 +115,17 @@ def certified(posed: PosedPlane | PosedScene, settings: Settings) -> tuple[Pmlem
         "likelihood": likelihood.name,
         "certificate": _certificate(iterate),
     }
-    return iterate, record
+    planes = posed.planes_of(iterate.plane)
+    sigmas: list[Image | None] = [None] * len(planes)
+    if settings.uncertainty:
+        generator = np.random.default_rng(_SEED)
+        sigmas = [
+            standard_deviation(plane, metric, choice.weight, penalty, generator)
+            for plane, metric in zip(planes, posed.metrics(level_e, iterate.plane), strict=True)
+        ]
+    return [
+        Solution(plane, record | {"mean_e": mean_e(plane)}, sigma) for plane, sigma in zip(planes, sigmas, strict=True)
+    ]
 
 
 def _certificate(iterate: PmlemIterate) -> dict[str, Any]:

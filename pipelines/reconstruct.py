@@ -82,6 +82,7 @@ def reconstruct(
     penalty_weight: NotNegative | Literal["auto"] = "auto",
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
+    uncertainty: bool = False,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
@@ -120,6 +121,9 @@ def reconstruct(
     likelihood
         How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
         above, which is faster. poisson ignores read noise; least-squares knows no counts.
+    uncertainty
+        Save the standard deviation of each sample beside the planes of pmlem and joint; see docs/physics.md for what
+        it covers.
     passes
         At most this many passes over the data.
     pitch_mm
@@ -144,7 +148,7 @@ def reconstruct(
     if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     weight = None if penalty_weight == "auto" else penalty_weight
-    settings = Settings(weight, passes, likelihood, penalty)
+    settings = Settings(weight, passes, likelihood, penalty, uncertainty)
     together: list[Method] = ["joint"] if joint else []
     methods = [*(method or []), *together] or [DEFAULT_METHOD]
     return reconstruct_set(loaded, out, Request(depths, methods, settings, pitch_mm, bool(swept)))
@@ -157,7 +161,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
     request = replace(request, depths_mm=depths, methods=methods)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     run = _Run(loaded, depths, request.pitch_mm, folders)
-    require_room(out, run.needed_bytes())
+    require_room(out, run.needed_bytes() * (2 if request.settings.uncertainty else 1))
     for folder in folders.values():
         (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
     run.reconstruct(request.settings, with_focus=request.with_focus)
@@ -198,6 +202,7 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
         "penalty_weight": "auto" if request.settings.penalty_weight is None else request.settings.penalty_weight,
         "penalty": request.settings.penalty,
         "likelihood": request.settings.likelihood,
+        "uncertainty": request.settings.uncertainty,
         "passes": request.settings.passes,
         "pitch_mm": request.pitch_mm,
         "focus": request.with_focus,
@@ -221,7 +226,7 @@ class _Run:
         mm_per_depth = default_pitch_px(loaded, self._layouts) / loaded.settings.camera.fx_px
         self._grids = {depth: plane_grid(loaded, depth, pitch_mm or depth * mm_per_depth) for depth in depths}
         self._folders = folders
-        self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
+        self._colours: dict[tuple[Method, float], list[Solution]] = {}
         self._focus = dict.fromkeys(depths, Focus(0.0, 0.0))
         self._with_focus = False
         self.records: list[dict[str, Any]] = []
@@ -259,9 +264,9 @@ class _Run:
 
     def _keep(self, depth: float, method: Method, layout: ChannelLayout, solution: Solution) -> None:
         """Record a plane of one channel, and write it once all its colours are there."""
-        self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
+        self.records.append(self._record(depth, method, layout, solution))
         colours = self._colours.setdefault((method, depth), [])
-        colours.append(solution.plane)
+        colours.append(solution)
         if len(colours) == len(self._layouts):
             self._write(method, depth)
 
@@ -298,9 +303,7 @@ class _Run:
                 f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
             )
 
-    def _record(
-        self, depth: float, method: Method, layout: ChannelLayout, record: dict[str, Any], plane: NDArray[np.floating]
-    ) -> dict[str, Any]:
+    def _record(self, depth: float, method: Method, layout: ChannelLayout, solution: Solution) -> dict[str, Any]:
         """Return the entry of one plane and channel in reconstruction.json."""
         grid = self._grids[depth]
         samples_per_px = (grid.pitch_mm * self._loaded.settings.camera.fx_px / depth) ** 2
@@ -310,18 +313,30 @@ class _Run:
             "channel": layout.name,
             "file": f"{plane_name(depth)}.tiff",
             **asdict(grid),
-            **record,
-            "flux_e": float(plane.sum(dtype=np.float64)) * samples_per_px,
+            **solution.record,
+            "flux_e": float(solution.plane.sum(dtype=np.float64)) * samples_per_px,
+            "sigma_file": None if solution.sigma_e is None else f"{plane_name(depth)}_sigma.tiff",
         }
 
     def _write(self, method: Method, depth: float) -> None:
         """Write a plane whose colours are complete, and its preview."""
         colours = self._colours.pop((method, depth))
-        plane = colours[0] if len(colours) == 1 else np.dstack(colours)
+        plane = _together([colour.plane for colour in colours])
         path = self._folders[method] / f"{plane_name(depth)}.tiff"
         write_plane(path, plane, self._grids[depth].pitch_mm)
         write_png(path.with_suffix(".png"), grey_levels(plane, white_level(plane)))
+        sigmas = [colour.sigma_e for colour in colours if colour.sigma_e is not None]
+        of_sigma = path.with_name(f"{path.stem}_sigma.tiff")
+        if sigmas:
+            write_plane(of_sigma, _together(sigmas), self._grids[depth].pitch_mm)
+        else:
+            of_sigma.unlink(missing_ok=True)  # of the plane that was here before
         self.written[method, depth] = path
+
+
+def _together(colours: list[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Return the colours of a plane as one array (row, column[, colour])."""
+    return colours[0] if len(colours) == 1 else np.dstack(colours)
 
 
 def distinct_depths(depths: list[float]) -> list[float]:

@@ -31,6 +31,7 @@ from pipelines.report_planes import (
     shared_white,
     shown_depths,
     side_by_side,
+    sigmas,
     slider,
 )
 from pipelines.result_files import Errors, Overview, Result, read_result
@@ -116,7 +117,7 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
 
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return what the page says of the planes: side by side, through depths and methods, and where they are sharp."""
-    planes = read_planes(directory, results, RECONSTRUCTION_FILE)
+    planes = read_planes(directory, results)
     depths = sorted({plane.depth_mm for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
     columns = list(dict.fromkeys(plane.column for plane in planes))
@@ -125,6 +126,7 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
     return {
         "columns": [column_title(name) for name in columns],
         "rows": side_by_side(planes, columns, shown_depths(depths, focus), white),
+        "sigmas": sigmas(planes, shown_depths(depths, focus)),
         "slider": slider(planes, columns, white) if several else None,
         "slider_column": first_column(columns),
         "slider_depth": first_depth(depths, focus),

@@ -22,6 +22,7 @@ class Record(msgspec.Struct):
     passes: int
     flux_e: float
     certificate: dict[str, Any] | None
+    sigma_file: str | None = None
 
 
 class Focus(msgspec.Struct):

@@ -49,6 +49,12 @@ class Posed(Protocol):
     def usual_weight(self, start: Image) -> float:
         """Return a penalty weight from the noise alone."""
 
+    def metrics(self, level_e: float, optimum: Image) -> list[Image]:
+        """Return the curvature of L (row, column) along each plane alone."""
+
+    def planes_of(self, samples: Image) -> list[Image]:
+        """Return the planes (row, column)."""
+
 
 @dataclass(frozen=True)
 class PosedPlane:
@@ -85,6 +91,14 @@ class PosedPlane:
     def usual_weight(self, start: Image) -> float:
         """Return `recon.solvers.universal_weight`."""
         return universal_weight(self.operator.sensitivity(), self.images, start)
+
+    def metrics(self, level_e: float, optimum: Image) -> list[Image]:
+        """Return the one metric."""
+        return [self.fit(level_e).metric(optimum)]
+
+    def planes_of(self, samples: Image) -> list[Image]:
+        """Return the one plane."""
+        return [samples]
 
 
 @dataclass(frozen=True)
@@ -124,3 +138,11 @@ class PosedScene:
         """Return `recon.solvers.universal_weight` of all samples, under the light of all planes."""
         everywhere = np.full_like(start, self.level_e(start))
         return universal_weight(self.operator.samples_of(self.operator.sensitivity()), self.images, everywhere)
+
+    def metrics(self, level_e: float, optimum: Image) -> list[Image]:
+        """Return each plane's metric were the others known."""
+        return self.fit(level_e).metric_of_each(optimum)
+
+    def planes_of(self, samples: Image) -> list[Image]:
+        """Return each plane."""
+        return self.operator.planes_of(samples)

@@ -47,6 +47,7 @@ class SceneFit:
         views: Sequence[int] | NDArray[np.intp] | None = None,
     ) -> None:
         self._operator, self._images, self._views = operator, images, views
+        self._chosen = operator.all_views if views is None else np.asarray(views)
         self._least_light_e = _LEAST_LIGHT * level_e
         self.sensitivity = operator.samples_of(operator.sensitivity(views))
         self.may_reach_zero = bool(np.asarray(images.known_variance_e2()).min() > 0)
@@ -69,17 +70,33 @@ class SceneFit:
         H 1)` for weights of H and D that are not negative. What L has of curvature beyond the average is the solver's
         to see to.
         """
-        likelihood, operator = self._images.likelihood, self._operator
-        chosen = operator.all_views if self._views is None else np.asarray(self._views)
-        inverse = np.zeros(operator.images_shape, operator.dtype)
-        if likelihood.name == "least-squares":
-            light_e = np.full_like(self._seen, likelihood.level_e)
-        else:
-            light_e = np.maximum(operator.forward(operator.planes_of(samples), chosen), self._least_light_e)
-        light_e += operator.map_of_views(self._images.known_variance_e2(), chosen)
-        inverse[chosen] = self._seen / light_e
-        metric = operator.samples_of(operator.adjoint(inverse, chosen))
+        metric = self._operator.samples_of(self._row_sums(self._seen, self._light_e(samples)))
         return np.asarray(np.maximum(metric, _LEAST_METRIC * np.median(metric)), samples.dtype)
+
+    def metric_of_each(self, samples: Image) -> list[Image]:
+        """Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` > 0 (row, column) of each plane: its metric were the others known."""
+        operator, light_e = self._operator, self._light_e(samples)
+        metrics = []
+        for index in range(len(operator.grids)):
+            ones = [np.full(grid.shape, index == z, operator.dtype) for z, grid in enumerate(operator.grids)]
+            metric = self._row_sums(operator.forward(ones, self._views), light_e)[index]
+            metrics.append(np.maximum(metric, _LEAST_METRIC * np.median(metric)))
+        return metrics
+
+    def _light_e(self, samples: Image) -> Image:
+        """Return the variance that L takes a pixel to have, `H f + b + σ²` (view, row, column)."""
+        likelihood, operator = self._images.likelihood, self._operator
+        if likelihood.name == "least-squares":
+            light_e = likelihood.level_e * operator.map_of_views(operator.response(), self._chosen)
+        else:
+            light_e = np.maximum(operator.forward(operator.planes_of(samples), self._chosen), self._least_light_e)
+        return np.asarray(light_e + operator.map_of_views(self._images.known_variance_e2(), self._chosen))
+
+    def _row_sums(self, seen: Image, light_e: Image) -> list[Image]:
+        """Return `Hᵀ[ seen/light ]` of each plane."""
+        ratio = np.zeros(self._operator.images_shape, self._operator.dtype)
+        ratio[self._chosen] = seen / light_e
+        return self._operator.adjoint(ratio, self._chosen)
 
 
 def scene_start(
