@@ -17,10 +17,10 @@ from recon.posed import PosedPlane, PosedScene
 from recon.solvers import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
 from recon.uncertainty import standard_deviation
 
-type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint"]
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
 
 # Methods that find all planes together, by `pipelines.joint`.
-TOGETHER: tuple[Method, ...] = ("joint",)
+TOGETHER: tuple[Method, ...] = ("joint", "occlusion")
 
 # Passes over the data that are made at most. MLEM is stopped early on purpose: carried on, it fits the noise.
 _PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
@@ -65,11 +65,12 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """A plane (row, column) in expected electrons, the record of how it came about, and its standard deviation."""
+    """A plane (row, column) in expected electrons, how it came about, its standard deviation, and how opaque it is."""
 
     plane: NDArray[np.floating]
     record: dict[str, Any]
     sigma_e: NDArray[np.floating] | None = None
+    opacity: NDArray[np.floating] | None = None
 
 
 def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:

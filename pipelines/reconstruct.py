@@ -79,6 +79,7 @@ def reconstruct(
     disparity_px: list[float] | None = None,
     method: list[Method] | None = None,
     joint: bool = False,
+    occlusion: bool = False,
     penalty_weight: NotNegative | Literal["auto"] = "auto",
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
@@ -108,10 +109,12 @@ def reconstruct(
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
     method
-        pmlem (the default; to its optimum, certified), joint (the same for all planes together), pmlem-osl and mlem
-        (the paper's iterations), or backprojection; give it once per method.
+        pmlem (the default; to its optimum, certified), joint and occlusion (the same for all planes together),
+        pmlem-osl and mlem (the paper's iterations), or backprojection; give it once per method.
     joint
         Short for --method joint: all planes are found together, so that none holds the blur of what stands in another.
+    occlusion
+        Short for --method occlusion: all planes together, and the nearer ones hide what is behind them.
     penalty_weight
         The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
         predict those held out, for pmlem-osl one from the noise level.
@@ -149,8 +152,8 @@ def reconstruct(
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
-    together: list[Method] = ["joint"] if joint else []
-    methods = [*(method or []), *together] or [DEFAULT_METHOD]
+    asked: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
+    methods = [*(method or []), *(name for name, wanted in asked.items() if wanted)] or [DEFAULT_METHOD]
     return reconstruct_set(loaded, out, Request(depths, methods, settings, pitch_mm, bool(swept)))
 
 
@@ -259,7 +262,7 @@ class _Run:
                 if method not in TOGETHER:
                     self._keep(depth, method, layout, solve(operator, images, method, settings))
                 elif depth == list(self._grids)[-1]:
-                    for each, solution in solve_joint(factory, images, self._grids, settings).items():
+                    for each, solution in solve_joint(factory, images, self._grids, method, settings).items():
                         self._keep(each, method, layout, solution)
 
     def _keep(self, depth: float, method: Method, layout: ChannelLayout, solution: Solution) -> None:
@@ -325,12 +328,16 @@ class _Run:
         path = self._folders[method] / f"{plane_name(depth)}.tiff"
         write_plane(path, plane, self._grids[depth].pitch_mm)
         write_png(path.with_suffix(".png"), grey_levels(plane, white_level(plane)))
-        sigmas = [colour.sigma_e for colour in colours if colour.sigma_e is not None]
-        of_sigma = path.with_name(f"{path.stem}_sigma.tiff")
-        if sigmas:
-            write_plane(of_sigma, _together(sigmas), self._grids[depth].pitch_mm)
-        else:
-            of_sigma.unlink(missing_ok=True)  # of the plane that was here before
+        beside = {
+            f"{path.stem}_sigma.tiff": [colour.sigma_e for colour in colours],
+            f"{path.stem.replace('plane', 'opacity')}.tiff": [colour.opacity for colour in colours],
+        }
+        for name, parts in beside.items():
+            known = [part for part in parts if part is not None]
+            if len(known) == len(parts):
+                write_plane(path.with_name(name), _together(known), self._grids[depth].pitch_mm)
+            else:
+                path.with_name(name).unlink(missing_ok=True)  # of the plane that was here before
         self.written[method, depth] = path
 
 

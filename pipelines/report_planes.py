@@ -24,6 +24,7 @@ METHOD_NAMES = {
     "pmlem-osl": "PMLEM (one-step-late, TV)",
     "pmlem": "PMLEM",
     "joint": "PMLEM, all planes together",
+    "occlusion": "PMLEM, all planes together, with occlusion",
 }
 
 
