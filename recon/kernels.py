@@ -23,14 +23,12 @@ accumulator of its own: sums are deterministic for a given number of workers.
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from recon.elementary import compiled, inlined
-from recon.pixel_models import WORK_ROWS, form_ratio
+from recon.pixel_models import WORK_ROWS, form_ratio_of_block
+from recon.pointers import advanced, index, pointer
 
 BLOCK_PX = 64
 TILE_ROWS = 8
@@ -47,29 +45,13 @@ _SCATTERED, _IN_STEP, _OUTSIDE = 0, 1, 2
 _LINE_BYTES = 64
 
 # Where the rows of the scratch begin. Rows of shifted products have a margin on either side that stays zero.
-_EXPECTED, _COUNTED, _OBSERVED, _BACKGROUND, _VARIANCE = (row * BLOCK_PX for row in range(5))
+_EXPECTED, _COUNTED = 0, BLOCK_PX
 _MARGIN = 16
 _PRODUCT_PX = BLOCK_PX + 2 * _MARGIN
-_PRODUCTS = 5 * BLOCK_PX + _MARGIN
-_PLACES = 5 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * _PRODUCT_PX
+_PRODUCTS = 2 * BLOCK_PX + _MARGIN
+_PLACES = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * _PRODUCT_PX
 _COLUMN, _ROW, _WEIGHT = (row * BLOCK_PX for row in range(3))
 _PLACE_SIZE = 3 * BLOCK_PX
-
-# Unsigned: numba would test signed ones for being negative, which keeps loops from becoming vectors
-_index = np.uintp
-
-
-@intrinsic
-def _pointer(_context, array):
-    """Return where a contiguous array begins.
-
-    What works on blocks is given pointers: arrays are counted references, and counting them costs more than the sums.
-    """
-
-    def build(context, builder, signature, arguments):
-        return context.make_array(signature.args[0])(context, builder, arguments[0]).data
-
-    return types.CPointer(array.dtype)(array), build
 
 
 class Geometry(NamedTuple):
@@ -139,10 +121,10 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
     greatest, least = np.int32(2**30), np.int32(-(2**30))
     row_from, row_to, column_from, column_to = greatest, least, greatest, least
     # Held in registers: stores to the scratch would make the compiler load them again for every pixel
-    a, b, c = homographies[matrix], homographies[matrix + _index(1)], homographies[matrix + _index(2)]
-    d, e, f = homographies[matrix + _index(3)], homographies[matrix + _index(4)], homographies[matrix + _index(5)]
-    g, h, i = homographies[matrix + _index(6)], homographies[matrix + _index(7)], homographies[matrix + _index(8)]
-    for k in range(_index(BLOCK_PX)):
+    a, b, c = homographies[matrix], homographies[matrix + index(1)], homographies[matrix + index(2)]
+    d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
+    g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
+    for k in range(index(BLOCK_PX)):
         at = pixel + k
         x, y, response = maps[at], maps[at + layer], maps[at + layer + layer]
         scale = g * x + h * y + i
@@ -156,9 +138,9 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
         # scale > 0 also says that the plane is met in front of the camera
         sees = (scale > zero) & (abs(column - within_column) <= margin) & (abs(row - within_row) <= margin)
         advance = within_column - number(np.int32(k))
-        scratch[place + _index(_COLUMN) + k] = advance
-        scratch[place + _index(_ROW) + k] = within_row
-        scratch[place + _index(_WEIGHT) + k] = response if sees else zero
+        scratch[place + index(_COLUMN) + k] = advance
+        scratch[place + index(_ROW) + k] = within_row
+        scratch[place + index(_WEIGHT) + k] = response if sees else zero
         whole_column, whole_row = np.int32(np.floor(advance)), np.int32(within_row)
         row_from, row_to = min(row_from, whole_row if sees else greatest), max(row_to, whole_row if sees else least)
         column_from = min(column_from, whole_column if sees else greatest)
@@ -200,22 +182,22 @@ def _gather_in_step(samples, start, stride, row_from, column_from, scratch, plac
     """Add to `_EXPECTED` what the block's pixels see: the plane, interpolated bilinearly, times the weight."""
     number = type(scratch[0])
     row, column = number(row_from), number(column_from)
-    upper = _index(start)
-    middle = upper + _index(stride)
-    lower = middle + _index(stride)
-    one, two, three = _index(1), _index(2), _index(3)
-    for k in range(_index(BLOCK_PX)):
-        along = scratch[place + _index(_COLUMN) + k] - column
+    upper = index(start)
+    middle = upper + index(stride)
+    lower = middle + index(stride)
+    one, two, three = index(1), index(2), index(3)
+    for k in range(index(BLOCK_PX)):
+        along = scratch[place + index(_COLUMN) + k] - column
         t0, t1, t2, t3 = _tent(along), _tent(along - number(1)), _tent(along - number(2)), _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + _index(_ROW) + k] - row)
+        u0, u1, u2 = _row_weights(scratch[place + index(_ROW) + k] - row)
         at = upper + k
         above = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
         at = middle + k
         here = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
         at = lower + k
         below = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        seen = scratch[place + _index(_WEIGHT) + k] * (u0 * above + u1 * here + u2 * below)
-        scratch[_index(_EXPECTED) + k] += seen
+        seen = scratch[place + index(_WEIGHT) + k] * (u0 * above + u1 * here + u2 * below)
+        scratch[index(_EXPECTED) + k] += seen
 
 
 @compiled
@@ -227,65 +209,65 @@ def _scatter_in_step(samples, start, stride, row_from, column_from, scratch, pla
     """
     number = type(scratch[0])
     row, column, zero = number(row_from), number(column_from), number(0)
-    size, base = _index(_PRODUCT_PX), _index(_PRODUCTS)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
-        value = weight * scratch[_index(_EXPECTED) + k] if weight != zero else zero
-        along = scratch[place + _index(_COLUMN) + k] - column
+    size, base = index(_PRODUCT_PX), index(_PRODUCTS)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(_WEIGHT) + k]
+        value = weight * scratch[index(_EXPECTED) + k] if weight != zero else zero
+        along = scratch[place + index(_COLUMN) + k] - column
         v0, v1 = value * _tent(along), value * _tent(along - number(1))
         v2, v3 = value * _tent(along - number(2)), value * _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + _index(_ROW) + k] - row)
+        u0, u1, u2 = _row_weights(scratch[place + index(_ROW) + k] - row)
         at = base + k
         scratch[at], scratch[at + size] = u0 * v0, u0 * v1
-        scratch[at + _index(2) * size], scratch[at + _index(3) * size] = u0 * v2, u0 * v3
-        scratch[at + _index(4) * size], scratch[at + _index(5) * size] = u1 * v0, u1 * v1
-        scratch[at + _index(6) * size], scratch[at + _index(7) * size] = u1 * v2, u1 * v3
-        scratch[at + _index(8) * size], scratch[at + _index(9) * size] = u2 * v0, u2 * v1
-        scratch[at + _index(10) * size], scratch[at + _index(11) * size] = u2 * v2, u2 * v3
-    first = _index(start)
+        scratch[at + index(2) * size], scratch[at + index(3) * size] = u0 * v2, u0 * v3
+        scratch[at + index(4) * size], scratch[at + index(5) * size] = u1 * v0, u1 * v1
+        scratch[at + index(6) * size], scratch[at + index(7) * size] = u1 * v2, u1 * v3
+        scratch[at + index(8) * size], scratch[at + index(9) * size] = u2 * v0, u2 * v1
+        scratch[at + index(10) * size], scratch[at + index(11) * size] = u2 * v2, u2 * v3
+    first = index(start)
     for _ in range(ROW_TAPS):
-        second, third = base + size - _index(1), base + _index(2) * size - _index(2)
-        fourth = base + _index(3) * size - _index(3)
-        for k in range(_index(BLOCK_PX + _MARGIN)):
+        second, third = base + size - index(1), base + index(2) * size - index(2)
+        fourth = base + index(3) * size - index(3)
+        for k in range(index(BLOCK_PX + _MARGIN)):
             even = scratch[base + k] + scratch[second + k]
             samples[first + k] += even + (scratch[third + k] + scratch[fourth + k])
-        first += _index(stride)
-        base += _index(COLUMN_TAPS) * size
+        first += index(stride)
+        base += index(COLUMN_TAPS) * size
 
 
 @inlined
 def _corner(scratch, place, k, start, height, stride):
     """Return the upper left of the four samples around a pixel's point, and the fractions down and right of it."""
     number = type(scratch[0])
-    column = scratch[place + _index(_COLUMN) + k] + number(np.int32(k))
-    row = scratch[place + _index(_ROW) + k]
+    column = scratch[place + index(_COLUMN) + k] + number(np.int32(k))
+    row = scratch[place + index(_ROW) + k]
     left, upper = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
-    return _index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
+    return index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
 
 
 @compiled
 def _gather_scattered(samples, start, height, stride, scratch, place):
     """Do as `_gather_in_step` does, pixel by pixel."""
-    zero, one, below = type(scratch[0])(0), _index(1), _index(stride)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(_WEIGHT) + k]
         if weight != zero:
             at, down, right = _corner(scratch, place, k, start, height, stride)
             upper, lower = samples[at], samples[at + below]
             upper += right * (samples[at + one] - upper)
             lower += right * (samples[at + below + one] - lower)
-            scratch[_index(_EXPECTED) + k] += weight * (upper + down * (lower - upper))
+            scratch[index(_EXPECTED) + k] += weight * (upper + down * (lower - upper))
 
 
 @compiled
 def _scatter_scattered(samples, start, height, stride, scratch, place):
     """Do as `_scatter_in_step` does, pixel by pixel."""
-    zero, one, below = type(scratch[0])(0), _index(1), _index(stride)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(_WEIGHT) + k]
         if weight != zero:
             at, down, right = _corner(scratch, place, k, start, height, stride)
-            value = weight * scratch[_index(_EXPECTED) + k]
+            value = weight * scratch[index(_EXPECTED) + k]
             lower = value * down
             upper = value - lower
             samples[at] += upper - upper * right
@@ -301,34 +283,34 @@ def _locate_on_all(homographies, matrix, views, layout, planes, samples, maps, l
     `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that one's row and column.
     """
     meets = False
-    for plane in range(_index(planes)):
+    for plane in range(index(planes)):
         start, height, width = (
-            layout[_index(3) * plane],
-            layout[_index(3) * plane + _index(1)],
-            layout[_index(3) * plane + _index(2)],
+            layout[index(3) * plane],
+            layout[index(3) * plane + index(1)],
+            layout[index(3) * plane + index(2)],
         )
         row_from, row_to, column_from, column_to = _locate(
-            homographies, matrix + _index(9) * plane * views, maps, layer, pixel, height, width, scratch, _place(plane)
+            homographies, matrix + index(9) * plane * views, maps, layer, pixel, height, width, scratch, _place(plane)
         )
         start += row_from * width + column_from
         how = _arrangement(row_from, row_to, column_from, column_to, start, width, samples)
-        block = _index(4) * plane
-        blocks[block], blocks[block + _index(1)] = how, start
-        blocks[block + _index(2)], blocks[block + _index(3)] = row_from, column_from
+        block = index(4) * plane
+        blocks[block], blocks[block + index(1)] = how, start
+        blocks[block + index(2)], blocks[block + index(3)] = row_from, column_from
         meets |= how != _OUTSIDE
     return meets
 
 
 @inlined
 def _place(plane):
-    return _index(_PLACES) + plane * _index(_PLACE_SIZE)
+    return index(_PLACES) + plane * index(_PLACE_SIZE)
 
 
 @compiled
 def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
     """Multiply the weights of a block's pixels on every plane."""
-    for plane in range(_index(planes)):
-        weight = _place(plane) + _index(_WEIGHT)
+    for plane in range(index(planes)):
+        weight = _place(plane) + index(_WEIGHT)
         for k in range(count):
             scratch[weight + k] *= type(scratch[0])(factors[pixel + k])
         pixel += to_next_plane
@@ -338,33 +320,33 @@ def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
 def _gather(samples, layout, planes, scratch, blocks):
     """Set `_EXPECTED` to what a block's pixels see of all planes, and `_COUNTED` to their greatest weight."""
     zero = type(scratch[0])(0)
-    for k in range(_index(2 * BLOCK_PX)):
-        scratch[_index(_EXPECTED) + k] = zero
-    for plane in range(_index(planes)):
-        block, place, width = _index(4) * plane, _place(plane), layout[_index(3) * plane + _index(2)]
+    for k in range(index(2 * BLOCK_PX)):
+        scratch[index(_EXPECTED) + k] = zero
+    for plane in range(index(planes)):
+        block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
         if blocks[block] == _OUTSIDE:
             continue
-        for k in range(_index(BLOCK_PX)):
-            at = _index(_COUNTED) + k
-            scratch[at] = max(scratch[at], scratch[place + _index(_WEIGHT) + k])
+        for k in range(index(BLOCK_PX)):
+            at = index(_COUNTED) + k
+            scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
         if blocks[block] == _IN_STEP:
-            start, row, column = blocks[block + _index(1)], blocks[block + _index(2)], blocks[block + _index(3)]
+            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
             _gather_in_step(samples, start, width, row, column, scratch, place)
         else:
-            start, height = layout[_index(3) * plane], layout[_index(3) * plane + _index(1)]
+            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _gather_scattered(samples, start, height, width, scratch, place)
 
 
 @compiled
 def _scatter(samples, layout, planes, scratch, blocks):
     """Add `_EXPECTED` to all planes."""
-    for plane in range(_index(planes)):
-        block, place, width = _index(4) * plane, _place(plane), layout[_index(3) * plane + _index(2)]
+    for plane in range(index(planes)):
+        block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
         if blocks[block] == _IN_STEP:
-            start, row, column = blocks[block + _index(1)], blocks[block + _index(2)], blocks[block + _index(3)]
+            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
             _scatter_in_step(samples, start, width, row, column, scratch, place)
         elif blocks[block] == _SCATTERED:
-            start, height = layout[_index(3) * plane], layout[_index(3) * plane + _index(1)]
+            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _scatter_scattered(samples, start, height, width, scratch, place)
 
 
@@ -392,12 +374,6 @@ def workspace(planes: int, dtype: np.dtype[Any]) -> Workspace:
     return Workspace(raw[skipped : skipped + size], models, np.zeros(4 * planes, np.intp))
 
 
-@inlined
-def _row(scratch, row):
-    """Return a row of the scratch as an array that is not counted."""
-    return numba.carray(_pointer(scratch[row : row + BLOCK_PX]), (BLOCK_PX,))
-
-
 @compiled
 def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
     """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
@@ -420,26 +396,20 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
         The worker's own.
     """
     rows, columns, padded = geometry.detector
-    count_of_planes, count_of_views = geometry.layout.shape[0], _index(geometry.lattice_of_view.size)
+    count_of_planes, count_of_views = geometry.layout.shape[0], index(geometry.lattice_of_view.size)
     samples = accumulator.size if operation == ADJOINT else planes.size
-    expected, counted, observed = (
-        _row(space.scratch, _EXPECTED),
-        _row(space.scratch, _COUNTED),
-        _row(space.scratch, _OBSERVED),
-    )
-    background, variance = _row(space.scratch, _BACKGROUND), _row(space.scratch, _VARIANCE)
-    models = numba.carray(_pointer(space.models), space.models.shape)
-    scratch, blocks, layout = _pointer(space.scratch), _pointer(space.blocks), _pointer(geometry.layout)
+    scratch, blocks, layout = pointer(space.scratch), pointer(space.blocks), pointer(geometry.layout)
+    expected, counted, models = scratch, advanced(scratch, index(_COUNTED)), pointer(space.models)
     homographies, maps, layer = (
-        _pointer(geometry.homographies),
-        _pointer(geometry.maps),
-        _index(geometry.maps.size // 3),
+        pointer(geometry.homographies),
+        pointer(geometry.maps),
+        index(geometry.maps.size // 3),
     )
-    planes_at, added_at, seen_at, images_at = _pointer(planes), _pointer(accumulator), _pointer(seen), _pointer(images)
-    background_at, variance_at = _pointer(pixels.background), _pointer(pixels.variance)
-    valid_at, transmission_at = _pointer(geometry.valid), _pointer(geometry.transmission)
+    planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
+    background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
+    valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
     masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
-    per_plane = count_of_views * _index(rows * columns)
+    per_plane = count_of_views * index(rows * columns)
     model, level = pixels.model, pixels.level
     value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
@@ -449,35 +419,35 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                 begin, end = geometry.reach[view, row, 0], geometry.reach[view, row, 1]
                 met_from, met_to = end, begin
                 for first in range(begin, end, BLOCK_PX):
-                    at = _index((lattice * rows + row) * padded + first)
+                    at = index((lattice * rows + row) * padded + first)
                     if not _locate_on_all(
-                        homographies, _index(9 * view), count_of_views, layout, count_of_planes, samples,
+                        homographies, index(9 * view), count_of_views, layout, count_of_planes, samples,
                         maps, layer, at, scratch, blocks,
                     ):  # fmt: skip
                         continue
                     met_from, met_to = min(met_from, first), first + BLOCK_PX
                     if operation == REACH:
                         continue
-                    count = _index(min(BLOCK_PX, columns - first))
-                    at = _index((view * rows + row) * columns + first)
+                    count = index(min(BLOCK_PX, columns - first))
+                    at = index((view * rows + row) * columns + first)
                     if masked:
-                        _weigh(valid_at, at, _index(0), count_of_planes, count, scratch)
+                        _weigh(valid_at, at, index(0), count_of_planes, count, scratch)
                     if occluded:
                         _weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
-                    pixel = _index((image * rows + row) * columns + first)
+                    pixel = index((image * rows + row) * columns + first)
                     if operation == ADJOINT:
-                        _copy(images_at, pixel, scratch, _index(_EXPECTED), count)
+                        _copy(images_at, pixel, scratch, index(_EXPECTED), count)
                     else:
                         _gather(planes_at, layout, count_of_planes, scratch, blocks)
                     if operation == FORWARD:
-                        _copy(scratch, _index(_EXPECTED), seen_at, pixel, count)
+                        _copy(scratch, index(_EXPECTED), seen_at, pixel, count)
                         continue
                     if operation != ADJOINT:
-                        at = _index((lattice * rows + row) * columns + first)
-                        _copy(images_at, pixel, scratch, _index(_OBSERVED), count)
-                        _copy(background_at, at, scratch, _index(_BACKGROUND), count)
-                        _copy(variance_at, at, scratch, _index(_VARIANCE), count)
-                        value += form_ratio(model, expected, observed, background, variance, counted, level, models)
+                        at = index((lattice * rows + row) * columns + first)
+                        value += form_ratio_of_block(
+                            model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
+                            advanced(variance_at, at), counted, level, models,
+                        )  # fmt: skip
                     if operation != VALUE:
                         _scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:
