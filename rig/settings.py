@@ -54,7 +54,7 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
     sharpness_share : float
         Smallest sharpness of a lit frame, as a share of the median of its step.
     board_corners : int
-        Smallest number of board corners found in a charuco frame.
+        Fewest board corners that make a charuco frame useful.
     leak_dn : float
         Largest difference of brightness between two parts of a frame that should be dark.
     """

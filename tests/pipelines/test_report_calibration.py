@@ -29,7 +29,7 @@ NOISE: dict[str, Any] = {
     "likelihood": "marginal Gaussian",
     "frames": [{"file": "dark.tiff", "kind": "dark", "exposure_s": 0.1}] * 12,
     "hot_pixels": [[1, 2]],
-    "temperature_c": -20.0,
+    "temperature_c": {"mean": -20.0, "min": -20.1, "max": -19.9},
     "warnings": ["the darks drift"],
 }
 
