@@ -52,7 +52,14 @@ def svg(figure: "Figure") -> str:
 
     text = io.StringIO()
     with rc_context({"svg.hashsalt": "faintfield"}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            text,
+            format="svg",
+            transparent=True,
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None, "Creator": None},
+        )
     drawn = text.getvalue()
     return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
 

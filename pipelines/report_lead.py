@@ -46,10 +46,10 @@ def _light(the_set: dict[str, Any]) -> list[dict[str, str]]:
         return []
     found = [_fact("SNR of a view", figure(light["snr"]), f"eq. (4): {light['region']} against {light['noise_from']}")]
     if light["photons_from_moments"] is not None:
-        value = f"{figure(light['photons_from_moments'])} photons per pixel"
+        value = f"{figure(light['photons_from_moments'])} photons/px"
         found.append(_fact("Light", value, f"from moments; {figure(light['photons_linear'])} by the paper’s eq. (7)"))
     elif light["electrons_from_moments"] is not None:
-        value = f"{figure(light['electrons_from_moments'])} e⁻ per pixel"
+        value = f"{figure(light['electrons_from_moments'])} e⁻/px"
         why = "the quantum efficiency is not known, so that this is no number of photons"
         found.append(_fact("Light", value, f"from moments; {figure(light['electrons_linear'])} by eq. (7); {why}"))
     return found

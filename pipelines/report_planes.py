@@ -20,6 +20,8 @@ _GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
 # Of the curves of several planes; told apart by colour and by mark.
 _LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D"))
 
+_POSES = ("measured", "nominal", "true", "stated")
+
 _OF_A_SESSION = "reconstructions"
 
 METHOD_NAMES = {
@@ -63,9 +65,14 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_fil
             parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
             column = f"{parts[-1]}/{method}" if parts else method
             planes.append(Plane(column, method, _poses(result), records[0]["depth_mm"], path, records))
-    order = list(METHOD_NAMES)
+    methods = list(METHOD_NAMES)
     return sorted(
-        planes, key=lambda p: (p.column.rpartition("/")[0], order.index(p.method) if p.method in order else 9)
+        planes,
+        key=lambda plane: (
+            _POSES.index(plane.poses),
+            plane.column.rpartition("/")[0],
+            methods.index(plane.method) if plane.method in methods else len(methods),
+        ),
     )
 
 
@@ -204,7 +211,7 @@ def weight_curves(planes: list[Plane]) -> str | None:
         axes.plot(weights, worse, marker=marker, markersize=4, color=colour, label=f"{depth_mm:g} mm{colour_name}")
         axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
-    axes.set_xlabel("penalty weight β (1/e⁻)")
+    axes.set_xlabel("penalty weight β")
     axes.set_ylabel("held-out views: −log likelihood\nabove its least")
     axes.legend(frameon=False, labelcolor=INK)
     inked(axes)

@@ -121,9 +121,9 @@ def test_the_report_shows_what_was_measured_and_what_it_is_compared_with(metrics
     for depth in ("500.0", "700.0"):
         assert f"noise-free set: back-projection at {depth} mm" in shown
         for method in ("back-projection", "MLEM", "PMLEM (one-step-late, TV)"):
-            assert f"session set: {method} at {depth} mm" in shown
+            assert f"{method}, measured poses at {depth} mm" in shown
         for poses in ("nominal", "true"):
-            assert f"{poses} set: PMLEM (one-step-late, TV) at {depth} mm" in shown
+            assert f"PMLEM (one-step-late, TV), {poses} poses at {depth} mm" in shown
     assert "The noise reference" in shown
 
 
