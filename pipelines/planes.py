@@ -1,33 +1,32 @@
 """One plane of one channel: run a method on it, watch it, and say how it went."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.images import ElementalImages
-from recon.likelihoods import negative_log_likelihood
+from recon.data_fit import DataFit
+from recon.held_out import LEAST_VIEWS, chosen_weight
+from recon.images import ElementalImages, Image, LikelihoodName
+from recon.likelihoods import likelihood_of, negative_log_likelihood
+from recon.one_step_late import Step, oscillates, pmlem_one_step_late, settled, updated_samples
 from recon.operator import PlaneOperator
-from recon.penalties import total_variation
-from recon.solvers import (
-    Step,
-    back_projection,
-    oscillates,
-    pmlem_one_step_late,
-    settled,
-    smooth_start,
-    universal_penalty_weight,
-    updated_samples,
-)
+from recon.penalties import Penalty, PenaltyName, total_variation
+from recon.pmlem import PmlemIterate, pmlem
+from recon.proximal import DualField
+from recon.solvers import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
 
-type Method = Literal["backprojection", "mlem", "pmlem-osl"]
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl"]
 
 # Passes over the data that are made at most. MLEM is stopped early on purpose: carried on, it fits the noise.
-_PASSES = {"mlem": 20, "pmlem-osl": 50}
+_PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
 
 # An iteration whose plane changes by less than this per pass has settled.
 _SETTLED = 1e-3
+
+# PMLEM is carried on until its plane is this close to the optimum, in root mean square relative to the plane.
+_TOLERANCE = 0.01
 
 # ε of eq. (3) relative to the square of the image's scale; the paper asks for less than 1 %.
 _EPSILON_OF_SCALE = 0.005
@@ -40,13 +39,19 @@ class Settings:
     Attributes
     ----------
     penalty_weight : float, optional
-        β of eq. (2); chosen from the noise level when None.
+        β; chosen from the data when None: by held-out views for PMLEM, from the noise level for one-step-late.
     passes : int, optional
         At most this many passes over the data; the method's own limit when None.
+    likelihood : str
+        How pixels are judged; "auto" chooses by their read noise.
+    penalty : str
+        What PMLEM holds against a plane; one-step-late knows the smoothed total variation of eq. (3) only.
     """
 
     penalty_weight: float | None = None
     passes: int | None = None
+    likelihood: LikelihoodName | Literal["auto"] = "auto"
+    penalty: PenaltyName = "tv"
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,91 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
     start = smooth_start(operator, images)
+    images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
+    if method == "pmlem":
+        return _pmlem(operator, images, start, settings)
+    return _one_step_late(operator, images, start, method, settings)
+
+
+def _pmlem(operator: PlaneOperator, images: ElementalImages, start: Image, settings: Settings) -> Solution:
+    """Run PMLEM to its certificate."""
+    fit = DataFit(operator, images, _level_e(operator, start))
+    seen = well_seen_samples(fit.sensitivity)
+    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[seen])))
+    penalty = Penalty.for_noise(settings.penalty, noise_e)
+    choice = _chosen(operator, images, start, penalty, settings)
+    iterates = pmlem(
+        fit, choice.start, penalty_weight=choice.weight, penalty=penalty, tolerance=_TOLERANCE, dual=choice.dual
+    )
+    limit = settings.passes or _PASSES["pmlem"]
+    for done, iterate in enumerate(iterates, 1):
+        if iterate.certificate.distance <= _TOLERANCE or max(done, iterate.passes) >= limit:
+            break
+    record = _record(iterate.plane, choice.weight, choice.how, iterate.passes, None, iterate.objective)
+    record |= {
+        "passes_before": 1 + choice.passes,
+        "penalty_weight_curve": choice.curve,
+        "penalty": asdict(penalty),
+        "likelihood": images.likelihood.name,
+        "certificate": _certificate(iterate),
+    }
+    return Solution(iterate.plane, record)
+
+
+def _certificate(iterate: PmlemIterate) -> dict[str, Any]:
+    """Return what reconstruction.json says of the distance to the optimum."""
+    certificate = iterate.certificate
+    return {
+        "kind": "bound on the relative distance to the optimum, from its optimality conditions in the metric of the "
+        "data; see docs/physics.md",
+        "value": float(certificate.distance),
+        "stationarity": float(certificate.stationarity),
+        "slack": float(certificate.slack),
+        "tolerance": _TOLERANCE,
+        "reached": bool(certificate.distance <= _TOLERANCE),
+        "passes": iterate.passes,
+        "inner_steps": iterate.inner_steps,
+    }
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """A penalty weight, how it was found, and where a reconstruction with it may start."""
+
+    weight: float
+    how: str
+    start: Image
+    dual: DualField | None = None
+    passes: float = 0.0
+    curve: list[dict[str, float]] | None = None
+
+
+def _chosen(
+    operator: PlaneOperator, images: ElementalImages, start: Image, penalty: Penalty, settings: Settings
+) -> _Choice:
+    """Return the penalty weight for PMLEM."""
+    if settings.penalty == "none":
+        return _Choice(0.0, "none: no penalty", start)
+    if settings.penalty_weight is not None:
+        return _Choice(settings.penalty_weight, "given", start)
+    guess = universal_penalty_weight(operator, images, start)
+    if len(operator.all_views) < LEAST_VIEWS:
+        return _Choice(guess, "from the noise level: too few views to hold some out", start)
+    found = chosen_weight(operator, images, guess, penalty)
+    curve = [{"weight": tried.weight, "held_out": tried.held_out} for tried in found.tried]
+    nearest = np.maximum(found.nearest.plane, 1e-3 * start)
+    return _Choice(found.weight, "predicts held-out views best", nearest, found.nearest.dual, found.passes, curve)
+
+
+def _level_e(operator: PlaneOperator, start: Image) -> float:
+    """Return the mean light of what the views see."""
+    return float(start[well_seen_samples(operator.sensitivity())].mean(dtype=np.float64))
+
+
+def _one_step_late(
+    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, settings: Settings
+) -> Solution:
+    """Run MLEM or one-step-late PMLEM as published."""
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
     weight, chosen = _penalty_weight(operator, images, start, method, settings)
     steps: list[Step] = []
@@ -79,14 +169,16 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
             break
     plane = iterate.plane
     objective = negative_log_likelihood(operator, plane, images) + weight * total_variation(plane, epsilon)
-    certificate = {
+    record = _record(plane, weight, chosen, len(steps), epsilon, objective)
+    record["likelihood"] = images.likelihood.name
+    record["certificate"] = {
         "kind": "relative change of the last pass; one-step-late iterations prove no optimum",
         "relative_change": steps[-1].relative_change,
         "settled": settled(steps, _SETTLED),
         "oscillates": oscillates(steps, _SETTLED),
         "kept_at_start": int(np.count_nonzero(~updated_samples(operator.sensitivity(), weight))),
     }
-    return Solution(plane, _record(plane, weight, chosen, len(steps), epsilon, objective, certificate))
+    return Solution(plane, record)
 
 
 def _penalty_weight(
@@ -107,15 +199,14 @@ def _record(
     passes: int,
     epsilon: float | None = None,
     objective: float | None = None,
-    certificate: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return what reconstruction.json says of a plane's making."""
+    """Return what reconstruction.json says of a plane's making, whatever the method."""
     return {
         "penalty_weight": weight,
         "penalty_weight_chosen": chosen,
         "epsilon_e2": epsilon,
         "passes": passes,
         "objective": objective,
-        "certificate": certificate,
+        "certificate": None,
         "mean_e": float(np.mean(plane, dtype=np.float64)),
     }

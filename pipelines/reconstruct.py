@@ -4,7 +4,7 @@ import re
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -35,10 +35,12 @@ from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from pipelines.stacks import write_stack
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
+from recon.images import LikelihoodName
 from recon.operator import PlaneOperator
+from recon.penalties import PenaltyName
 from rig.session.opening import has_session
 
-DEFAULT_METHOD: Method = "pmlem-osl"
+DEFAULT_METHOD: Method = "pmlem"
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,9 @@ def reconstruct(
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
     method: list[Method] | None = None,
-    penalty_weight: NotNegative | None = None,
+    penalty_weight: NotNegative | Literal["auto"] = "auto",
+    penalty: PenaltyName = "tv",
+    likelihood: LikelihoodName | Literal["auto"] = "auto",
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
@@ -101,9 +105,17 @@ def reconstruct(
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
     method
-        backprojection, mlem or pmlem-osl (the default); give it once per method.
+        pmlem (the default; to its optimum, certified), pmlem-osl and mlem (the paper's iterations), or backprojection;
+        give it once per method.
     penalty_weight
-        The paper's β, in the unit of the number of views; chosen from the noise level by default.
+        The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
+        predict those held out, for pmlem-osl one from the noise level.
+    penalty
+        What pmlem holds against rough planes: total variation, the same with small differences squared (huber-tv),
+        squared differences (quadratic), or nothing.
+    likelihood
+        How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
+        above, which is faster. poisson ignores read noise; least-squares knows no counts.
     passes
         At most this many passes over the data.
     pitch_mm
@@ -125,7 +137,10 @@ def reconstruct(
     if out is None:
         raise WrongUsage("no folder for the results is named; give --out")
     depths = [*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])]
-    settings = Settings(penalty_weight, passes)
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
+        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
+    weight = None if penalty_weight == "auto" else penalty_weight
+    settings = Settings(weight, passes, likelihood, penalty)
     return reconstruct_set(loaded, out, Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)))
 
 
@@ -159,6 +174,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
             write_stack(folder, result["planes"])
     report = write_report(out)
     _say_what_oscillates(run.records)
+    _say_what_is_not_reached(run.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {"out": str(out), "report": str(report), "planes": run.records, "focus": run.focus(), "metrics": metrics}
 
@@ -173,7 +189,9 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
     return {
         "method": method,
         "depth_mm": request.depths_mm,
-        "penalty_weight": request.settings.penalty_weight,
+        "penalty_weight": "auto" if request.settings.penalty_weight is None else request.settings.penalty_weight,
+        "penalty": request.settings.penalty,
+        "likelihood": request.settings.likelihood,
         "passes": request.settings.passes,
         "pitch_mm": request.pitch_mm,
         "focus": request.with_focus,
@@ -328,10 +346,22 @@ def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[n
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     """Tell of planes on which the iteration swings to and fro."""
     certificates = [record["certificate"] for record in records if record["certificate"]]
+    certificates = [certificate for certificate in certificates if "oscillates" in certificate]
     swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
     if swings:
         say(
             f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
             f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
             "--penalty-weight calms it, and leaves more noise."
+        )
+
+
+def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
+    """Tell of planes whose certificate is not what was asked for."""
+    certificates = [record["certificate"] for record in records if record["method"] == "pmlem"]
+    missed = [certificate["value"] for certificate in certificates if not certificate["reached"]]
+    if missed:
+        say(
+            f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
+            f"{max(missed):.1%} from the optimum instead of {certificates[0]['tolerance']:.0%}; allow more --passes"
         )

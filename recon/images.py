@@ -1,11 +1,52 @@
 """The data of a reconstruction: the elemental images of one scene in electrons, and what is known of their noise."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recon import pixel_models
+
 type Image = NDArray[np.floating]
+type LikelihoodName = Literal["poisson", "shifted-poisson", "poisson-gaussian", "least-squares"]
+
+_MODELS = {
+    "poisson": pixel_models.SHIFTED_POISSON,
+    "shifted-poisson": pixel_models.SHIFTED_POISSON,
+    "poisson-gaussian": pixel_models.POISSON_GAUSSIAN,
+    "least-squares": pixel_models.LEAST_SQUARES,
+}
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """By which model of its statistics a pixel is judged, see `recon.pixel_models`.
+
+    Parameters
+    ----------
+    name : str
+        "poisson" ignores the read noise, and takes negative numbers for zero.
+    level_e : float
+        Electrons of light at which least squares takes the variance of a pixel of response one; the others ignore it.
+    read_noise_share : float
+        What part of σ² counts as variance where the exact model tells counts apart: a pixel informs of its mean as if
+        its variance were `λ + share · σ²`. Solvers take their metric from it; the likelihood itself does not need it.
+    """
+
+    name: LikelihoodName = "shifted-poisson"
+    level_e: float = 0.0
+    read_noise_share: float = 1.0
+
+    @property
+    def model(self) -> int:
+        """The model's number in `recon.pixel_models`."""
+        return _MODELS[self.name]
+
+    @property
+    def knows_read_noise(self) -> bool:
+        """Whether the model takes the read noise into account."""
+        return self.name != "poisson"
 
 
 @dataclass(frozen=True)
@@ -26,6 +67,8 @@ class ElementalImages:
         σ²: variance that is there without any electron.
     valid : bool array (view, row, column), optional
         False where a pixel carries no number (saturated, say); the operator must have been made with the same.
+    likelihood : Likelihood
+        How the numbers are judged.
 
     Raises
     ------
@@ -37,6 +80,7 @@ class ElementalImages:
     background_e: float | Image = 0.0
     read_variance_e2: float | Image = 0.0
     valid: NDArray[np.bool_] | None = None
+    likelihood: Likelihood = field(default_factory=Likelihood)
 
     def __post_init__(self) -> None:
         if self.electrons.ndim != 3:
@@ -47,3 +91,8 @@ class ElementalImages:
             finite = np.isfinite(image) if self.valid is None else np.isfinite(image[self.valid[view]])
             if not finite.all():
                 raise ValueError(f"view {view} has {np.count_nonzero(~finite)} pixels that are not finite numbers")
+
+    def known_variance_e2(self) -> float | Image:
+        """Return b + σ², the variance of a pixel beside that of the light, as far as the likelihood counts it."""
+        share = self.likelihood.read_noise_share if self.likelihood.knows_read_noise else 0.0
+        return self.background_e + share * self.read_variance_e2

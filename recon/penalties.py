@@ -1,8 +1,55 @@
-"""Total variation, smoothed as in the paper."""
+"""What a plane's roughness costs: the penalties of PMLEM, and total variation smoothed as in the paper."""
+
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from recon.images import Image
+
+type PenaltyName = Literal["tv", "huber-tv", "quadratic", "none"]
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """Σ φ(t) over the samples of a plane, where t is the length of the difference to the next along rows and columns.
+
+    "tv": φ = t, isotropic total variation, not smoothed. "quadratic": φ = t²/2δ. "huber-tv": φ = t²/2δ up to t = δ and
+    t − δ/2 beyond. "none": 0.
+
+    Parameters
+    ----------
+    name : str
+        One of these.
+    smoothing_e : float
+        δ in electrons; zero for total variation.
+
+    Raises
+    ------
+    ValueError
+        δ is not positive where it is needed.
+    """
+
+    name: PenaltyName = "tv"
+    smoothing_e: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.name in ("huber-tv", "quadratic") and not self.smoothing_e > 0:
+            raise ValueError(f"{self.name} needs a smoothing_e > 0, got {self.smoothing_e}")
+
+    @classmethod
+    def for_noise(cls, name: PenaltyName, noise_e: float) -> "Penalty":
+        """Return a penalty whose δ suits a back-projection with noise of a standard deviation of `noise_e`.
+
+        The quadratic penalty then weighs differences as large as the noise about as total variation does; Huber's is
+        total variation for differences above a tenth of the noise.
+        """
+        return cls(name, {"quadratic": noise_e, "huber-tv": 0.1 * noise_e}.get(name, 0.0))
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the derivative of φ stays below one."""
+        return self.name != "quadratic"
 
 
 def total_variation(plane: Image, epsilon: float) -> float:

@@ -68,6 +68,13 @@ def _check_fused_ratio(operator: PlaneOperator, dense: Image, generator: np.rand
     ratio = np.maximum(electrons + 2.0, 0.0).ravel() / (dense @ plane.ravel() + 0.25 + 2.0)
     expected = (dense.T @ ratio).reshape(operator.grid.shape)
     np.testing.assert_allclose(operator.adjoint_of_ratio(plane, images), expected, atol=_ROUNDING)
+    value, back = operator.value_and_ratio(plane, images)
+    np.testing.assert_array_equal(back, operator.adjoint_of_ratio(plane, images))
+    mean, shifted = (dense @ plane.ravel() + 2.25), np.maximum(electrons + 2.0, 0.0).ravel()
+    seen = dense.any(axis=1)
+    terms = mean - shifted + shifted * np.log(np.where(shifted > 0, shifted, 1.0) / mean)
+    assert value == pytest.approx(terms[seen].sum(), rel=1e-12)
+    assert operator.negative_log_likelihood(plane, images) == pytest.approx(value, rel=1e-12)
 
 
 def _check_views(operator: PlaneOperator, x: Image, y: Image) -> None:

@@ -12,21 +12,11 @@ from scipy.stats import norm, poisson
 
 from recon.errors import NotConverged
 from recon.images import ElementalImages, Image
+from recon.one_step_late import Iterate, Step, mlem, oscillates, pmlem_one_step_late, settled, updated_samples
 from recon.operator import PlaneOperator
 from recon.penalties import total_variation, total_variation_gradient
 from recon.plane import PlaneGrid
-from recon.solvers import (
-    Iterate,
-    Step,
-    back_projection,
-    mlem,
-    oscillates,
-    pmlem_one_step_late,
-    settled,
-    smooth_start,
-    universal_penalty_weight,
-    updated_samples,
-)
+from recon.solvers import back_projection, smooth_start, universal_penalty_weight
 
 SHAPE = (9, 12)
 

@@ -1,0 +1,188 @@
+"""One pass over the data, H, ratio and Hᵀ, by us and by peers; what it costs when the problem grows; its memory."""
+
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numba
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+
+from benchmarks.problem import Problem
+from recon.scene import SceneOperator
+
+type Run = Callable[[], object]
+
+
+def compare_passes(problem: Problem, rounds: int) -> dict[str, float]:
+    """Return how many times longer than ours each peer takes, and how many times ours the reading of the data."""
+    few = np.arange(0, len(problem.poses), 4)  # all matrices are 3 GB, and take a minute to build
+    contenders = {
+        "ours": fused_pass(problem),
+        "ours_of_few": fused_pass(problem, few),
+        "csr_of_few": sparse_pass(problem, few),
+        "warp": warp_pass(problem),
+        "floor": reading(problem.images.electrons),
+    }
+    seconds, computed = interleaved(contenders, rounds), interleaved(contenders, rounds, time.process_time)
+    return {
+        "pass_s": seconds["ours"],
+        "scipy_csr_over_ours": seconds["csr_of_few"] / seconds["ours_of_few"],
+        "cv2_warp_pair_over_ours": seconds["warp"] / seconds["ours"],
+        "scipy_csr_over_ours_computing": computed["csr_of_few"] / computed["ours_of_few"],
+        "cv2_warp_pair_over_ours_computing": computed["warp"] / computed["ours"],
+        "ours_over_reading_the_images": seconds["ours"] / seconds["floor"],
+        "bandwidth_gb_per_s": problem.images.electrons.nbytes / seconds["floor"] / 1e9,
+    }
+
+
+def scaling(problem: Problem, rounds: int) -> dict[str, float]:
+    """Return how much longer a pass takes with more of something, over what proportion would make of it."""
+    operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
+    single, few = problem.operator(workers=1), np.arange(0, len(problem.poses), 4)
+    half = Problem.of_size(problem.lens.size_px[0] // 2)
+    seconds = interleaved(
+        {
+            "all": lambda: operator.adjoint_of_ratio(plane, problem.images),
+            "one_thread": lambda: single.adjoint_of_ratio(plane, problem.images),
+            "few_views": lambda: operator.adjoint_of_ratio(plane, problem.images, few),
+            "half_size": fused_pass(half),
+            "three_planes": _scene_pass(problem, (480.0, 500.0, 520.0)),
+        },
+        rounds,
+    )
+    return {
+        "one_thread_over_all_threads": seconds["one_thread"] / seconds["all"],
+        "four_times_the_views_over_proportion": seconds["all"] / seconds["few_views"] * len(few) / len(problem.poses),
+        "four_times_the_pixels_over_proportion": seconds["all"] / seconds["half_size"] / 4,
+        "three_planes_over_proportion": seconds["three_planes"] / seconds["all"] / 3,
+    }
+
+
+def interleaved(
+    contenders: Mapping[str, Run], rounds: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
+    """Return the median seconds of each, run in turns: the machine may be busy, and then is for all of them."""
+    seconds: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds + 1):  # the first round compiles and warms up
+        for name, run in contenders.items():
+            started = clock()
+            run()
+            seconds[name].append(clock() - started)
+    return {name: statistics.median(times[1:]) for name, times in seconds.items()}
+
+
+def fused_pass(problem: Problem, views: NDArray[np.intp] | None = None) -> Run:
+    """Return our own pass: gather, ratio and scatter in one sweep."""
+    operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
+    return lambda: operator.adjoint_of_ratio(plane, problem.images, views)
+
+
+def _scene_pass(problem: Problem, depths_mm: tuple[float, ...]) -> Run:
+    scene = SceneOperator(
+        np.stack([problem.homographies(depth) for depth in depths_mm]),
+        problem.lens.rays(),
+        [problem.grid(depth) for depth in depths_mm],
+        flat=problem.flat,
+        valid=problem.images.valid,
+    )
+    planes = [np.ones(grid.shape, np.float32) for grid in scene.grids]
+    return lambda: scene.value_and_ratio(planes, problem.images)
+
+
+def sparse_pass(problem: Problem, views: NDArray[np.intp]) -> Run:
+    """Return the pass over some views with a scipy CSR matrix of each, response and mask in it, and its transpose."""
+    matrices = [_bilinear_matrix(problem, view) for view in views]
+    transposes = [matrix.T.tocsr() for matrix in matrices]
+    plane = np.ones(problem.grid().shape, np.float32).ravel()
+
+    def run() -> NDArray[np.float32]:
+        total = np.zeros_like(plane)
+        for view, matrix, transpose in zip(views, matrices, transposes, strict=True):
+            total += transpose @ _ratio(problem, view, (matrix @ plane).reshape(problem.flat.shape)).ravel()
+        return total
+
+    return run
+
+
+def warp_pass(problem: Problem) -> Run:
+    """Return the pass with OpenCV's warps, whose second is not the adjoint of the first; lens and mask are left out."""
+    camera = np.linalg.inv(problem.lens.camera_matrix())
+    index_from_pixel = [problem.grid().index_from_plane() @ h @ camera for h in problem.homographies()]
+    size = problem.grid().shape[::-1]
+    plane = np.ones(problem.grid().shape, np.float32)
+
+    def run() -> NDArray[np.float32]:
+        total = np.zeros_like(plane)
+        for view, matrix in enumerate(index_from_pixel):
+            seen = cv2.warpPerspective(plane, matrix, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            seen *= problem.flat
+            ratio = _ratio(problem, view, seen)
+            ratio *= problem.flat
+            total += cv2.warpPerspective(ratio, matrix, size, flags=cv2.INTER_LINEAR)
+        return total
+
+    return run
+
+
+def reading(images: NDArray[np.float32]) -> Run:
+    """Return the least that any pass must do: read the images once, with as many threads as the pass has."""
+    parts = np.array_split(images.reshape(-1), int(numba.config.NUMBA_NUM_THREADS))
+
+    def run() -> list[float]:
+        with ThreadPoolExecutor(len(parts)) as pool:
+            return list(pool.map(_sum, parts))
+
+    return run
+
+
+@numba.njit(nogil=True, fastmath=True)  # type: ignore[untyped-decorator]
+def _sum(part: NDArray[np.float32]) -> float:
+    total = np.float32(0)
+    for number in part:
+        total += number
+    return float(total)
+
+
+def _ratio(problem: Problem, view: int, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+    images = problem.images
+    shifted: NDArray[np.float32] = np.maximum(images.electrons[view] + images.read_variance_e2, np.float32(0))
+    seen = seen + images.background_e
+    seen += images.read_variance_e2
+    shifted /= seen
+    return shifted
+
+
+def _bilinear_matrix(problem: Problem, view: int) -> scipy.sparse.csr_array:
+    """Return H of one view, built from the rays without the operator."""
+    rays = problem.lens.rays().reshape(-1, 2)
+    homogeneous = np.column_stack([rays, np.ones(len(rays))])
+    x, y, scale = problem.grid().index_from_plane() @ problem.homographies()[view] @ homogeneous.T
+    column, row = x / scale, y / scale
+    rows, columns = problem.grid().shape
+    counts = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
+    if problem.images.valid is not None:
+        counts &= problem.images.valid[view].ravel()
+    inside = np.flatnonzero(counts)
+    left = np.minimum(column[inside].astype(int), columns - 2)
+    top = np.minimum(row[inside].astype(int), rows - 2)
+    right, down, response = column[inside] - left, row[inside] - top, problem.flat.ravel()[inside]
+    weights = [(1 - down) * (1 - right), (1 - down) * right, down * (1 - right), down * right]
+    samples = [top * columns + left + offset for offset in (0, 1, columns, columns + 1)]
+    entries = np.concatenate([response * weight for weight in weights]).astype(np.float32)
+    matrix = scipy.sparse.coo_array(
+        (entries, (np.tile(inside, 4), np.concatenate(samples))), shape=(len(rays), rows * columns)
+    )
+    return scipy.sparse.csr_array(matrix)
+
+
+def memory(size_px: int) -> dict[str, float]:
+    """Return what passes over the data need at most beside them, measured in a process of its own."""
+    command = [sys.executable, "-m", "benchmarks.memory", str(size_px)]
+    return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))

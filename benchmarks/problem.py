@@ -1,0 +1,61 @@
+"""The problem that the engine is measured on: the paper's grid, a distorted lens, maps of everything, dark data."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from calib.lens import Lens
+from recon.images import ElementalImages
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+from rig.grid import nominal_poses_rt_cam_ref
+
+DEPTH_MM = 500.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Views of a square detector: each pixel has a response, background and noise of its own, and some are bad."""
+
+    lens: Lens
+    poses: NDArray[np.float64]
+    flat: NDArray[np.float32]
+    images: ElementalImages
+
+    @classmethod
+    def of_size(cls, size_px: int, views: int = 49) -> "Problem":
+        """Return the problem for a lens of 8 % distortion and poses that are off by 0.2° and 0.3 mm."""
+        generator = np.random.default_rng(1)
+        poses = nominal_poses_rt_cam_ref(7, 7, 50.0) + generator.normal(size=(49, 6)) * np.repeat([0.0035, 0.3], 3)
+        f_px, shape = 1.25 * size_px, (views, size_px, size_px)
+        lens = Lens((size_px, size_px), f_px, f_px, size_px / 2, size_px / 2, (-0.08, 0.02))
+        electrons = np.empty(shape, np.float32)
+        valid = np.empty(shape, bool)
+        for view in range(views):
+            electrons[view] = generator.normal(1.0, 3.6, shape[1:])
+            valid[view] = generator.random(shape[1:], np.float32) > 1e-3
+        maps = generator.uniform([[[0.5]], [[0.0]], [[10.0]]], [[[1.0]], [[0.05]], [[14.0]]], (3, *shape[1:]))
+        flat, background, variance = maps.astype(np.float32)
+        return cls(lens, poses[:views], flat, ElementalImages(electrons, background, variance, valid))
+
+    def homographies(self, depth_mm: float = DEPTH_MM) -> NDArray[np.float64]:
+        """Return the way from rays to the plane at a depth, (view, 3, 3)."""
+        return plane_from_ray(self.poses, fronto_parallel_rt_ref_plane(depth_mm))
+
+    def grid(self, depth_mm: float = DEPTH_MM) -> PlaneGrid:
+        """Return the samples that overlay the reference view's pixels."""
+        size_px, pitch_mm = self.lens.size_px[0], depth_mm / self.lens.fx_px
+        return PlaneGrid((size_px, size_px), pitch_mm, (-size_px / 2 * pitch_mm, -size_px / 2 * pitch_mm))
+
+    def operator(self, workers: int | None = None) -> PlaneOperator:
+        """Return our own H."""
+        return PlaneOperator(
+            self.homographies(),
+            self.lens.rays(),
+            self.grid(),
+            flat=self.flat,
+            valid=self.images.valid,
+            workers=workers,
+        )

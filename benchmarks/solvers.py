@@ -1,0 +1,103 @@
+"""Passes and seconds until a plane stays close to the converged one: PMLEM, one-step-late, and a library's solver.
+
+The criterion is that of the PETRIC challenge: the whole plane within 1 % (root of the mean square, relative) and the
+mean of a region within 0.5 % of the converged solution, ten checks in a row; what counts is the first of the ten.
+"""
+
+import itertools
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.library_solver import primal_dual
+from benchmarks.problem import Problem
+from recon.data_fit import DataFit
+from recon.images import ElementalImages, Image
+from recon.one_step_late import pmlem_one_step_late
+from recon.operator import PlaneOperator
+from recon.pmlem import pmlem
+from recon.solvers import smooth_start, universal_penalty_weight
+
+_IN_A_ROW = 10
+_LIMIT_S = 15.0
+
+
+def compare_solvers(size_px: int) -> dict[str, float | None]:
+    """Return passes and seconds to the criterion, and how many times longer than PMLEM the others take."""
+    operator, images = _scene(size_px)
+    start = smooth_start(operator, images)
+    weight = universal_penalty_weight(operator, images, start)
+    fit = DataFit(operator, images, float(start.mean()))
+
+    def ours() -> Iterator[Image]:
+        return (iterate.plane for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=1e-3))
+
+    optimum = _last(iterate for iterate in itertools.islice(ours(), 60))
+    epsilon = 0.005 * float(np.quantile(start, 0.99)) ** 2
+
+    def late() -> Iterator[Image]:
+        steps = pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon)
+        return (iterate.plane for iterate in steps)
+
+    settled = _last(itertools.islice(late(), 200))  # its own limit: its penalty is smoothed
+    found = {
+        "pmlem": _to_criterion(ours, optimum),
+        "one_step_late": _to_criterion(late, settled),
+        "pyproximal": _to_criterion(lambda: primal_dual(operator, images, start, weight, optimum), optimum),
+    }
+    result: dict[str, float | None] = {}
+    for name, (passes, seconds) in found.items():
+        result |= {f"{name}_passes": passes, f"{name}_s": seconds}
+    for name in ("one_step_late", "pyproximal"):
+        theirs, own = result[f"{name}_s"], result["pmlem_s"]
+        result[f"{name}_over_pmlem"] = theirs / own if theirs and own else None
+    return result
+
+
+def _scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
+    """Return dark views (one electron per pixel, read noise 3.5) of rectangles of several levels."""
+    problem, generator = Problem.of_size(size_px), np.random.default_rng(4)
+    operator, truth = problem.operator(), np.full(problem.grid().shape, 0.3)
+    for _ in range(25):
+        top, left = generator.integers(0, size_px, 2)
+        high, wide = generator.integers(size_px // 16, size_px // 3, 2)
+        truth[top : top + high, left : left + wide] = generator.uniform(0.1, 2.0)
+    light = operator.forward(truth) + np.asarray(problem.images.background_e)
+    noise = np.sqrt(np.asarray(problem.images.read_variance_e2))
+    electrons = (generator.poisson(light) + noise * generator.normal(size=light.shape)).astype(np.float32)
+    known = problem.images
+    return operator, ElementalImages(electrons, known.background_e, known.read_variance_e2, known.valid)
+
+
+def _to_criterion(iterate: Callable[[], Iterable[Image] | None], converged: Image) -> tuple[float | None, float | None]:
+    """Return after how many passes and seconds the criterion holds; None where it does not within the limit."""
+    planes = iterate()
+    if planes is None:
+        return None, None
+    rows, columns = converged.shape
+    region = np.s_[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3]
+    held: list[tuple[float, float]] = []
+    checking, started = 0.0, time.perf_counter()
+    for passes, plane in enumerate(planes, 1):
+        now = time.perf_counter()
+        error = np.linalg.norm(plane - converged) / np.linalg.norm(converged)
+        close = error <= 0.01 and abs(_mean(plane[region]) / _mean(converged[region]) - 1) <= 0.005
+        held = [*held, (passes, now - started - checking)] if close else []
+        checking += time.perf_counter() - now
+        if len(held) == _IN_A_ROW:
+            return held[0]
+        if now - started > _LIMIT_S:
+            break
+    return None, None
+
+
+def _mean(part: NDArray[np.floating]) -> float:
+    return float(part.mean(dtype=np.float64))
+
+
+def _last(planes: Iterable[Image]) -> Image:
+    for plane in planes:
+        last = plane
+    return last

@@ -1,0 +1,73 @@
+"""The weight that predicts held-out views, against the weight that the truth would choose."""
+
+import numpy as np
+import pytest
+
+from recon.data_fit import DataFit
+from recon.held_out import chosen_weight, held_out_views
+from recon.images import ElementalImages, Image
+from recon.operator import PlaneOperator
+from recon.penalties import Penalty
+from recon.plane import PlaneGrid
+from recon.pmlem import pmlem
+from recon.solvers import smooth_start, universal_penalty_weight
+
+
+@pytest.mark.parametrize("views", [4, 5, 9, 13, 25, 49, 50, 81, 98])
+def test_folds_are_disjoint_and_cover_all_views(views: int) -> None:
+    count = max(2, min(7, views // 2))
+    folds = [held_out_views(views, fold) for fold in range(count)]
+    assert sorted(np.concatenate(folds).tolist()) == list(range(views))
+    assert all(0.5 <= len(fold) * count / views <= 2 for fold in folds)
+
+
+def test_in_a_grid_of_seven_by_seven_each_row_and_column_gives_one() -> None:
+    for fold in range(7):
+        rows, columns = np.divmod(held_out_views(49, fold), 7)
+        assert sorted(rows.tolist()) == sorted(columns.tolist()) == list(range(7))
+
+
+def scene(size: int = 96) -> Image:
+    y, x = np.mgrid[:size, :size] / size
+    disc = 1.0 * ((x - 0.4) ** 2 + (y - 0.5) ** 2 < 0.08)
+    return np.asarray(0.2 + disc + 0.4 * ((x > 0.6) & (y > 0.3)) + 0.2 * np.sin(9 * x) * (y < 0.25), np.float32)
+
+
+def dark_views(truth: Image, seed: int) -> tuple[PlaneOperator, ElementalImages]:
+    generator = np.random.default_rng(seed)
+    size = len(truth)
+    homographies = np.stack([np.eye(3)] * 49)
+    homographies[:, :2, 2] = generator.uniform(-2, 2, (49, 2))
+    rays = np.stack(np.meshgrid(np.arange(float(size)), np.arange(float(size))), axis=-1)
+    operator = PlaneOperator(homographies, rays, PlaneGrid(truth.shape, 1.0, (0.0, 0.0)))
+    electrons = generator.poisson(operator.forward(truth)) + generator.normal(0, 3.46, operator.images_shape)
+    return operator, ElementalImages(electrons.astype(np.float32), 0.0, 12.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: int) -> None:
+    truth = scene()
+    operator, images = dark_views(truth, seed)
+    start = smooth_start(operator, images)
+    guess = universal_penalty_weight(operator, images, start)
+    fit = DataFit(operator, images, float(start.mean()))
+
+    def error(weight: float) -> float:
+        for iterate in pmlem(fit, start, penalty_weight=weight):
+            if iterate.certificate.distance < 0.01 or iterate.passes >= 10:
+                break
+        return float(np.mean((iterate.plane - truth)[8:-8, 8:-8] ** 2))
+
+    chosen = chosen_weight(operator, images, guess / 3, Penalty())  # a guess that is far off
+    best = min(error(guess * 2 ** (step / 2)) for step in range(-3, 4))
+    assert error(chosen.weight) <= 1.1 * best
+    scores = {tried.weight: tried.held_out for tried in chosen.tried}
+    assert min(scores) < chosen.weight < max(scores)
+    assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
+    assert chosen.passes < 60 * 7  # each of seven folds: these views have few pixels
+
+
+def test_too_few_views_are_refused() -> None:
+    few = PlaneOperator(np.stack([np.eye(3)] * 3), np.zeros((4, 4, 2)), PlaneGrid((4, 4), 1.0, (0.0, 0.0)))
+    with pytest.raises(ValueError, match="at least 4 views"):
+        chosen_weight(few, ElementalImages(np.ones((3, 4, 4))), 1.0, Penalty())

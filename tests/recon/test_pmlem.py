@@ -1,0 +1,181 @@
+"""PMLEM against two solvers of other kinds on a matrix of its own; its certificate against true distances."""
+
+from collections.abc import Callable
+from itertools import islice, pairwise
+
+import numpy as np
+import pytest
+
+from recon.data_fit import DataFit
+from recon.errors import NotConverged
+from recon.images import Image, LikelihoodName
+from recon.penalties import Penalty
+from recon.pmlem import PmlemIterate, norm, pmlem
+from recon.solvers import smooth_start
+from tests.recon.small_problems import (
+    SHAPE,
+    Problem,
+    difference_matrix,
+    primal_dual_solution,
+    problem,
+    smooth_solution,
+)
+
+LIKELIHOODS: list[LikelihoodName] = ["shifted-poisson", "poisson-gaussian", "least-squares"]
+WEIGHT = 1.5
+
+
+def started(posed: Problem) -> tuple[DataFit, Image]:
+    start = smooth_start(posed.operator, posed.images)
+    return DataFit(posed.operator, posed.images, float(start.mean())), start
+
+
+def solved(
+    posed: Problem, weight: float, penalty: Penalty, *, tolerance: float = 1e-6, most: int = 400
+) -> PmlemIterate:
+    fit, start = started(posed)
+    for iterate in pmlem(fit, start, penalty_weight=weight, penalty=penalty, tolerance=tolerance):
+        if iterate.certificate.distance <= tolerance or iterate.passes >= most:
+            break
+    return iterate
+
+
+def distance(found: Image, best: Image) -> float:
+    return float(np.linalg.norm(found - best) / np.linalg.norm(best))
+
+
+def quadratic(delta: float) -> Callable[[Image], tuple[Image, Image]]:
+    return lambda t: (t**2 / (2 * delta), np.full_like(t, 1 / delta))
+
+
+def huber(delta: float) -> Callable[[Image], tuple[Image, Image]]:
+    return lambda t: (np.where(t < delta, t**2 / (2 * delta), t - delta / 2), 1 / np.maximum(t, delta))
+
+
+def test_the_matrix_is_the_operator() -> None:
+    posed, plane = problem(), np.random.default_rng(1).normal(size=SHAPE)
+    np.testing.assert_allclose(posed.operator.forward(plane).ravel(), posed.matrix @ plane.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_total_variation_finds_what_a_primal_dual_method_finds(likelihood: LikelihoodName) -> None:
+    posed = problem(likelihood)
+    best = primal_dual_solution(posed, WEIGHT, 5000)
+    found = solved(posed, WEIGHT, Penalty())
+    assert distance(found.plane, best) <= 1e-4
+    differences = (difference_matrix() @ best.ravel()).reshape(2, -1)
+    assert (np.hypot(*differences) < 1e-6).mean() > 0.2  # the penalty does something: pieces are flat
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+@pytest.mark.parametrize(("penalty", "phi"), [("quadratic", quadratic), ("huber-tv", huber)])
+def test_smooth_penalties_find_what_a_quasi_newton_method_finds(
+    likelihood: LikelihoodName, penalty: str, phi: Callable[[float], Callable[[Image], tuple[Image, Image]]]
+) -> None:
+    posed = problem(likelihood)
+    found = solved(posed, WEIGHT, Penalty.for_noise(penalty, 0.7))  # type: ignore[arg-type]
+    delta = {"quadratic": 0.7, "huber-tv": 0.07}[penalty]
+    assert distance(found.plane, smooth_solution(posed, WEIGHT, phi(delta))) <= 1e-4
+
+
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_without_penalty_it_finds_the_maximum_of_the_likelihood(likelihood: LikelihoodName) -> None:
+    posed = problem(likelihood, views=30)
+    best = smooth_solution(posed, 0.0, quadratic(1.0))
+    assert distance(solved(posed, 0.0, Penalty("none"), most=3000).plane, best) <= 1e-4
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_no_plane_is_further_from_the_optimum_than_its_certificate_says(likelihood: LikelihoodName, seed: int) -> None:
+    posed = problem(likelihood, seed=seed)
+    best = solved(posed, WEIGHT, Penalty(), tolerance=1e-7).plane
+    fit, start = started(posed)
+    metric = fit.metric(best)
+    for tolerance in (0.1, 0.003):
+        for iterate in islice(pmlem(fit, start, penalty_weight=WEIGHT, tolerance=tolerance), 8):
+            true = norm(iterate.plane - best, metric) / norm(best, metric)
+            assert true <= iterate.certificate.distance + 1e-6
+        assert iterate.certificate.distance <= tolerance
+
+
+@pytest.mark.parametrize(
+    ("background_e", "variance_e2", "low", "high", "reached"),
+    [
+        (0.3, 12.0, 0.5, 2.0, 0.01),
+        (0.02, 0.0, 0.05, 3.0, 0.01),
+        (5.0, 2.0, 0.0, 900.0, 0.01),
+        (0.0, 0.0, 0.1, 40.0, 0.03),
+        (0.0, 0.0, 1.0, 2000.0, 0.2),  # a thousand to one with no background: not in 40 passes
+    ],
+)
+def test_the_objective_never_rises(
+    background_e: float, variance_e2: float, low: float, high: float, reached: float
+) -> None:
+    posed = problem(background_e=background_e, variance_e2=variance_e2, low=low, high=high)
+    fit, start = started(posed)
+    iterates = []
+    for iterate in pmlem(fit, start, penalty_weight=0.5):
+        iterates.append(iterate)
+        if iterate.passes >= 40 or iterate.certificate.distance < 0.003:
+            break
+    for before, after in pairwise(iterates):
+        assert after.objective <= before.objective + 1e-6 * abs(before.objective)
+    assert iterates[-1].certificate.distance < reached
+    assert (iterates[-1].plane >= 0).all()
+
+
+def test_a_metric_that_is_too_small_is_made_larger_until_the_objective_falls() -> None:
+    posed = problem()
+    fit, start = started(posed)
+
+    class TooBold:
+        may_reach_zero = True
+
+        def value_and_gradient(self, plane: Image) -> tuple[float, Image]:
+            return fit.value_and_gradient(plane)
+
+        def metric(self, plane: Image) -> Image:
+            return fit.metric(plane) / 16
+
+    iterates = list(islice(pmlem(TooBold(), start, penalty_weight=WEIGHT, tolerance=1e-4), 60))
+    assert iterates[1].passes > 2  # steps were undone
+    assert all(after.objective <= before.objective * (1 + 1e-6) for before, after in pairwise(iterates))
+    assert distance(iterates[-1].plane, solved(posed, WEIGHT, Penalty()).plane) < 2e-3
+
+
+def test_a_small_precision_reaches_the_same_plane() -> None:
+    posed = problem()
+    double = solved(posed, WEIGHT, Penalty()).plane
+    single = solved(problem(dtype=np.float32), WEIGHT, Penalty(), tolerance=3e-3).plane
+    assert single.dtype == np.float32
+    assert distance(single, double) < 2e-3
+
+
+def test_a_similar_problem_solved_before_saves_passes() -> None:
+    posed = problem()
+    fit, start = started(posed)
+    near = solved(posed, 1.1 * WEIGHT, Penalty(), tolerance=1e-3)
+    begun = next(pmlem(fit, np.maximum(near.plane, 1e-3), penalty_weight=WEIGHT, dual=near.dual))
+    assert begun.certificate.distance < next(pmlem(fit, start, penalty_weight=WEIGHT)).certificate.distance / 2
+
+
+@pytest.mark.parametrize(("weight", "least", "words"), [(-1.0, 1.0, "penalty_weight"), (1.0, 0.0, "start must be")])
+def test_arguments_out_of_range_are_refused_before_the_first_pass(weight: float, least: float, words: str) -> None:
+    fit, start = started(problem())
+    with pytest.raises(ValueError, match=words):
+        pmlem(fit, np.full_like(start, least), penalty_weight=weight)
+
+
+def test_numbers_that_leave_the_finite_are_refused() -> None:
+    class Overflowing:
+        may_reach_zero = True
+
+        def value_and_gradient(self, plane: Image) -> tuple[float, Image]:
+            return float("nan"), plane
+
+        def metric(self, plane: Image) -> Image:
+            return np.ones_like(plane)
+
+    with pytest.raises(NotConverged, match="pass 1 left the finite numbers"):
+        next(pmlem(Overflowing(), np.ones(SHAPE), penalty_weight=1.0))

@@ -1,0 +1,150 @@
+"""Several planes in one sweep against operators of one plane each; blocks against scipy; data that stay on disk."""
+
+import tracemalloc
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from calib.lens import Lens
+from recon import kernels
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages, Image
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+from recon.scene import SceneOperator
+
+# Four blocks of pixels and a rest; poses in step with the planes, turned so that they are not, and far aside
+LENS = Lens((4 * kernels.BLOCK_PX + 9, 13), 300.0, 300.0, 130.2, 6.1, (-0.08, 0.02))
+POSES = np.array([[0.0] * 6, [2e-3, -3e-3, 4e-3, 30, -4, 3], [0, 0, 0.2, -20, 5, 0], [0, 0, 0, -190, 0, 0]])
+DEPTHS_MM = (400.0, 500.0, 900.0)
+GRIDS = tuple(
+    PlaneGrid((rows, columns), pitch * depth / 300.0, (-columns * pitch * depth / 600.0, -rows * pitch * depth / 600.0))
+    for depth, rows, columns, pitch in zip(DEPTHS_MM, (21, 15, 9), (260, 270, 101), (1.0, 1.0, 2.0), strict=True)
+)
+HOMOGRAPHIES = np.stack([plane_from_ray(POSES, fronto_parallel_rt_ref_plane(depth)) for depth in DEPTHS_MM])
+IMAGES_SHAPE = (len(POSES), LENS.size_px[1], LENS.size_px[0])
+
+
+def known(generator: np.random.Generator) -> dict[str, Any]:
+    return {
+        "flat": generator.uniform(0.5, 1.0, IMAGES_SHAPE[1:]),
+        "valid": generator.random(IMAGES_SHAPE) > 0.05,
+        "dtype": np.float64,
+        "workers": 2,
+    }
+
+
+@pytest.fixture
+def generator() -> np.random.Generator:
+    return np.random.default_rng(7)
+
+
+def singles(options: dict[str, Any]) -> list[PlaneOperator]:
+    return [PlaneOperator(h, LENS.rays(), grid, **options) for h, grid in zip(HOMOGRAPHIES, GRIDS, strict=True)]
+
+
+def planes_of(generator: np.random.Generator) -> list[Image]:
+    return [generator.normal(size=grid.shape) for grid in GRIDS]
+
+
+@pytest.mark.parametrize("occluded", [False, True])
+def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.Generator) -> None:
+    options = known(generator)
+    transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE)) if occluded else np.ones((len(GRIDS), 1, 1, 1))
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options, transmission=transmission if occluded else None)
+    alone = singles(options)
+    planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
+    expected = sum(t * one.forward(plane) for one, plane, t in zip(alone, planes, transmission, strict=True))
+    np.testing.assert_allclose(scene.forward(planes), expected, atol=1e-12)
+    for back, one, t in zip(scene.adjoint(images), alone, transmission, strict=True):
+        np.testing.assert_allclose(back, one.adjoint(t * images), atol=1e-12)
+
+
+def test_a_scene_and_its_adjoint_are_adjoint(generator: np.random.Generator) -> None:
+    transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE))
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **known(generator), transmission=transmission)
+    planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
+    seen = scene.forward(planes)
+    back = sum(float(np.vdot(plane, other)) for plane, other in zip(planes, scene.adjoint(images), strict=True))
+    assert abs(float(np.vdot(seen, images)) - back) <= 1e-12 * np.linalg.norm(seen) * np.linalg.norm(images)
+
+
+def test_the_ratio_of_a_scene_is_formed_with_what_all_planes_give(generator: np.random.Generator) -> None:
+    options = known(generator)
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options)
+    planes = [generator.uniform(0.5, 2.0, grid.shape) for grid in GRIDS]
+    electrons = generator.normal(1.0, 3.0, IMAGES_SHAPE)
+    images = ElementalImages(electrons, 0.25, 2.0, options["valid"])
+    value, ratios = scene.value_and_ratio(planes, images)
+    mean, shifted = scene.forward(planes) + 2.25, np.maximum(electrons + 2.0, 0)
+    for ratio, one in zip(ratios, singles(options), strict=True):
+        np.testing.assert_allclose(ratio, one.adjoint(shifted / mean), atol=1e-12)
+    met = scene.forward([np.ones(grid.shape) for grid in GRIDS]) > 0
+    terms = mean - shifted + shifted * np.log(np.where(shifted > 0, shifted, 1.0) / mean)
+    assert value == pytest.approx(terms[met].sum(), rel=1e-12)
+    assert scene.negative_log_likelihood(planes, images) == pytest.approx(value, rel=1e-12)
+
+
+@pytest.mark.parametrize("plane", range(len(GRIDS)))
+def test_blocks_in_step_and_not_interpolate_as_scipy_does(plane: int, generator: np.random.Generator) -> None:
+    grid, samples = GRIDS[plane], generator.normal(size=GRIDS[plane].shape)
+    seen = PlaneOperator(HOMOGRAPHIES[plane], LENS.rays(), grid, dtype=np.float64).forward(samples)
+    at = index_of_pixels(HOMOGRAPHIES[plane], grid)
+    rows, columns = grid.shape
+    inside = (at[0] >= 0) & (at[0] <= rows - 1) & (at[1] >= 0) & (at[1] <= columns - 1)
+    assert all(inside[view].sum() > 200 for view in range(3))
+    expected = np.where(inside, map_coordinates(samples, at, order=1, mode="nearest"), 0)
+    np.testing.assert_allclose(seen, expected, atol=1e-10)
+
+
+def index_of_pixels(homographies: NDArray[Any], grid: PlaneGrid) -> NDArray[np.float64]:
+    """Row and column (2, view, row, column) on a plane's grid that each pixel looks at."""
+    rays = np.concatenate([LENS.rays(), np.ones((*IMAGES_SHAPE[1:], 1))], axis=-1)
+    x, y, scale = np.einsum("vij,rcj->ivrc", homographies, rays)
+    return np.stack([(y / scale - grid.origin_mm[1]), (x / scale - grid.origin_mm[0])]) / grid.pitch_mm
+
+
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        ({"transmission": np.ones((3, 4, 13, 5))}, "transmission has shape"),
+        ({"transmission": np.full((3, *IMAGES_SHAPE), -0.1)}, "a transmission is negative"),
+        ({"transmission": np.full((3, *IMAGES_SHAPE), np.nan)}, "not a finite number"),
+        ({"grids": GRIDS[:2]}, "do not fit"),
+        ({"grids": (*GRIDS[:2], PlaneGrid((5, 5), 1.0, (9e5, 0.0)))}, "no pixel of any of the 4 views"),
+    ],
+)
+def test_parts_of_a_scene_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> None:
+    with pytest.raises(GeometryMismatch, match=words):
+        SceneOperator(HOMOGRAPHIES, LENS.rays(), **{"grids": GRIDS, **bad})
+
+
+@pytest.mark.parametrize("shapes", [(GRIDS[0].shape,), (GRIDS[1].shape, GRIDS[0].shape, GRIDS[2].shape)])
+def test_planes_of_other_shapes_than_the_scenes_are_refused(shapes: Sequence[tuple[int, int]]) -> None:
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS)
+    with pytest.raises(GeometryMismatch, match="shapes"):
+        scene.forward([np.ones(shape) for shape in shapes])
+
+
+def test_data_that_stay_on_disk_are_neither_copied_nor_compiled_for(tmp_path: Path) -> None:
+    shape, grid = (60, 128, 128), PlaneGrid((128, 128), 1.0, (0.0, 0.0))
+    electrons = np.random.default_rng(5).normal(1, 3, shape).astype(np.float32)
+    np.save(tmp_path / "electrons.npy", electrons)
+    rays = np.stack(np.meshgrid(np.arange(128.0), np.arange(128.0)), axis=-1)
+    operator = PlaneOperator(np.repeat(np.eye(3)[np.newaxis], 60, axis=0), rays, grid, workers=2)
+    plane = np.ones(grid.shape, np.float32)
+    in_memory = operator.adjoint_of_ratio(plane, ElementalImages(electrons, 0.1, 9.0))
+    compiled = len(kernels.sweep.signatures)
+    tracemalloc.start()
+    on_disk = ElementalImages(np.load(tmp_path / "electrons.npy", mmap_mode="r"), 0.1, 9.0)
+    np.testing.assert_array_equal(operator.adjoint_of_ratio(plane, on_disk), in_memory)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < electrons.nbytes / 4
+    assert len(kernels.sweep.signatures) == compiled
