@@ -184,7 +184,7 @@ def _error_sections(directory: Path) -> dict[str, Any]:
 
 
 def _is_of(row: dict[str, Any], method: str, poses: str) -> bool:
-    """Return whether errors are those of a method's planes; of stated poses they say whether these are the true ones."""
+    """Return whether errors are those of a method's planes; of stated poses, errors say whether they are true."""
     return row["method"] == method and poses in ("stated", row["poses"])
 
 

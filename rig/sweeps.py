@@ -59,8 +59,8 @@ def _nodes_without_a_board(boards: Sequence[PlannedFrame], corners: Mapping[int,
         return []
     named = ", ".join(map(str, blind[:_MOST_NAMED])) + (" …" if len(blind) > _MOST_NAMED else "")
     return [
-        f"{len(blind)} of {len(best)} nodes see {limit} board corners in no sweep ({named}), so that their poses cannot "
-        "be found; add a sweep with a board in their view"
+        f"{len(blind)} of {len(best)} nodes see {limit} board corners in no sweep ({named}), so that their poses "
+        "cannot be found; add a sweep with a board in their view"
     ]
 
 

@@ -50,8 +50,11 @@ class SimulatedCamera:
         truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
         pixels = self._lab.expose(exposure_s, number)
         self._clock.sleep_s(exposure_s + _READOUT_S)
-        metadata = {"camera": "simulated camera", "temperature_c": _TEMPERATURE_C, TRUE_POSE: truth}
-        return Exposure(".tiff", pixels=pixels, metadata=metadata)
+        return Exposure(
+            ".tiff",
+            pixels=pixels,
+            metadata={"camera": "simulated camera", "temperature_c": _TEMPERATURE_C, TRUE_POSE: truth},
+        )
 
     def close(self) -> None:
         """Disconnect."""

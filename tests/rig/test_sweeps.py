@@ -8,7 +8,7 @@ from rig.stages.protocol import Point
 from rig.sweeps import board_doubts
 
 _GRID = Grid(3, 3, 50.0, Point(0.0, 0.0))
-_PLAN = CapturePlan.of(_GRID, [Step("charuco", (0.1,)), Step("charuco", (0.1,))], approach_mm=1.0, frame_bytes=1)  # type: ignore[arg-type]
+_PLAN = CapturePlan.of(_GRID, [Step("charuco", (0.1,)), Step("charuco", (0.1,))], approach_mm=1.0, frame_bytes=1)
 FRAMES = planned_frames(_PLAN)
 
 
