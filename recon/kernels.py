@@ -39,7 +39,8 @@ COLUMN_TAPS, ROW_TAPS = 4, 3
 EDGE_TOLERANCE = 1e-3
 
 FORWARD, ADJOINT, RATIO, VALUE, REACH = 0, 1, 2, 3, 4
-_SCATTERED, _IN_STEP, _OUTSIDE = 0, 1, 2
+# How a block lies on a plane; in step with it, by how many rows and columns of taps it needs.
+_OUTSIDE, _SCATTERED, _IN_STEP_2_2, _IN_STEP_2_3, _IN_STEP_3_3, _IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
 
 # Vectors are fastest where they do not straddle the processor's cache lines.
 _LINE_BYTES = 64
@@ -156,9 +157,15 @@ def _arrangement(row_from, row_to, column_from, column_to, start, stride, sample
     """
     if row_to < row_from:
         return _OUTSIDE
-    in_step = row_to - row_from < ROW_TAPS - 1 and column_to - column_from < COLUMN_TAPS - 1
+    rows, columns = row_to - row_from + 2, column_to - column_from + 2
     end = start + (ROW_TAPS - 1) * stride + BLOCK_PX + _MARGIN
-    return _IN_STEP if in_step and start >= 0 and end <= samples else _SCATTERED
+    if rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
+        return _SCATTERED
+    if columns > 3:
+        return _IN_STEP_3_4
+    if rows > 2:
+        return _IN_STEP_3_3
+    return _IN_STEP_2_3 if columns > 2 else _IN_STEP_2_2
 
 
 @inlined
@@ -168,71 +175,106 @@ def _tent(distance):
 
 
 @inlined
-def _row_weights(down):
-    """Return the tents of the three rows; they sum to one."""
+def _row_weights(down, rows):
+    """Return the tents of the rows; they sum to one."""
     number = type(down)
     zero, one = number(0), number(1)
+    if rows == 2:
+        return one - down, down, zero
     upper = one - down if down < one else zero
     lower = down - one if down > one else zero
     return upper, one - upper - lower, lower
 
 
-@compiled
-def _gather_in_step(samples, start, stride, row_from, column_from, scratch, place):
+@inlined
+def _gather_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
     """Add to `_EXPECTED` what the block's pixels see: the plane, interpolated bilinearly, times the weight."""
     number = type(scratch[0])
     row, column = number(row_from), number(column_from)
-    upper = index(start)
-    middle = upper + index(stride)
-    lower = middle + index(stride)
-    one, two, three = index(1), index(2), index(3)
+    across, down = advanced(scratch, place + index(_COLUMN)), advanced(scratch, place + index(_ROW))
+    weights = advanced(scratch, place + index(_WEIGHT))
     for k in range(index(BLOCK_PX)):
-        along = scratch[place + index(_COLUMN) + k] - column
-        t0, t1, t2, t3 = _tent(along), _tent(along - number(1)), _tent(along - number(2)), _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + index(_ROW) + k] - row)
-        at = upper + k
-        above = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        at = middle + k
-        here = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        at = lower + k
-        below = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        seen = scratch[place + index(_WEIGHT) + k] * (u0 * above + u1 * here + u2 * below)
-        scratch[index(_EXPECTED) + k] += seen
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        seen = u0 * _along_row(columns, along, samples, k)
+        seen += u1 * _along_row(columns, along, samples, index(stride) + k)
+        if rows > 2:
+            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + k)
+        scratch[index(_EXPECTED) + k] += weights[k] * seen
 
 
-@compiled
-def _scatter_in_step(samples, start, stride, row_from, column_from, scratch, place):
-    """Add `_EXPECTED` to the plane with the weights that `_gather_in_step` reads it with.
+@inlined
+def _along_row(columns, along, samples, at):
+    """Return a row of the plane, interpolated."""
+    number = type(along)
+    if columns == 2:
+        return samples[at] + along * (samples[at + index(1)] - samples[at])
+    seen = _tent(along) * samples[at] + _tent(along - number(1)) * samples[at + index(1)]
+    seen += _tent(along - number(2)) * samples[at + index(2)]
+    if columns > 3:
+        seen += _tent(along - number(3)) * samples[at + index(3)]
+    return seen
+
+
+@inlined
+def _scatter_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
+    """Add `_EXPECTED` to the plane with the weights that `_gather_taps` reads it with.
 
     Products of all taps are formed first and then added, shifted, once per row of samples: stores that overlap loads
     soon after would make the processor wait. A pixel that does not count may hold anything, a NaN as well.
     """
     number = type(scratch[0])
     row, column, zero = number(row_from), number(column_from), number(0)
-    size, base = index(_PRODUCT_PX), index(_PRODUCTS)
+    across, down = advanced(scratch, place + index(_COLUMN)), advanced(scratch, place + index(_ROW))
+    weights = advanced(scratch, place + index(_WEIGHT))
+    size = index(_PRODUCT_PX)
+    upper = advanced(scratch, index(_PRODUCTS))
+    middle, lower = advanced(upper, index(columns) * size), advanced(upper, index(2 * columns) * size)
     for k in range(index(BLOCK_PX)):
-        weight = scratch[place + index(_WEIGHT) + k]
-        value = weight * scratch[index(_EXPECTED) + k] if weight != zero else zero
-        along = scratch[place + index(_COLUMN) + k] - column
-        v0, v1 = value * _tent(along), value * _tent(along - number(1))
-        v2, v3 = value * _tent(along - number(2)), value * _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + index(_ROW) + k] - row)
-        at = base + k
-        scratch[at], scratch[at + size] = u0 * v0, u0 * v1
-        scratch[at + index(2) * size], scratch[at + index(3) * size] = u0 * v2, u0 * v3
-        scratch[at + index(4) * size], scratch[at + index(5) * size] = u1 * v0, u1 * v1
-        scratch[at + index(6) * size], scratch[at + index(7) * size] = u1 * v2, u1 * v3
-        scratch[at + index(8) * size], scratch[at + index(9) * size] = u2 * v0, u2 * v1
-        scratch[at + index(10) * size], scratch[at + index(11) * size] = u2 * v2, u2 * v3
-    first = index(start)
-    for _ in range(ROW_TAPS):
-        second, third = base + size - index(1), base + index(2) * size - index(2)
-        fourth = base + index(3) * size - index(3)
+        value = weights[k] * scratch[index(_EXPECTED) + k] if weights[k] != zero else zero
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        for tap in range(columns):
+            share = value * _tent(along - number(tap))
+            upper[index(tap) * size + k] = u0 * share
+            middle[index(tap) * size + k] = u1 * share
+            if rows > 2:
+                lower[index(tap) * size + k] = u2 * share
+    for r in range(rows):
+        products, target = advanced(upper, index(r * columns) * size), advanced(samples, index(r * stride))
         for k in range(index(BLOCK_PX + _MARGIN)):
-            even = scratch[base + k] + scratch[second + k]
-            samples[first + k] += even + (scratch[third + k] + scratch[fourth + k])
-        first += index(stride)
-        base += index(COLUMN_TAPS) * size
+            added = products[k]
+            for tap in range(1, columns):
+                added += products[index(tap) * (size - index(1)) + k]
+            target[k] += added
+
+
+@compiled
+def _gather_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Interpolate with as few taps as the block's lie allows; each number of taps is compiled by itself."""
+    samples = advanced(samples, index(start))
+    if how == _IN_STEP_2_2:
+        _gather_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_2_3:
+        _gather_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_3_3:
+        _gather_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _gather_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+
+
+@compiled
+def _scatter_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Scatter with the taps of `_gather_in_step`."""
+    samples = advanced(samples, index(start))
+    if how == _IN_STEP_2_2:
+        _scatter_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_2_3:
+        _scatter_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_3_3:
+        _scatter_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _scatter_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
 
 
 @inlined
@@ -329,9 +371,9 @@ def _gather(samples, layout, planes, scratch, blocks):
         for k in range(index(BLOCK_PX)):
             at = index(_COUNTED) + k
             scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
-        if blocks[block] == _IN_STEP:
+        if blocks[block] > _SCATTERED:
             start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
-            _gather_in_step(samples, start, width, row, column, scratch, place)
+            _gather_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         else:
             start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _gather_scattered(samples, start, height, width, scratch, place)
@@ -342,9 +384,9 @@ def _scatter(samples, layout, planes, scratch, blocks):
     """Add `_EXPECTED` to all planes."""
     for plane in range(index(planes)):
         block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
-        if blocks[block] == _IN_STEP:
+        if blocks[block] > _SCATTERED:
             start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
-            _scatter_in_step(samples, start, width, row, column, scratch, place)
+            _scatter_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         elif blocks[block] == _SCATTERED:
             start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _scatter_scattered(samples, start, height, width, scratch, place)
