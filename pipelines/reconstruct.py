@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from pipelines.arguments import Count, NotNegative, Positive
 from pipelines.channels import channel_layouts, default_pitch_px, plane_grid, require_in_front
+from pipelines.cluster import crew_of
 from pipelines.console import say
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
@@ -75,6 +76,8 @@ def reconstruct(
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
     scene: SceneKind = "dark_scene",
+    workers: Count | None = None,
+    scheduler: str | None = None,
 ) -> dict[str, Any]:
     """Reconstruct planes of the scene at chosen depths.
 
@@ -116,7 +119,12 @@ def reconstruct(
         geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
     scene
         Which of a session's sets: the dark scene, or the bright one.
+    workers
+        Have the planes made by so many processes of one thread each; needs the extra faintfield[cluster].
+    scheduler
+        Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
     """
+    crew = crew_of(workers, scheduler)
     swept = swept_depths(sweep_mm) if sweep_mm else []
     if not (depth_mm or swept or disparity_px):
         raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
@@ -134,7 +142,7 @@ def reconstruct(
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty)
     request = Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept))
-    return reconstruct_set(loaded, out, request)
+    return reconstruct_set(loaded, out, request, crew)
 
 
 def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew = one_by_one) -> dict[str, Any]:
