@@ -1,6 +1,6 @@
 """All planes of a scene together, in one channel: g = Σ_z H_z f_z + b, or with what nearer planes hide of farther ones."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from pipelines.channels import OperatorFactory
@@ -17,32 +17,34 @@ from recon.scene import SceneOperator
 _ROUNDS = 2
 
 
-def solve_joint(
+def solve_together(
     factory: OperatorFactory,
     images: ElementalImages,
     grids: Mapping[float, PlaneGrid],
-    method: Method,
+    methods: Collection[Method],
     settings: Settings,
-) -> dict[float, Solution]:
+) -> dict[Method, dict[float, Solution]]:
     """Reconstruct all planes of one channel together, so that none has to explain the light of the others.
 
     Parameters
     ----------
     grids : mapping of float to PlaneGrid
         The samples at each depth in mm.
-    method : Method
-        "joint", or "occlusion": then planes hide those behind them, where that explains the images better.
+    methods : collection of Method
+        "joint", "occlusion" or both: by the latter planes hide those behind them, where that explains the images
+        better.
 
     Returns
     -------
-    mapping of float to Solution
-        By depth. All records tell of the one iteration: its penalty weight, passes, objective and certificate.
+    dict of Method to dict of float to Solution
+        By method and depth. All records tell of one iteration: its penalty weight, passes, objective and certificate.
     """
     operator = factory.of_scene(grids)
-    found = certified(PosedScene(operator, images), settings)
-    if method == "occlusion":
-        found = _with_occlusion(factory, operator, images, grids, found, settings)
-    return dict(zip(grids, found, strict=True))
+    joint = certified(PosedScene(operator, images), settings)
+    found: dict[Method, list[Solution]] = {"joint": joint}
+    if "occlusion" in methods:
+        found["occlusion"] = _with_occlusion(factory, operator, images, grids, joint, settings)
+    return {method: dict(zip(grids, found[method], strict=True)) for method in methods}
 
 
 def _with_occlusion(
@@ -66,10 +68,12 @@ def _with_occlusion(
         if better[0].record["objective"] >= found[0].record["objective"]:
             break
         found = [
-            replace(one, record=one.record | chosen | {"occlusion_rounds": done + 1}, opacity=of_plane)
+            Solution(
+                one.plane, one.record | chosen | {"occlusion_rounds": done + 1}, one.beside | {"opacity": of_plane}
+            )
             for one, of_plane in zip(better, opacities, strict=True)
         ]
-    if found[0].opacity is None:
+    if "opacity" not in found[0].beside:
         say("occlusion explains the images no better; the planes are those without")
         found = [replace(one, record=one.record | {"occlusion_rounds": 0}) for one in found]
     return found

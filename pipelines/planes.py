@@ -1,6 +1,6 @@
 """One plane of one channel: run a method on it, watch it, and say how it went."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -65,12 +65,21 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """A plane (row, column) in expected electrons, how it came about, its standard deviation, and how opaque it is."""
+    """A plane of one channel.
 
-    plane: NDArray[np.floating]
+    Attributes
+    ----------
+    plane : float array (row, column)
+        In expected electrons.
+    record : dict
+        How it came about.
+    beside : dict of str to float array (row, column)
+        What else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to 1.
+    """
+
+    plane: Image
     record: dict[str, Any]
-    sigma_e: NDArray[np.floating] | None = None
-    opacity: NDArray[np.floating] | None = None
+    beside: dict[str, Image] = field(default_factory=dict)
 
 
 def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:
@@ -117,15 +126,13 @@ def certified(posed: PosedPlane | PosedScene, settings: Settings) -> list[Soluti
         "certificate": _certificate(iterate),
     }
     planes = posed.planes_of(iterate.plane)
-    sigmas: list[Image | None] = [None] * len(planes)
+    beside: list[dict[str, Image]] = [{} for _ in planes]
     if settings.uncertainty:
         generator = np.random.default_rng(_SEED)
-        sigmas = [
-            standard_deviation(plane, metric, choice.weight, penalty, generator)
-            for plane, metric in zip(planes, posed.metrics(level_e, iterate.plane), strict=True)
-        ]
+        for known, plane, metric in zip(beside, planes, posed.metrics(level_e, iterate.plane), strict=True):
+            known["sigma"] = standard_deviation(plane, metric, choice.weight, penalty, generator)
     return [
-        Solution(plane, record | {"mean_e": mean_e(plane)}, sigma) for plane, sigma in zip(planes, sigmas, strict=True)
+        Solution(plane, record | {"mean_e": mean_e(plane)}, known) for plane, known in zip(planes, beside, strict=True)
     ]
 
 

@@ -23,6 +23,7 @@ class Record(msgspec.Struct):
     flux_e: float
     certificate: dict[str, Any] | None
     sigma_file: str | None = None
+    opacity_file: str | None = None
 
 
 class Focus(msgspec.Struct):
@@ -91,6 +92,7 @@ class Noise(msgspec.Struct):
     dark_current_e_per_s: Measured
     likelihood: str
     frames: list[dict[str, Any]]
+    temperature_c: dict[str, float] | None = None
 
 
 class StageFigure(msgspec.Struct):
