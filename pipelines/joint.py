@@ -1,20 +1,18 @@
-"""All planes of a scene together, in one channel: g = Σ_z H_z f_z + b, or with what nearer planes hide of farther ones."""
+"""All planes of a scene together, in one channel: g = Σ_z H_z f_z + b, or with what nearer ones hide of farther."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import Any
 
 from pipelines.channels import OperatorFactory
 from pipelines.console import say
-from pipelines.planes import Method, Settings, Solution, certified
+from pipelines.planes import Method, Settings, Solution, certified, mean_e
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages
 from recon.occlusion import opacity, transmission
 from recon.plane import PlaneGrid
 from recon.posed import PosedScene
 from recon.scene import SceneOperator
-
-# How often opacity and light are found in turn at most.
-_ROUNDS = 2
 
 
 def solve_together(
@@ -52,28 +50,37 @@ def _with_occlusion(
     operator: SceneOperator,
     images: ElementalImages,
     grids: Mapping[float, PlaneGrid],
-    found: list[Solution],
+    joint: list[Solution],
     settings: Settings,
 ) -> list[Solution]:
-    """Find opacity and light in turn, with the penalty weight found without, for as long as the objective falls."""
-    chosen = {key: found[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
-    settings = replace(settings, penalty_weight=found[0].record["penalty_weight"])
-    for done in range(_ROUNDS):
-        opacities = [opacity(solution.plane) for solution in found]
-        try:
-            occluded = factory.of_scene(grids, transmission(operator, opacities, list(grids)))
-        except GeometryMismatch:
-            break  # a plane would be hidden from all views
-        better = certified(PosedScene(occluded, images), settings)
-        if better[0].record["objective"] >= found[0].record["objective"]:
-            break
-        found = [
-            Solution(
-                one.plane, one.record | chosen | {"occlusion_rounds": done + 1}, one.beside | {"opacity": of_plane}
-            )
-            for one, of_plane in zip(better, opacities, strict=True)
-        ]
-    if "opacity" not in found[0].beside:
-        say("occlusion explains the images no better; the planes are those without")
-        found = [replace(one, record=one.record | {"occlusion_rounds": 0}) for one in found]
-    return found
+    """Find opacity from the planes, and the light once more behind it, with the penalty weight found without.
+
+    What is written of each plane is `α f`: where a plane lets through what is behind it, it is not there, and has no
+    light of its own. The certificate is that of f.
+    """
+    chosen = {key: joint[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
+    settings = replace(settings, penalty_weight=joint[0].record["penalty_weight"])
+    hidden = transmission(operator, [opacity(one.plane) for one in joint], list(grids))
+    try:
+        occluded = factory.of_scene(grids, hidden)
+    except GeometryMismatch:
+        return _without_occlusion(joint, "a plane would be hidden from all views")
+    better = certified(PosedScene(occluded, images), settings)
+    if better[0].record["objective"] >= joint[0].record["objective"]:
+        return _without_occlusion(joint, "it explains the images no better")
+    return [_of_what_is_there(one, chosen) for one in better]
+
+
+def _of_what_is_there(one: Solution, record: dict[str, Any]) -> Solution:
+    """Return a plane as `α f`, with α beside it."""
+    alpha = opacity(one.plane)
+    plane = alpha * one.plane
+    return Solution(
+        plane, one.record | record | {"mean_e": mean_e(plane), "occlusion": True}, one.beside | {"opacity": alpha}
+    )
+
+
+def _without_occlusion(joint: list[Solution], why: str) -> list[Solution]:
+    """Return the planes as they are, and say so."""
+    say(f"occlusion is left out: {why}; the planes are those of joint")
+    return [replace(one, record=one.record | {"occlusion": False}) for one in joint]

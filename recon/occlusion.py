@@ -20,7 +20,8 @@ def opacity(plane: Image) -> Image:
     """Return how opaque a plane is, 0 to 1 (row, column), judged by its light: what shines or scatters, hides.
 
     Typical is the mean of the light weighted by the light itself, so that an empty surround does not count. What is
-    black hides without being seen; it stays transparent.
+    black hides without being seen; it stays transparent. And what is fainter than a seventh of the typical passes for
+    noise, or for the blur of something at another depth.
     """
     light = blurred(plane, _LOOK)
     total = float(light.sum(dtype=np.float64))
