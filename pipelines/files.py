@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import msgspec
 
-from pipelines.errors import CannotWrite, DiskFull, OutputExists
+from pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputExists
 
 # A short write of an array comes without a number: it, too, means that the disk is full.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -146,9 +146,12 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a file's bytes, in hexadecimal; MissingFile where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as failure:
+        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
 
 @contextmanager

@@ -141,11 +141,11 @@ def reconstruct(
     if has_session(elemental_set):
         loaded = load_session(elemental_set, scene, geometry)
         out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    elif out is None:
+        raise WrongUsage("no folder for the results is named; give --out")
     else:
         loaded = load_set(elemental_set)
         loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
-    if out is None:
-        raise WrongUsage("no folder for the results is named; give --out")
     depths = [*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])]
     if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
