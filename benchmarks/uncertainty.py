@@ -2,8 +2,8 @@
 
 Each set has one object of the demo scene alone, its expected light that of SNR 0.16, in 49 views displaced by up to
 three samples, and noise of its own; half of the sets have the truck and half the airplane. Reconstructed with the
-weight that held-out views choose. Printed as JSON: the share of samples whose interval f ± 1.645 σ holds the truth, where the
-object is, where there is nothing, and of all.
+weight that held-out views choose. Printed as JSON: the share of samples whose interval f ± 1.645 σ holds the truth,
+where the object is, where there is nothing, and of all.
 """
 
 import json

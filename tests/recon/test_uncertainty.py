@@ -5,8 +5,9 @@ import pytest
 
 from pipelines.planes import Settings, certified
 from recon.images import ElementalImages, Image
-from recon.penalties import Penalty
+from recon.penalties import Penalty, PenaltyName
 from recon.posed import PosedPlane, PosedScene
+from recon.smoothing import blurred
 from recon.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_held_out import dark_views
@@ -35,19 +36,33 @@ def test_without_a_penalty_it_is_that_of_the_data() -> None:
 
 def test_total_variation_leaves_edges_less_sure_than_flat_pieces_and_all_surer_than_the_data_alone() -> None:
     plane = np.where(np.arange(48) < 24, 0.0, 20.0) * np.ones((40, 1))
-    found = standard_deviation(plane, np.full(plane.shape, 4.0), 3.0, Penalty(), np.random.default_rng(3))
+    penalty = Penalty("huber-tv", 0.02)  # of a given weight
+    found = standard_deviation(plane, np.full(plane.shape, 4.0), 3.0, penalty, np.random.default_rng(3))
     assert found.max() < 0.5 * 1.15  # the draws of an edge scatter
     assert found[:, 22:26].mean() > 1.1 * found[:, :16].mean()
 
 
-def test_more_weight_makes_surer() -> None:
+@pytest.mark.parametrize("name", ["quadratic", "huber-tv"])
+def test_more_weight_makes_surer(name: PenaltyName) -> None:
     sigmas = [
-        standard_deviation(np.ones((40, 40)), np.full((40, 40), 2.0), weight, Penalty(), np.random.default_rng(1))
+        standard_deviation(np.ones((40, 40)), np.full((40, 40), 2.0), weight, Penalty(name, 0.1), generator)
         for weight in (0.5, 1.0, 2.0)
+        for generator in [np.random.default_rng(1)]
     ]
     means = [float(sigma.mean()) for sigma in sigmas]
     assert means[0] > 1.1 * means[1] > 1.1**2 * means[2]
     assert means[0] < 2**-0.5
+
+
+def test_total_variation_is_weighted_as_the_plane_is_rough_whatever_the_weight_of_the_optimum() -> None:
+    rough = blurred(np.random.default_rng(1).normal(0, 4, (40, 40)), (1, 2))
+
+    def mean_of(height: float, weight: float) -> float:
+        metric, generator = np.full(rough.shape, 2.0), np.random.default_rng(1)
+        return float(standard_deviation(5 + height * rough, metric, weight, Penalty(), generator).mean())
+
+    assert mean_of(1.0, 0.3) == pytest.approx(mean_of(1.0, 3.0), rel=0.05)
+    assert 1.1 * mean_of(1.0, 1.0) < mean_of(2.0, 1.0) < 2**-0.5
 
 
 def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
