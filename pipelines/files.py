@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -85,8 +86,10 @@ def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | N
         raise OutputExists(f"{out}: holds {reads}, which is read; name another folder")
     with reported_as_cannot_write(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        # The name is known before the folder is there: an interrupt at any moment finds what to remove
+        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
         try:
+            building.mkdir(mode=0o700)
             yield building
             os.chmod(building, 0o777 & ~_umask())
             _put_in_place(building, out)
