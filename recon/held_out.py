@@ -131,7 +131,7 @@ class _Fold:
         self._start = posed.start(kept)
         level_e = posed.level_e(self._start)
         self._kept, self._out = (posed.fit(level_e, views) for views in (kept, out))
-        self._dual, self._penalty = posed.dual(), penalty
+        self._smooth_dual, self._penalty = posed.dual, penalty
         self._share = len(kept) / len(posed.views)
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
@@ -145,7 +145,7 @@ class _Fold:
             penalty_weight=weight * self._share**0.5,
             penalty=self._penalty,
             tolerance=_TOLERANCE,
-            dual=self._dual if near is None else near.dual,
+            dual=self._smooth_dual() if near is None else near.dual,
         )
         for iterate in iterates:
             if iterate.certificate.distance <= _TOLERANCE or iterate.passes >= _PASSES:
