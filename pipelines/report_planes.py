@@ -243,6 +243,8 @@ def weight_curves(planes: list[Plane]) -> str | None:
         axes.plot(weights, worse, marker=marker, markersize=4, color=colour, label=f"{depth_mm:g} mm{colour_name}")
         axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
+    for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        axis_format("{x:g}")
     axes.set_xlabel("penalty weight β")
     axes.set_ylabel("held-out views: −log likelihood\nabove its least")
     axes.legend(frameon=False, labelcolor=INK)

@@ -58,10 +58,6 @@ class DataFit:
         value, ratio = self._operator.value_and_ratio(plane, self._images, self._views)
         return value, self.sensitivity - ratio
 
-    def value(self, plane: Image) -> float:
-        """Return L(f) alone."""
-        return self._operator.negative_log_likelihood(plane, self._images, self._views)
-
     def metric(self, plane: Image) -> Image:
         """Return about `Hᵀ[ (H 1)/(H f + b + σ²) ]` > 0 (row, column), without a pass over the data.
 

@@ -129,9 +129,8 @@ class _Fold:
     def __init__(self, posed: Posed, penalty: Penalty, out: NDArray[np.intp]) -> None:
         kept = np.setdiff1d(posed.views, out)
         self._start = posed.start(kept)
-        level_e = posed.level_e(self._start)
-        self._kept, self._out = (posed.fit(level_e, views) for views in (kept, out))
-        self._smooth_dual, self._penalty = posed.dual, penalty
+        self._fit = posed.fit(posed.level_e(self._start), kept)
+        self._posed, self._out, self._penalty = posed, out, penalty
         self._share = len(kept) / len(posed.views)
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
@@ -140,19 +139,19 @@ class _Fold:
         """Return how well the candidate of a step predicts, solving from its neighbour's solution."""
         near = self.solutions.get(step + 1) or self.solutions.get(step - 1)
         iterates = pmlem(
-            self._kept,
+            self._fit,
             self._start if near is None else np.maximum(near.plane, 1e-3 * self._start),
             penalty_weight=weight * self._share**0.5,
             penalty=self._penalty,
             tolerance=_TOLERANCE,
-            dual=self._smooth_dual() if near is None else near.dual,
+            dual=self._posed.dual() if near is None else near.dual,
         )
         for iterate in iterates:
             if iterate.certificate.distance <= _TOLERANCE or iterate.passes >= _PASSES:
                 break
         self.solutions[step] = iterate
         self.passes += iterate.passes * self._share + (1 - self._share)
-        return self._out.value(iterate.plane)
+        return self._posed.value(iterate.plane, self._out)
 
 
 class _Search:

@@ -161,7 +161,7 @@ def pmlem(
     penalty = penalty or Penalty()
     if penalty_weight == 0 or penalty.name == "none":
         penalty_weight, penalty = 0.0, Penalty("none")
-    dual = DualField.zero((start.shape[0], start.shape[1]), start.dtype) if dual is None else dual.copy()
+    dual = dual or DualField.zero((start.shape[0], start.shape[1]), start.dtype)
     return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
@@ -202,7 +202,7 @@ class _Pmlem:
 
     def _step(self, here: PmlemIterate, gradient: Image, metric: Image) -> tuple[Image, Dual]:
         """Return the least of the quadratic and the penalty, and its dual field."""
-        scaled = metric * metric.dtype.type(self._scale)
+        scaled = metric if self._scale == 1 else metric * metric.dtype.type(self._scale)
         centre = here.plane - gradient / scaled
         if self._weight == 0:
             plane, dual = np.maximum(centre, 0), here.dual

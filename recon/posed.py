@@ -43,6 +43,9 @@ class Posed(Protocol):
     def fit(self, level_e: float, views: Views = None) -> DataFit | SceneFit:
         """Return L of some views."""
 
+    def value(self, samples: Image, views: Views = None) -> float:
+        """Return the value of L of some views alone."""
+
     def dual(self) -> Dual:
         """Return the dual field of nothing rough."""
 
@@ -83,6 +86,10 @@ class PosedPlane:
     def fit(self, level_e: float, views: Views = None) -> DataFit:
         """Return L of some views."""
         return DataFit(self.operator, self.images, level_e, views)
+
+    def value(self, samples: Image, views: Views = None) -> float:
+        """Return the value of L of some views alone."""
+        return self.operator.negative_log_likelihood(samples, self.images, views)
 
     def dual(self) -> DualField:
         """Return a field of zeros."""
@@ -129,6 +136,10 @@ class PosedScene:
     def fit(self, level_e: float, views: Views = None) -> SceneFit:
         """Return L of some views."""
         return SceneFit(self.operator, self.images, level_e, views)
+
+    def value(self, samples: Image, views: Views = None) -> float:
+        """Return the value of L of some views alone."""
+        return self.operator.negative_log_likelihood(self.planes_of(samples), self.images, views)
 
     def dual(self) -> SceneDual:
         """Return fields of zeros."""

@@ -59,10 +59,6 @@ class SceneFit:
         value, ratios = self._operator.value_and_ratio(planes, self._images, self._views)
         return value, self.sensitivity - self._operator.samples_of(ratios)
 
-    def value(self, samples: Image) -> float:
-        """Return L(f) alone."""
-        return self._operator.negative_log_likelihood(self._operator.planes_of(samples), self._images, self._views)
-
     def metric(self, samples: Image) -> Image:
         """Return `Hᵀ[ (Σ_z H_z 1)/(H f + b + σ²) ]` > 0 (sample,), in two passes over the data.
 
