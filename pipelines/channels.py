@@ -1,6 +1,7 @@
 """From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from pipelines.elemental_set import LoadedSet, noise_of_phase
 from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from pipelines.frames import Frame, read_frame
 from recon.errors import GeometryMismatch
-from recon.images import ElementalImages
+from recon.images import ElementalImages, binned
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
 
@@ -225,20 +226,27 @@ def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None
 
 
 class OperatorFactory:
-    """Makes the operators of one channel; what they share (rays, response, mask) is computed once."""
+    """Makes the operators of one channel; what they share (rays, response, mask) is computed once.
 
-    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages) -> None:
+    For images whose pixels were added up in bins (`ElementalImages.binned`) give as many `bins`.
+    """
+
+    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages, *, bins: int = 1) -> None:
         self._loaded = loaded
         self._images = images
         self._phases = len(layout.lattices)
         lattices = layout.lattices
-        self._rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
-        self._response = np.stack([_response(loaded, lattice) for lattice in lattices])
+        rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
+        self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
+        self._response = binned(np.stack([_response(loaded, lattice) for lattice in lattices]), bins)
         self._principal_shift = _principal_shift(loaded)
 
     def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
         """Return H of the plane across the reference camera's axis at a depth."""
-        rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
+        return self.at_pose(fronto_parallel_rt_ref_plane(depth_mm), grid)
+
+    def at_pose(self, rt_ref_plane: NDArray[np.floating], grid: PlaneGrid) -> PlaneOperator:
+        """Return H of the plane of a pose (6,): Rodrigues rad and mm, from plane to reference."""
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
         return PlaneOperator(
             np.repeat(homographies, self._phases, axis=0),

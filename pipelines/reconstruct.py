@@ -21,6 +21,7 @@ from pipelines.channels import (
     require_in_front,
 )
 from pipelines.console import progress, say
+from pipelines.depth_map import require_sweep, write_depth_map
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room, write_json
@@ -59,6 +60,10 @@ class Request:
         Distance of the planes' samples; one detector pixel of the reference view when None.
     with_focus : bool
         Whether a curve of focus against depth is wanted.
+    with_depth_map : bool
+        Whether depths and an all-in-focus picture are to be found from the planes.
+    disparities_px : dict of depth in mm to px
+        What was asked for instead of depths, if it was.
     """
 
     depths_mm: list[float]
@@ -66,6 +71,8 @@ class Request:
     settings: Settings = field(default_factory=Settings)
     pitch_mm: float | None = None
     with_focus: bool = False
+    with_depth_map: bool = False
+    disparities_px: dict[float, float] = field(default_factory=dict)
 
 
 def reconstruct(
@@ -76,6 +83,8 @@ def reconstruct(
     depth_mm: list[float] | None = None,
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
+    sweep_px: str | None = None,
+    depth_map: bool = False,
     method: list[Method] | None = None,
     penalty_weight: NotNegative | Literal["auto"] = "auto",
     penalty: PenaltyName = "tv",
@@ -104,6 +113,11 @@ def reconstruct(
     disparity_px
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
+    sweep_px
+        FIRST:LAST:COUNT, a sweep in equal steps of disparity instead of depth, such as -3.5:0.8:40.
+    depth_map
+        From the sweep also how far away each pixel is, with the probability of that, and a picture that is sharp
+        everywhere.
     method
         pmlem (the default; to its optimum, certified), pmlem-osl and mlem (the paper's iterations), or backprojection;
         give it once per method.
@@ -126,8 +140,11 @@ def reconstruct(
         Which of a session's sets: the dark scene, or the bright one.
     """
     swept = swept_depths(sweep_mm) if sweep_mm else []
-    if not (depth_mm or swept or disparity_px):
-        raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
+    disparities = [*(disparity_px or []), *(swept_disparities(sweep_px) if sweep_px else [])]
+    if not (depth_mm or swept or disparities):
+        raise WrongUsage(
+            "no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT, --disparity-px or --sweep-px"
+        )
     if has_session(elemental_set):
         loaded = load_session(elemental_set, scene, geometry)
         out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
@@ -136,12 +153,24 @@ def reconstruct(
         loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
     if out is None:
         raise WrongUsage("no folder for the results is named; give --out")
-    depths = [*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])]
+    of_disparity = {loaded.depth_of_disparity(disparity): disparity for disparity in disparities}
+    depths = [*(depth_mm or []), *swept, *of_disparity]
+    if depth_map:
+        require_sweep(depths)
     if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty)
-    return reconstruct_set(loaded, out, Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)))
+    request = Request(
+        depths,
+        method or [DEFAULT_METHOD],
+        settings,
+        pitch_mm,
+        with_focus=bool(swept or sweep_px),
+        with_depth_map=depth_map,
+        disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
+    )
+    return reconstruct_set(loaded, out, request)
 
 
 def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str, Any]:
@@ -156,6 +185,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
         (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
     run.reconstruct(request.settings, with_focus=request.with_focus)
     write_overview(loaded, out)
+    mapped = write_depth_map(loaded, run.written, request.disparities_px) if request.with_depth_map else None
     metrics = assess(loaded, run.written)
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
@@ -166,6 +196,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
             "format": 1,
             "planes": [record for record in run.records if record["method"] == name],
             "focus": run.focus(),
+            "depth_map": mapped,
             "wall_time_s": time.monotonic() - started,
             **provenance("reconstruct", options_of(name, request, loaded.poses), inputs),
         }
@@ -176,7 +207,14 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str,
     _say_what_oscillates(run.records)
     _say_what_is_not_reached(run.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
-    return {"out": str(out), "report": str(report), "planes": run.records, "focus": run.focus(), "metrics": metrics}
+    return {
+        "out": str(out),
+        "report": str(report),
+        "planes": run.records,
+        "focus": run.focus(),
+        "depth_map": mapped,
+        "metrics": metrics,
+    }
 
 
 def folder_of_method(out: Path, method: Method, methods: list[Method]) -> Path:
@@ -195,6 +233,7 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
         "passes": request.settings.passes,
         "pitch_mm": request.pitch_mm,
         "focus": request.with_focus,
+        "depth_map": request.with_depth_map,
         "poses": poses,
     }
 
@@ -324,15 +363,26 @@ def distinct_depths(depths: list[float]) -> list[float]:
 
 def swept_depths(sweep_mm: str) -> list[float]:
     """Return the depths of FIRST:LAST:COUNT."""
-    parts = re.fullmatch(r"(\d+(?:\.\d*)?):(\d+(?:\.\d*)?):(\d+)", sweep_mm)
+    depths = _swept("--sweep-mm", sweep_mm, "400:900:64")
+    if min(depths) <= 0:
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths")
+    return depths
+
+
+def swept_disparities(sweep_px: str) -> list[float]:
+    """Return the disparities of FIRST:LAST:COUNT."""
+    return _swept("--sweep-px", sweep_px, "-3.5:0.8:40")
+
+
+def _swept(option: str, given: str, example: str) -> list[float]:
+    """Return COUNT numbers in equal steps."""
+    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", given)
     if parts is None:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give FIRST:LAST:COUNT, such as 400:900:64")
+        raise WrongUsage(f"{option} {given}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
     first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if min(first, last) <= 0 or first == last or count < 2:
-        raise WrongUsage(
-            f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths and at least 2 planes"
-        )
-    return [round(float(depth), 6) for depth in np.linspace(first, last, count)]
+    if first == last or count < 2:
+        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and at least 2 planes")
+    return [round(float(value), 6) for value in np.linspace(first, last, count)]
 
 
 def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

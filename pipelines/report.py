@@ -86,6 +86,9 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         title=_title(directory, results),
         sets=_set_sections(directory),
         **_plane_sections(directory, results),
+        depth_maps=[
+            _depth_section(folder, result["depth_map"]) for folder, result in results.items() if result.get("depth_map")
+        ],
         **calibrations,
         **_error_sections(directory),
         method_names=METHOD_NAMES,
@@ -133,6 +136,17 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
         "focus_curve": focus_curve(focus) if focus else None,
         "sharp_mm": focus["sharp_mm"] if focus else [],
     }
+
+
+def _depth_section(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
+    """Return what the page shows of a sweep's depth map: its pictures, where they are still there."""
+    pictures = {
+        key: data_uri(path.read_bytes(), ".png")
+        if (path := (folder / Path(found[key]).name).with_suffix(".png")).is_file()
+        else None
+        for key in ("all_in_focus", "file", "confidence")
+    }
+    return {**found, "pictures": pictures}
 
 
 def _links(directory: Path) -> list[tuple[str, str]]:
