@@ -14,8 +14,8 @@ help: ## list the tasks
 demo: $(VENV)/compiled ## the whole experiment, simulated; the last line is the path of its report
 	$(BIN)/faintfield demo $(OUT)
 
-test: $(VENV)/compiled ## all tests
-	$(BIN)/python -m pytest
+test: $(VENV)/compiled ## all tests, on two cores
+	$(BIN)/python -m pytest -n 2
 
 lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .

@@ -26,8 +26,8 @@ class NoiseModel:
         σ, standard deviation of the read noise, in electrons.
     dark_current_e_per_s : Map
         D, electrons per pixel and second with no light.
-    quantum_efficiency : float
-        η, electrons per photon.
+    quantum_efficiency : float, optional
+        η, electrons per photon; None where nobody has measured it.
     saturation_dn : float
         Pixels at or above this value are saturated and carry no number.
 
@@ -41,7 +41,7 @@ class NoiseModel:
     gain_dn_per_e: Map
     read_noise_e: Map
     dark_current_e_per_s: Map = 0.0
-    quantum_efficiency: float = 1.0
+    quantum_efficiency: float | None = None
     saturation_dn: float = np.inf
 
     def __post_init__(self) -> None:
@@ -49,7 +49,8 @@ class NoiseModel:
         _require("gain_dn_per_e", self.gain_dn_per_e, at_least=np.finfo(float).tiny)
         _require("read_noise_e", self.read_noise_e, at_least=0.0)
         _require("dark_current_e_per_s", self.dark_current_e_per_s, at_least=0.0)
-        _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
+        if self.quantum_efficiency is not None:
+            _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
         if not self.saturation_dn > 0:
             raise ValueError(f"saturation_dn must be positive, got {self.saturation_dn}")
 

@@ -17,8 +17,8 @@ _BLOCK = re.compile(
 _METHODS = {
     "backprojection": "mean of the views",
     "mlem": "MLEM",
-    "pmlem": "PMLEM",
-    "pmlem-osl": "PMLEM, one-step-late",
+    "pmlem-osl": "PMLEM, the paper's one-step-late iteration",
+    "pmlem": "PMLEM, to its optimum",
 }
 
 _NOISE = {
@@ -61,14 +61,15 @@ def table(results: dict[str, Any]) -> str:
         + " |",
         "|---|" + "---|" * len(depths),
     ]
-    for method, poses in dict.fromkeys((row["method"], row["poses"]) for row in results["planes"]):
+    rows = sorted(results["planes"], key=lambda row: list(_METHODS).index(row["method"]))
+    for method, poses in dict.fromkeys((row["method"], row["poses"]) for row in rows):
         of_depth = {
-            row["depth_mm"]: f"{row['mse_bright']:.3f}"
+            row["depth_mm"]: f"{row['mse_bright']:.4f}"
             for row in results["planes"]
             if (row["method"], row["poses"]) == (method, poses)
         }
         cells = " | ".join(of_depth.get(depth, "–") for depth in depths)
-        lines.append(f"| {_METHODS.get(method, method)}, {poses} poses | {cells} |")
+        lines.append(f"| {_METHODS[method]}, {poses} poses | {cells} |")
     said = [
         f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
         for name, (words, unit) in _NOISE.items()

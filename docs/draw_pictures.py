@@ -26,7 +26,7 @@ _WHITE_E = 1.5
 _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
 _PENALISED = ("pmlem", "pmlem-osl")
 _WIDTH_PX = 1000
-_PAGES = (("report", "report.html", 900), ("stage", "geometry.html", 1380))
+_PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
 
 
 def draw_planes(demo: Path) -> None:

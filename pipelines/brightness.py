@@ -8,11 +8,8 @@ from numpy.typing import NDArray
 
 from pipelines.channels import channel_layouts, lattice_noise, view_electrons
 from pipelines.elemental_set import LoadedSet
-from pipelines.frames import read_frame
+from pipelines.object_region import Region, object_region
 from recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
-
-# Beside a set's images, where it is known: the object region of the reference view.
-OBJECT_REGION = "object_region.png"
 
 
 @dataclass(frozen=True)
@@ -22,31 +19,40 @@ class Brightness:
     Attributes
     ----------
     region : str
-        "object region" where the set brings one, else "whole view".
+        "object region" where the set brings one, "object region of the bright view" where it brings that, else
+        "whole view".
     noise_from : str
         "noise reference" image where the set brings one, else "noise model".
     snr : float, optional
         Eq. (4), a ratio of powers; None where the noise model states no read noise to compare with.
-    photons_linear : float, optional
-        Photons per pixel that eq. (7) reads from it, the paper's figure; None where the SNR is not positive.
-    photons_from_moments : float, optional
-        Photons per pixel of a uniform object that has this SNR.
+    electrons_linear : float, optional
+        Electrons per pixel that eq. (7) reads from it, by the paper's way; None where the SNR is not positive.
+    electrons_from_moments : float, optional
+        Electrons per pixel of a uniform object that has this SNR.
     mean_signal_e : float
         Mean electrons per pixel above the dark level.
+    photons_linear, photons_from_moments : float, optional
+        The same in photons; None where the quantum efficiency is not known.
     """
 
     region: str
     noise_from: str
     snr: float | None
-    photons_linear: float | None
-    photons_from_moments: float | None
+    electrons_linear: float | None
+    electrons_from_moments: float | None
     mean_signal_e: float
+    photons_linear: float | None = None
+    photons_from_moments: float | None = None
 
 
 def brightness(loaded: LoadedSet, region_path: Path | None = None) -> Brightness:
     """Measure the reference view of a set, in all its colours together; over the set's own object region by default."""
-    region_path = region_path or loaded.folder / OBJECT_REGION
-    region = read_frame(region_path).pixels_dn > 127 if region_path.is_file() else None
+    region, words = object_region(loaded, region_path)
+    return brightness_within(loaded, region, words)
+
+
+def brightness_within(loaded: LoadedSet, region: Region | None, words: str) -> Brightness:
+    """Measure the reference view over a region (row, column), all of it where that is None; `words` name the region."""
     has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
     signal, reference = [], []
     for layout in channel_layouts(loaded):
@@ -62,14 +68,14 @@ def brightness(loaded: LoadedSet, region_path: Path | None = None) -> Brightness
                 dark_e = loaded.background_e(noise)
                 power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
                 reference.append(np.sqrt(power).ravel())
-    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), region is not None, has_reference)
+    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), words, has_reference)
 
 
 def _figures(
     loaded: LoadedSet,
     signal_e: NDArray[np.floating],
     reference_e: NDArray[np.floating],
-    has_region: bool,
+    region: str,
     has_reference: bool,
 ) -> Brightness:
     """Apply the formulas."""
@@ -77,12 +83,22 @@ def _figures(
     read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
     snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
     dark_e = float(np.mean(loaded.background_e(noise)))
-    known = {"quantum_efficiency": noise.quantum_efficiency, "read_noise_e": read_noise_e}
+    linear_e = moments_e = None
+    if snr and snr > 0:
+        # A detector that makes an electron of every photon counts electrons
+        counting = {"quantum_efficiency": 1.0, "read_noise_e": read_noise_e}
+        linear_e, moments_e = (
+            photons_from_linear_snr(snr, **counting),
+            photons_from_moments(snr, dark_e=dark_e, **counting),
+        )
+    efficiency = noise.quantum_efficiency
     return Brightness(
-        region="object region" if has_region else "whole view",
+        region=region,
         noise_from="noise reference" if has_reference else "noise model",
         snr=snr,
-        photons_linear=photons_from_linear_snr(snr, **known) if snr and snr > 0 else None,
-        photons_from_moments=photons_from_moments(snr, dark_e=dark_e, **known) if snr and snr > 0 else None,
+        electrons_linear=linear_e,
+        electrons_from_moments=moments_e,
         mean_signal_e=float(np.mean(signal_e, dtype=np.float64)) - dark_e,
+        photons_linear=linear_e / efficiency if efficiency and linear_e else None,
+        photons_from_moments=moments_e / efficiency if efficiency and moments_e else None,
     )

@@ -1,7 +1,6 @@
 """From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from calib.noise_model import NoiseModel
 from pipelines.elemental_set import LoadedSet, noise_of_phase
 from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from pipelines.frames import Frame, read_frame
+from pipelines.large_arrays import Allocate
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages, binned
 from recon.operator import PlaneOperator
@@ -88,8 +88,17 @@ def channel_layouts(loaded: LoadedSet) -> list[ChannelLayout]:
     return layouts
 
 
-def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
+def load_channel(loaded: LoadedSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
     """Read one colour of all views into electrons; frames are read one at a time, straight into the stack.
+
+    Parameters
+    ----------
+    loaded : LoadedSet
+        The set.
+    layout : ChannelLayout
+        The colour.
+    allocate : callable
+        Makes the arrays of the size of all views: in memory by default.
 
     Raises
     ------
@@ -99,19 +108,22 @@ def load_channel(loaded: LoadedSet, layout: ChannelLayout) -> ElementalImages:
     phases = len(layout.lattices)
     views = len(loaded.settings.view)
     shape = layout.lattices[0].shape
-    electrons = np.empty((views * phases, *shape), np.float32)
-    saturated: dict[int, NDArray[np.bool_]] = {}
+    electrons = allocate((views * phases, *shape), np.float32)
+    valid: NDArray[np.bool_] | None = None
     for view in range(views):
         for phase, (sum_e, over) in enumerate(view_electrons(loaded, layout, loaded.frame_paths(view))):
             electrons[view * phases + phase] = sum_e
             if over.any():
-                saturated[view * phases + phase] = over
+                if valid is None:
+                    valid = allocate(electrons.shape, np.bool_)
+                    valid.fill(True)
+                valid[view * phases + phase] = ~over
     noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
     return ElementalImages(
         electrons,
         background_e=_stacked([loaded.background_e(noise) for noise in noises], shape),
         read_variance_e2=_stacked([loaded.read_variance_e2(noise) for noise in noises], shape),
-        valid=_valid(electrons.shape, saturated),
+        valid=valid,
     )
 
 
@@ -263,16 +275,6 @@ def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:
     if all(np.ndim(part) == 0 and part == parts[0] for part in parts):
         return float(parts[0])
     return np.stack([np.broadcast_to(part, shape) for part in parts]).astype(np.float32)
-
-
-def _valid(shape: tuple[int, ...], saturated: dict[int, NDArray[np.bool_]]) -> NDArray[np.bool_] | None:
-    """Return the mask of pixels that carry a number, None when all do."""
-    if not saturated:
-        return None
-    valid = np.ones(shape, bool)
-    for index, over in saturated.items():
-        valid[index] = ~over
-    return valid
 
 
 def _cropped_rays(loaded: LoadedSet, lattice: Lattice) -> NDArray[np.float32]:

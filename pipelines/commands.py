@@ -67,6 +67,7 @@ IMPORTS = (
 EXPORTS = (
     Command("colmap", "pipelines.import_colmap:export_colmap", "colmap set sparse"),
     Command("mrcal", "pipelines.import_mrcal:export_mrcal", "mrcal set cameras"),
+    Command("zarr", "pipelines.export_zarr:export_zarr", "zarr sweep sweep.ome.zarr"),
 )
 
 
@@ -77,7 +78,7 @@ def register_commands(app: App) -> None:
     app.command("pipelines.stage:app", name="stage", group=AT_THE_RIG, sort_key=2.5)
     for name, commands, words in (
         ("import", IMPORTS, "Make a set of images and poses, or of frames, from other people's files."),
-        ("export", EXPORTS, "Write the lens and poses of a set for other people's programs."),
+        ("export", EXPORTS, "Write lens and poses of a set, or planes, for other people's programs."),
     ):
         app.command(App(name=name, help=words, group=FILES, help_epilogue=_example(f"faintfield {name}", commands[0])))
         _register(app[name], commands, f"faintfield {name}")

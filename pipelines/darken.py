@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from pipelines.arguments import Fraction, NotNegative, Positive, Seed
-from pipelines.brightness import OBJECT_REGION, brightness
+from pipelines.brightness import brightness
 from pipelines.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from pipelines.console import progress, say
 from pipelines.elemental_set import NOISE_REFERENCE, LoadedSet, load_set, write_set
@@ -18,6 +18,7 @@ from pipelines.errors import BadValue
 from pipelines.exposures import stated_noise, write_exposures
 from pipelines.files import building_folder, write_json
 from pipelines.image_files import mask_picture, write_plane, write_png
+from pipelines.object_region import OBJECT_REGION
 from pipelines.provenance import provenance
 from recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
 from rig.simulation.sensor import SimulatedSensor

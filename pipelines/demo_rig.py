@@ -11,7 +11,7 @@ from rig.boards import Board
 from rig.cameras.settings import SimulatedSettings
 from rig.plan import Grid
 from rig.settings import CheckSettings, DriftSettings, RigSettings, SceneSettings, SettleSettings, StepSettings
-from rig.simulation.lab import lab_experiment
+from rig.simulation.lab import flat_photons_per_s, lab_experiment
 from rig.simulation.scene import render
 from rig.stages.protocol import Point
 from rig.stages.settings import StageSettings
@@ -59,7 +59,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
         StepSettings("dark_scene", EXPOSURE_S),
         StepSettings("noise_reference", EXPOSURE_S, at="centre"),
         StepSettings("dark", (0.1, 1.0, 10.0, 60.0), size.frames),
-        StepSettings("flat", (0.05, 0.1), size.frames),
+        StepSettings("flat", (0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
     ]
     return RigSettings(
         stage=StageSettings("simulated", port="simulated:grbl:pty"),

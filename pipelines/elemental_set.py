@@ -47,7 +47,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     read_noise_e: float
     offset_dn: float | None = None
     dark_current_e_per_s: float = 0.0
-    quantum_efficiency: float = 1.0
+    quantum_efficiency: float | None = None
     saturation_dn: float | None = None
 
 
@@ -101,6 +101,8 @@ class LoadedSet:
         The file that says what the images are.
     noise_reference : tuple of Path
         Exposures of nothing, where there are any.
+    bright_view : (Path, float), optional
+        The reference view in plenty of light and its exposure in s, where there is one.
     """
 
     folder: Path
@@ -114,6 +116,7 @@ class LoadedSet:
     poses: Literal["stated", "measured", "nominal", "true"] = "stated"
     described_in: str = FILE_NAME
     noise_reference: tuple[Path, ...] = ()
+    bright_view: tuple[Path, float] | None = None
 
     @property
     def reference_view(self) -> int:

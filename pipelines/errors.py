@@ -9,6 +9,7 @@ InputError
 │   └── UnknownKey
 ├── OutputExists
 ├── MissingPackage
+├── ClusterFailed
 └── CannotWrite
     └── DiskFull
 
@@ -56,6 +57,10 @@ class OutputExists(InputError):
 
 class MissingPackage(InputError):
     """A command needs a package that is not installed with the rest."""
+
+
+class ClusterFailed(InputError):
+    """The workers that were to do the tasks cannot be reached, or died; what they finished is kept."""
 
 
 class CannotWrite(InputError):

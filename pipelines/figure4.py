@@ -20,13 +20,17 @@ from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
 from recon.solvers import back_projection
 from rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
+from rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck
 from rig.simulation.scene import TexturedPlane, render
 
 SNRS = tuple(round(0.16 + 0.01 * step, 2) for step in range(8))
 PAPERS_AXIS = (0.0, 0.12)
 
 _DEPTH_MM = 600.0
+
+# A plane goes beyond its object by this part of its width, where there is nothing to see.
+_MARGIN = 16
+
 _POSITION_SD_MM, _ROTATION_SD_RAD = 0.3, 3.5e-3
 
 
@@ -55,13 +59,26 @@ class Error:
 
 @dataclass(frozen=True)
 class Stage:
-    """One object alone before the camera: its light (view, row, column), relative, and what it should give."""
+    """One object alone before the camera, and what it should give.
+
+    Attributes
+    ----------
+    light : float32 array (view, row, column)
+        Relative to that of a white object.
+    region : bool array (row, column)
+        Where the reference view shows the object.
+    window : (slice, slice)
+        Rows and columns of the reference view that the plane's samples overlay: those about the object.
+    bright, texture : float array (row, column)
+        The back-projection of `light`, and the object, at the plane's samples.
+    """
 
     name: str
     experiment: SimulatedExperiment
     operator: PlaneOperator
     light: NDArray[np.float32]
     region: NDArray[np.bool_]
+    window: tuple[slice, slice]
     bright: Image
     texture: Image
 
@@ -88,8 +105,8 @@ class Stage:
 
     def errors(self, plane: Image, scale_e: float) -> tuple[float, float]:
         """Return the mean square errors of a plane against the bright one and against the texture."""
-        scaled = plane / scale_e
-        return mean_square_error(scaled, self.bright, self.region), mean_square_error(scaled, self.texture, self.region)
+        scaled, region = plane / scale_e, self.region[self.window]
+        return mean_square_error(scaled, self.bright, region), mean_square_error(scaled, self.texture, region)
 
 
 # By method and SNR.
@@ -107,7 +124,7 @@ def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
     seeds : int
         Draws of the noise per object and SNR.
     """
-    makers = (toy_truck, toy_airplane, star_chart, shaded_ball)
+    makers = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
     cases = progress(_exposures(makers, size_px, seeds), "figure 4: exposures", len(makers) * seeds * len(SNRS))
     return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
 
@@ -134,6 +151,8 @@ def _errors(
 ) -> Iterator[Error]:
     """Yield the errors of all methods on one exposure; best weights are those of the first draw, kept in `weights`."""
     for method in METHODS:
+        if seed > (method.draws or seed):
+            continue
         if (method.name, snr) not in weights:
             weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
         weight = weights[method.name, snr]
@@ -159,22 +178,34 @@ def staged(shown: TexturedPlane, size_px: tuple[int, int]) -> Stage:
     light = np.stack([view.light for view in render([shown], optics, poses)])
     ideal = next(render([shown], optics.ideal(), np.zeros((1, 6))))
     lens = Lens(size_px, optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, optics.distortion)
+    region = ideal.visible[shown.name] > 0.5
+    window = _window(region)
     operator = PlaneOperator(
         plane_from_ray(poses, fronto_parallel_rt_ref_plane(shown.depth_mm)),
         lens.rays().astype(np.float32),
-        _grid(experiment),
+        _grid(experiment, window),
         flat=optics.relative_illumination(),
     )
     bright = back_projection(operator, ElementalImages(light))
-    return Stage(shown.name, experiment, operator, light, ideal.visible[shown.name] > 0.5, bright, ideal.light)
+    return Stage(shown.name, experiment, operator, light, region, window, bright, ideal.light[window])
 
 
-def _grid(experiment: SimulatedExperiment) -> PlaneGrid:
-    """Return the samples that overlay the reference view pixel for pixel."""
+def _window(region: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of a region with a margin: a plane of these costs a fraction of a whole one."""
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    margin = -(-len(columns) // _MARGIN)
+    first_row, first_column = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
+    return slice(first_row, rows[-1] + 1 + margin), slice(first_column, columns[-1] + 1 + margin)
+
+
+def _grid(experiment: SimulatedExperiment, window: tuple[slice, slice]) -> PlaneGrid:
+    """Return the samples that overlay a window of the reference view pixel for pixel."""
     optics = experiment.optics
     pitch_mm = _DEPTH_MM / optics.fx_px
     width, height = optics.size_px
-    return PlaneGrid((height, width), pitch_mm, (-optics.cx_px * pitch_mm, -optics.cy_px * pitch_mm))
+    (top, bottom, _), (left, right, _) = window[0].indices(height), window[1].indices(width)
+    origin_mm = ((left - optics.cx_px) * pitch_mm, (top - optics.cy_px) * pitch_mm)
+    return PlaneGrid((bottom - top, right - left), pitch_mm, origin_mm)
 
 
 def curves(errors: Sequence[Error]) -> list[dict[str, Any]]:
@@ -187,6 +218,7 @@ def curves(errors: Sequence[Error]) -> list[dict[str, Any]]:
             "object": name,
             "method": method,
             "snr": snr,
+            "draws": len(group),
             "mse": float(np.mean([error.mse for error in group])),
             "standard_error": float(np.std([e.mse for e in group], ddof=1) / np.sqrt(len(group)))
             if len(group) > 1
@@ -204,6 +236,16 @@ def is_monotone(points: Sequence[dict[str, Any]], method: str) -> bool:
         curve = sorted((p["snr"], p["mse"]) for p in points if (p["object"], p["method"]) == (name, method))
         falls &= all(after[1] < before[1] for before, after in pairwise(curve))
     return falls
+
+
+def over_best(points: Sequence[dict[str, Any]], method: str, best: str) -> dict[str, float]:
+    """Return for each object how many times its error with the best weight a method's is at most, of all SNRs."""
+    of = {(point["object"], point["method"], point["snr"]): float(point["mse"]) for point in points}
+    ratios: dict[str, float] = {}
+    for (name, of_method, snr), mse in of.items():
+        if of_method == method:
+            ratios[name] = max(ratios.get(name, 0.0), mse / of[name, best, snr])
+    return ratios
 
 
 def as_csv(rows: Sequence[dict[str, Any]]) -> str:

@@ -17,6 +17,9 @@ from pipelines.errors import CannotWrite, DiskFull, OutputExists
 # A short write of an array comes without a number: it, too, means that the disk is full.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
 
+# How temporary names end; what still has one when nobody writes was left by a process that was killed.
+UNFINISHED = ".unfinished"
+
 
 @contextmanager
 def writing(path: Path) -> Iterator[BinaryIO]:
@@ -31,7 +34,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
     """
     with reported_as_cannot_write(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=UNFINISHED, dir=path.parent)
         try:
             os.close(descriptor)
             with open(name, "wb") as file:
@@ -116,6 +119,15 @@ def check_free(out: Path, *, replace_if: str | None = None) -> None:
         raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
     if any(out.iterdir()):
         raise OutputExists(f"{out}: holds files already, and none are overwritten; name a new or empty folder")
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a process that was killed has left half-written in a folder; nobody may be writing there."""
+    for path in folder.glob(f".*{UNFINISHED}"):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
 
 
 def require_room(path: Path, needed_bytes: int) -> None:

@@ -47,7 +47,7 @@ def import_grid(
     gain_dn_per_e: Positive = 1.0,
     read_noise_e: NotNegative = 0.0,
     dark_current_e_per_s: NotNegative = 0.0,
-    quantum_efficiency: Fraction = 1.0,
+    quantum_efficiency: Fraction | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Make an elemental set from pictures taken on a regular grid.
@@ -85,7 +85,7 @@ def import_grid(
     dark_current_e_per_s
         Dark electrons per pixel and second.
     quantum_efficiency
-        Electrons per photon.
+        Electrons per photon; without it nothing is said in photons.
     overwrite
         Replace an earlier set in OUT.
     """

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.brightness import OBJECT_REGION, brightness
+from pipelines.brightness import brightness
 from pipelines.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.frames import read_frame
+from pipelines.object_region import OBJECT_REGION
 from pipelines.planes import Method
 from pipelines.truth import Truth, read_truth, texture_and_region, true_plane
 from recon.metrics import mean_square_error, peak_snr_db

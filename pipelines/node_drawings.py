@@ -9,6 +9,9 @@ from pipelines.pages import INK, inked, svg
 
 _MOST_MAGNIFIED_SHARE = 0.35
 
+# From here on rotations are in mrad, below in µrad.
+_COARSE_RAD = 1e-4
+
 # More nodes than this have no number written into their cell.
 _MOST_WRITTEN = 121
 
@@ -67,11 +70,13 @@ def sigma_maps(geometry: dict[str, Any]) -> str:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    largest_rad = max(node["sigma_rad"] for node in geometry["nodes"])
+    per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
     for axes, key, factor, words in zip(
         figure.subplots(1, 2),
         ("sigma_mm", "sigma_rad"),
-        (1e3, 1e3),
-        ("σ of position, √ of the variances' sum (µm)", "σ of rotation, √ of the variances' sum (mrad)"),
+        (1e3, per_rad),
+        ("σ of position, √ of the variances' sum (µm)", f"σ of rotation, √ of the variances' sum ({unit})"),
         strict=True,
     ):
         first, values = _map_of_nodes(geometry["nodes"], key, factor)

@@ -23,13 +23,13 @@ from rig.session.session import PLAN
 _BLACK_TOLERANCE_DN = 2.0
 
 _SHOWN = (
-    ("gain_dn_per_e", "K, system gain", "DN/e-"),
+    ("gain_dn_per_e", "K, system gain", "DN/e⁻"),
     ("offset_dn", "mu_y.dark(0), offset", "DN"),
-    ("read_noise_e", "sigma_d, read noise", "e-"),
-    ("dark_current_e_per_s", "mu_I, dark current", "e-/s"),
-    ("dsnu_e", "DSNU (pixel)", "e-"),
+    ("read_noise_e", "sigma_d, read noise", "e⁻"),
+    ("dark_current_e_per_s", "mu_I, dark current", "e⁻/s"),
+    ("dsnu_e", "DSNU (pixel)", "e⁻"),
     ("prnu", "PRNU (pixel)", ""),
-    ("quantum_efficiency", "eta, quantum efficiency", "e-/photon"),
+    ("quantum_efficiency", "eta, quantum efficiency", "e⁻/photon"),
 )
 
 

@@ -75,6 +75,8 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
 
 def _of_session(folder: Path) -> NoiseSet:
     """Return the dark and flat frames of a session; each step of flats is a light level."""
+    rig = read_plan(folder).rig
+    light = [step.photons_per_s for step in rig.step]
     frames = [
         NoiseFrame(
             file=str(path.relative_to(folder)),
@@ -82,13 +84,13 @@ def _of_session(folder: Path) -> NoiseSet:
             exposure_s=planned.exposure_s,
             temperature_c=taken.detail.get("camera", {}).get("temperature_c"),
             level=planned.sweep if planned.kind == "flat" else 0,
+            photons=None if (photons_per_s := light[planned.step]) is None else photons_per_s * planned.exposure_s,
         )
         for planned, taken, path in taken_frames(folder)
         if planned.kind in ("dark", "flat")
     ]
     if not frames:
         raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
-    rig = read_plan(folder).rig
     return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic)
 
 

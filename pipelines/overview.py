@@ -4,21 +4,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.brightness import brightness
+from pipelines.brightness import brightness_within
 from pipelines.elemental_set import LoadedSet
 from pipelines.files import write_json
 from pipelines.frames import read_frame
-from pipelines.image_files import Picture, contact_sheet, grey_levels, write_png
+from pipelines.image_files import Picture, contact_sheet, grey_levels, white_level, write_png
+from pipelines.object_region import Region, bright_electrons, object_region
 
 OVERVIEW_FILE = "overview.json"
 INTEGRAL_IMAGE = "integral_image.png"
 REFERENCE_VIEW = "reference_view.png"
 REFERENCE_OF_NOISE = "noise_reference.png"
+BRIGHT_VIEW = "bright_view.png"
+REGION_OUTLINED = "object_region_outlined.png"
 
 _SHEET_WIDTH_PX = 1260
+
+# Seen on white, grey and black alike.
+_OUTLINE_RGB = (240, 120, 0)
 
 
 def write_overview(loaded: LoadedSet, out: Path) -> None:
@@ -35,11 +42,15 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
     if has_noise_reference:
         nothing = read_frame(loaded.noise_reference[0]).pixels_dn
         write_png(out / REFERENCE_OF_NOISE, _as_seen(nothing, white, black))
+    region, words = object_region(loaded)
+    _write_bright_view(loaded, region, out)
     write_json(
         out / OVERVIEW_FILE,
         {
             "set": loaded.folder.resolve().name,
             "views": len(loaded.settings.view),
+            "grid": _grid(loaded),
+            "poses": loaded.poses,
             "size_px": camera.size_px,
             "exposure_s": loaded.settings.exposure_s,
             "frames_per_view": loaded.frames_per_view,
@@ -48,9 +59,23 @@ def write_overview(loaded: LoadedSet, out: Path) -> None:
             "quantum_efficiency": loaded.noise.quantum_efficiency,
             "dark_e": float(np.mean(loaded.noise.background_e(loaded.settings.exposure_s))),
             "grey_scale_dn": [black, white],
-            "brightness": asdict(brightness(loaded)),
+            "brightness": asdict(brightness_within(loaded, region, words)),
         },
     )
+
+
+def _write_bright_view(loaded: LoadedSet, region: Region | None, out: Path) -> None:
+    """Write the reference view in plenty of light, and the same with the object region outlined, where there is one."""
+    light_e = bright_electrons(loaded)
+    if light_e is None:
+        return
+    picture = grey_levels(light_e, white_level(light_e))
+    write_png(out / BRIGHT_VIEW, picture)
+    if region is not None:
+        outlined = np.ascontiguousarray(np.dstack([picture] * 3))
+        around, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(outlined, around, -1, _OUTLINE_RGB, max(max(region.shape) // 400, 1))
+        write_png(out / REGION_OUTLINED, outlined)
 
 
 def grey_scale_dn(reference_dn: NDArray[Any]) -> tuple[float, float]:
@@ -72,8 +97,14 @@ def _as_seen(pixels_dn: NDArray[Any], white: float, black: float) -> Picture:
 
 def _columns(loaded: LoadedSet) -> int:
     """Return how many views stand in a row of the sheet: the grid's columns where nodes are stated."""
-    nodes = [view.node for view in loaded.settings.view]
-    stated = [node[1] for node in nodes if node is not None]
-    if len(stated) == len(nodes):
-        return max(stated) - min(stated) + 1
-    return int(np.ceil(np.sqrt(len(nodes))))
+    grid = _grid(loaded)
+    return int(np.ceil(np.sqrt(len(loaded.settings.view)))) if grid is None else grid[1]
+
+
+def _grid(loaded: LoadedSet) -> tuple[int, int] | None:
+    """Return rows and columns of the grid, None where not every view states its node."""
+    nodes = [view.node for view in loaded.settings.view if view.node is not None]
+    if len(nodes) < len(loaded.settings.view):
+        return None
+    rows, columns = (np.ptp(places) + 1 for places in zip(*nodes, strict=True))
+    return int(rows), int(columns)

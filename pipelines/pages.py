@@ -4,6 +4,8 @@ import base64
 import io
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from jinja2 import Template
     from matplotlib.figure import Figure
@@ -23,13 +25,19 @@ def template(name: str) -> "Template":
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["figure"] = _figure
+    environment.filters["figure"] = figure
     return environment.get_template(name)
 
 
-def _figure(value: float | None, digits: int = 3) -> str:
-    """Return a number to so many digits, a dash where there is none."""
-    return "–" if value is None else f"{value:.{digits}g}"
+def figure(value: float | None, digits: int = 3) -> str:
+    """Return a number to so many digits, zeros at its end among them, a dash where there is none."""
+    if value is None:
+        return "–"
+    rounded = float(f"{value:.{digits}g}")
+    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
+        decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
+        return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
+    return f"{rounded:.{digits - 1}e}".replace("-", "−")
 
 
 def data_uri(content: bytes, suffix: str) -> str:
@@ -44,7 +52,14 @@ def svg(figure: "Figure") -> str:
 
     text = io.StringIO()
     with rc_context({"svg.hashsalt": "faintfield"}):
-        figure.savefig(text, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+        figure.savefig(
+            text,
+            format="svg",
+            transparent=True,
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None, "Creator": None},
+        )
     drawn = text.getvalue()
     return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
 

@@ -1,8 +1,10 @@
-"""What every artefact records of itself: the command, its options, its inputs' hashes, and the versions."""
+"""What every artefact records of itself (command, options, inputs' hashes, versions), and whether it still holds."""
 
 import platform
 from importlib.metadata import version
 from typing import Any
+
+import msgspec
 
 _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless")
 
@@ -30,3 +32,23 @@ def provenance(command: str, options: dict[str, Any], inputs: dict[str, str]) ->
 def versions() -> dict[str, str]:
     """Return the versions of what computes results, by name."""
     return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+
+
+def first_difference(origin: dict[str, Any], now: dict[str, Any]) -> str | None:
+    """Return in words the first thing in which the origin of a result differs from what it would be now.
+
+    Parameters
+    ----------
+    origin : dict
+        What the result says of itself, as it was read from its file.
+    now : dict
+        Of `provenance`: what it would say if it were made now.
+    """
+    now = msgspec.json.decode(msgspec.json.encode(now))
+    for key, called in (("inputs", "input"), ("options", "option"), ("versions", "version")):
+        before, after = origin.get(key, {}), now[key]
+        changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+        if changed:
+            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
+            return f"{called}: {changed[0]}{more}"
+    return None

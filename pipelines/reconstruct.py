@@ -1,43 +1,35 @@
 """`faintfield reconstruct`: planes of a session or an elemental set at chosen depths."""
 
 import re
+import shutil
 import time
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from cyclopts import Parameter
-from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive
-from pipelines.channels import (
-    ChannelLayout,
-    OperatorFactory,
-    channel_layouts,
-    default_pitch_px,
-    load_channel,
-    plane_grid,
-    require_in_front,
-)
-from pipelines.console import progress, say
+from pipelines.channels import channel_layouts, default_pitch_px, plane_grid, require_in_front
+from pipelines.cluster import crew_of
+from pipelines.console import say
 from pipelines.depth_map import require_sweep, write_depth_map
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
-from pipelines.files import require_room, write_json
-from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.files import remove_leftovers, require_room, write_json
 from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
-from pipelines.planes import Method, Settings, solve
+from pipelines.plane_files import PARTS, PlaneFiles, plane_name
+from pipelines.planes import Method, Settings
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from pipelines.stacks import write_stack
-from recon.errors import GeometryMismatch
-from recon.focus import Focus, focus_measure, sharp_depths_mm
+from pipelines.sweep import Crew, Sweep, one_by_one
 from recon.images import LikelihoodName
-from recon.operator import PlaneOperator
 from recon.penalties import PenaltyName
 from rig.session.opening import has_session
 
@@ -93,11 +85,14 @@ def reconstruct(
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
     scene: SceneKind = "dark_scene",
+    workers: Count | None = None,
+    scheduler: str | None = None,
 ) -> dict[str, Any]:
     """Reconstruct planes of the scene at chosen depths.
 
     Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
     entry in reconstruction.json; report.html shows them all. With several methods each has a folder of its own in OUT.
+    Planes that are there, made of the same files with the same options, stay: a sweep that was cut short goes on.
 
     Parameters
     ----------
@@ -138,7 +133,12 @@ def reconstruct(
         geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
     scene
         Which of a session's sets: the dark scene, or the bright one.
+    workers
+        Have the planes made by so many processes of one thread each; needs the extra faintfield[cluster].
+    scheduler
+        Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
     """
+    crew = crew_of(workers, scheduler)
     swept = swept_depths(sweep_mm) if sweep_mm else []
     disparities = [*(disparity_px or []), *(swept_disparities(sweep_px) if sweep_px else [])]
     if not (depth_mm or swept or disparities):
@@ -170,51 +170,81 @@ def reconstruct(
         with_depth_map=depth_map,
         disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
     )
-    return reconstruct_set(loaded, out, request)
+    return reconstruct_set(loaded, out, request, crew)
 
 
-def reconstruct_set(loaded: LoadedSet, out: Path, request: Request) -> dict[str, Any]:
-    """Reconstruct planes of a set that was loaded, and write them, their origin, their errors and the report."""
+def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew = one_by_one) -> dict[str, Any]:
+    """Reconstruct planes of a set that was loaded, and write them, their origin, their errors and the report.
+
+    Planes that are there, made of the same files with the same options, are not made again.
+    """
     started = time.monotonic()
     depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
     request = replace(request, depths_mm=depths, methods=methods)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
-    run = _Run(loaded, depths, request.pitch_mm, folders)
-    require_room(out, run.needed_bytes())
+    sweep = _sweep(loaded, folders, request)
+    require_room(out, sweep.needed_bytes())
     for folder in folders.values():
+        remove_leftovers(folder)
         (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
-    run.reconstruct(request.settings, with_focus=request.with_focus)
+    try:
+        sweep.run(crew, out)
+    finally:
+        for folder in folders.values():
+            with suppress(OSError):
+                (folder / PARTS).rmdir()  # stays as long as planes want colours
     write_overview(loaded, out)
-    mapped = write_depth_map(loaded, run.written, request.disparities_px) if request.with_depth_map else None
-    metrics = assess(loaded, run.written)
+    mapped = write_depth_map(loaded, sweep.written, request.disparities_px) if request.with_depth_map else None
+    metrics = assess(loaded, sweep.written)
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
         write_json(out / METRICS_FILE, metrics)
-    inputs = dict(loaded.input_hashes())
     for name, folder in folders.items():
         result = {
             "format": 1,
-            "planes": [record for record in run.records if record["method"] == name],
-            "focus": run.focus(),
+            "planes": [record for record in sweep.records if record["method"] == name],
+            "focus": sweep.focus(),
             "depth_map": mapped,
             "wall_time_s": time.monotonic() - started,
-            **provenance("reconstruct", options_of(name, request, loaded.poses), inputs),
+            **sweep.origins[name],
         }
         write_json(folder / RECONSTRUCTION_FILE, result)
         if request.with_focus:
             write_stack(folder, result["planes"])
+        shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was cut short
     report = write_report(out)
-    _say_what_oscillates(run.records)
-    _say_what_is_not_reached(run.records)
+    _say_what_oscillates(sweep.records)
+    _say_what_is_not_reached(sweep.records)
     say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {
         "out": str(out),
         "report": str(report),
-        "planes": run.records,
-        "focus": run.focus(),
+        "planes": sweep.records,
+        "focus": sweep.focus(),
         "depth_map": mapped,
         "metrics": metrics,
     }
+
+
+def _sweep(loaded: LoadedSet, folders: dict[Method, Path], request: Request) -> Sweep:
+    """Return the planes of a request, none of them made yet."""
+    layouts = channel_layouts(loaded)
+    mm_per_depth = default_pitch_px(loaded, layouts) / loaded.settings.camera.fx_px
+    grids = {depth: plane_grid(loaded, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm}
+    inputs = dict(loaded.input_hashes())
+
+    def origin(name: Method, depths: list[float]) -> dict[str, Any]:
+        options = options_of(name, replace(request, depths_mm=depths), loaded.poses)
+        return provenance("reconstruct", options, inputs)
+
+    channels = tuple(layout.name for layout in layouts)
+    files = [
+        PlaneFiles(folder, name, depth, channels, origin(name, [depth]))
+        for depth in grids
+        for name, folder in folders.items()
+    ]
+    origins = {name: origin(name, request.depths_mm) for name in folders}
+    return Sweep(loaded, grids, files, origins, request.settings, with_focus=request.with_focus)
 
 
 def folder_of_method(out: Path, method: Method, methods: list[Method]) -> Path:
@@ -236,118 +266,6 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
         "depth_map": request.with_depth_map,
         "poses": poses,
     }
-
-
-def plane_name(depth_mm: float) -> str:
-    """Return the file name, without suffix, of the plane at a depth."""
-    return f"plane_{depth_mm:07.1f}"
-
-
-class _Run:
-    """The planes of one call: every channel, depth and method, written as soon as all colours of a plane are there."""
-
-    def __init__(
-        self, loaded: LoadedSet, depths: list[float], pitch_mm: float | None, folders: dict[Method, Path]
-    ) -> None:
-        self._loaded = loaded
-        self._layouts = channel_layouts(loaded)
-        mm_per_depth = default_pitch_px(loaded, self._layouts) / loaded.settings.camera.fx_px
-        self._grids = {depth: plane_grid(loaded, depth, pitch_mm or depth * mm_per_depth) for depth in depths}
-        self._folders = folders
-        self._colours: dict[tuple[Method, float], list[NDArray[np.floating]]] = {}
-        self._focus = dict.fromkeys(depths, Focus(0.0, 0.0))
-        self._with_focus = False
-        self.records: list[dict[str, Any]] = []
-        self.written: dict[tuple[Method, float], Path] = {}
-
-    def needed_bytes(self) -> int:
-        """Return about how much disk the results take: planes, previews, and the report that shows them again."""
-        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self._folders)
-        return samples * len(self._layouts) * (np.dtype(np.float32).itemsize + 3)
-
-    def reconstruct(self, settings: Settings, *, with_focus: bool) -> None:
-        """Go through the channels, one in memory at a time."""
-        self._with_focus = with_focus
-        tasks = [(layout, depth) for layout in self._layouts for depth in self._grids]
-        factory_of: ChannelLayout | None = None
-        for layout, depth in progress(tasks, "reconstructing planes"):
-            if layout is not factory_of:
-                images = factory = None  # the channel before goes before the next is read
-                images = load_channel(self._loaded, layout)
-                factory = OperatorFactory(self._loaded, layout, images)
-                factory_of = layout
-            assert images is not None
-            assert factory is not None
-            operator = self._operator(factory, depth)
-            self._say_which_views_are_blind(operator, depth, len(layout.lattices))
-            if with_focus:
-                halves = _halves(self._loaded, len(layout.lattices))
-                self._add_focus(depth, focus_measure(operator, images, halves))
-            for method in self._folders:
-                solution = solve(operator, images, method, settings)
-                self.records.append(self._record(depth, method, layout, solution.record, solution.plane))
-                colours = self._colours.setdefault((method, depth), [])
-                colours.append(solution.plane)
-                if len(colours) == len(self._layouts):
-                    self._write(method, depth)
-
-    def focus(self) -> dict[str, Any] | None:
-        """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
-        if not self._with_focus:
-            return None
-        depths, curve = list(self._focus), list(self._focus.values())
-        return {
-            "depth_mm": depths,
-            "detail_e2": [point.detail_e2 for point in curve],
-            "sigma_e2": [point.sigma_e2 for point in curve],
-            "sharp_mm": sharp_depths_mm(depths, curve),
-        }
-
-    def _add_focus(self, depth: float, of_channel: Focus) -> None:
-        """Add what one more channel says of a depth."""
-        known = self._focus[depth]
-        sigma_e2 = float(np.hypot(known.sigma_e2, of_channel.sigma_e2))
-        self._focus[depth] = Focus(known.detail_e2 + of_channel.detail_e2, sigma_e2)
-
-    def _operator(self, factory: OperatorFactory, depth_mm: float) -> PlaneOperator:
-        try:
-            return factory.at_depth(depth_mm, self._grids[depth_mm])
-        except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
-
-    def _say_which_views_are_blind(self, operator: PlaneOperator, depth_mm: float, phases: int) -> None:
-        """Tell of views that see nothing of a plane: a pose may be wrong."""
-        blind = {int(view) // phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()}
-        if blind:
-            first = self._loaded.settings.view[min(blind)].image
-            say(
-                f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
-            )
-
-    def _record(
-        self, depth: float, method: Method, layout: ChannelLayout, record: dict[str, Any], plane: NDArray[np.floating]
-    ) -> dict[str, Any]:
-        """Return the entry of one plane and channel in reconstruction.json."""
-        grid = self._grids[depth]
-        samples_per_px = (grid.pitch_mm * self._loaded.settings.camera.fx_px / depth) ** 2
-        return {
-            "depth_mm": depth,
-            "method": method,
-            "channel": layout.name,
-            "file": f"{plane_name(depth)}.tiff",
-            **asdict(grid),
-            **record,
-            "flux_e": float(plane.sum(dtype=np.float64)) * samples_per_px,
-        }
-
-    def _write(self, method: Method, depth: float) -> None:
-        """Write a plane whose colours are complete, and its preview."""
-        colours = self._colours.pop((method, depth))
-        plane = colours[0] if len(colours) == 1 else np.dstack(colours)
-        path = self._folders[method] / f"{plane_name(depth)}.tiff"
-        write_plane(path, plane, self._grids[depth].pitch_mm)
-        write_png(path.with_suffix(".png"), grey_levels(plane, white_level(plane)))
-        self.written[method, depth] = path
 
 
 def distinct_depths(depths: list[float]) -> list[float]:
@@ -383,14 +301,6 @@ def _swept(option: str, given: str, example: str) -> list[float]:
     if first == last or count < 2:
         raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and at least 2 planes")
     return [round(float(value), 6) for value in np.linspace(first, last, count)]
-
-
-def _halves(loaded: LoadedSet, phases: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
-    views = loaded.settings.view
-    odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
-    odd = np.repeat(odd, phases)
-    return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
 
 
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:

@@ -7,24 +7,23 @@ from typing import Any
 from pipelines.console import say
 from pipelines.errors import MissingFile
 from pipelines.files import write_whole
-from pipelines.frames import read_frame
-from pipelines.image_files import encoded
 from pipelines.metrics import METRICS_FILE
-from pipelines.overview import INTEGRAL_IMAGE, OVERVIEW_FILE, REFERENCE_OF_NOISE, REFERENCE_VIEW
-from pipelines.pages import data_uri, template
+from pipelines.overview import OVERVIEW_FILE
+from pipelines.pages import template
 from pipelines.report_calibration import (
     GEOMETRY_FILE,
     NOISE_FILE,
     find_beside,
     geometry_section,
     noise_section,
-    photon_budget,
     records,
 )
+from pipelines.report_depth import depth_section
+from pipelines.report_lead import facts
 from pipelines.report_planes import (
     METHOD_NAMES,
-    column_title,
-    first_column,
+    best_column,
+    column_titles,
     first_depth,
     focus_curve,
     read_planes,
@@ -32,14 +31,13 @@ from pipelines.report_planes import (
     shown_depths,
     side_by_side,
     slider,
+    weight_curves,
 )
-from pipelines.result_files import Errors, Overview, Result, read_result
+from pipelines.report_sets import set_sections
+from pipelines.result_files import Errors, Result, read_result
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
-
-# Of a view that is shown pixel for pixel.
-_MOST_SHOWN_PX = 640
 
 POSES = ("nominal", "measured", "true")
 
@@ -47,8 +45,9 @@ POSES = ("nominal", "measured", "true")
 def report(directory: Path, /) -> dict[str, Any]:
     """Draw report.html anew from the results in a folder and the folders within it.
 
-    It shows the set, its light, the planes and their errors; the noise and the geometry of the camera where noise.json
-    and geometry.json lie there or in one of the two folders above; and how everything was made.
+    It leads with the planes beside what the camera saw; then come sliders, errors, the noise and the geometry of the
+    camera where noise.json and geometry.json lie there or in one of the two folders above, the set and its light, and
+    how everything was made.
 
     Parameters
     ----------
@@ -82,15 +81,19 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         "noise": noise_section(directory, noise, inputs) if noise else None,
         "geometry": geometry_section(directory, geometry, inputs) if geometry else None,
     }
+    sets = set_sections(_below(directory, OVERVIEW_FILE))
+    planes, errors = _plane_sections(directory, results), _error_sections(directory)
+    led_by = [row for row in errors["metrics"] if _is_of(row, *planes["best"])]
     page = template("report.html").render(
         title=_title(directory, results),
-        sets=_set_sections(directory),
-        **_plane_sections(directory, results),
+        facts=facts(sets[0] if sets else None, **calibrations, against_truth=errors["geometry_off"], errors=led_by),
+        sets=sets,
+        **planes,
         depth_maps=[
-            _depth_section(folder, result["depth_map"]) for folder, result in results.items() if result.get("depth_map")
+            depth_section(folder, result["depth_map"]) for folder, result in results.items() if result.get("depth_map")
         ],
         **calibrations,
-        **_error_sections(directory),
+        **errors,
         method_names=METHOD_NAMES,
         links=_links(directory),
         results=[_origin(directory, folder, result) for folder, result in results.items()],
@@ -118,35 +121,37 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
 
 
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
-    """Return what the page says of the planes: side by side, through depths and methods, and where they are sharp."""
+    """Return what the page says of the planes: the best, all side by side, on sliders, and where they are sharp."""
     planes = read_planes(directory, results, RECONSTRUCTION_FILE)
     depths = sorted({plane.depth_mm for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
-    columns = list(dict.fromkeys(plane.column for plane in planes))
+    titles, best = column_titles(planes), best_column(planes)
+    columns = list(titles)
     white = shared_white(planes, columns)
-    several = len(depths) > 1 or len(columns) > 1
+    rows = side_by_side(planes, columns, shown_depths(depths, focus), white)
+    of_best = [plane for plane in planes if plane.column == best]
+    place = columns.index(best)
     return {
-        "columns": [column_title(name) for name in columns],
-        "rows": side_by_side(planes, columns, shown_depths(depths, focus), white),
-        "slider": slider(planes, columns, white) if several else None,
-        "slider_column": first_column(columns),
+        "best": (of_best[0].method, of_best[0].poses),
+        "best_title": titles[best],
+        "best_planes": [(row["depth_mm"], row["cells"][place]) for row in rows if row["cells"][place]],
+        "weight_curves": weight_curves(of_best),
+        "certificates": [
+            (plane.depth_mm, record["certificate"])
+            for plane in of_best
+            for record in plane.records
+            if record["certificate"] and "value" in record["certificate"]
+        ],
+        "columns": list(titles.values()),
+        "rows": rows,
+        "slider": slider(planes, titles, white) if len(depths) > 1 or len(columns) > 1 else None,
+        "slider_column": place,
         "slider_depth": first_depth(depths, focus),
         "depths": len(depths),
         "white": white,
         "focus_curve": focus_curve(focus) if focus else None,
         "sharp_mm": focus["sharp_mm"] if focus else [],
     }
-
-
-def _depth_section(folder: Path, found: dict[str, Any]) -> dict[str, Any]:
-    """Return what the page shows of a sweep's depth map: its pictures, where they are still there."""
-    pictures = {
-        key: data_uri(path.read_bytes(), ".png")
-        if (path := (folder / Path(found[key]).name).with_suffix(".png")).is_file()
-        else None
-        for key in ("all_in_focus", "file", "confidence")
-    }
-    return {**found, "pictures": pictures}
 
 
 def _links(directory: Path) -> list[tuple[str, str]]:
@@ -176,12 +181,15 @@ def _below(directory: Path, name: str) -> list[Path]:
 def _error_sections(directory: Path) -> dict[str, Any]:
     """Return the errors against the truth, the folder's own or those of the folders within it, and by poses."""
     own = directory / METRICS_FILE
-    rows = [
-        row
-        for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))
-        for row in read_result(path, Errors)["planes"]
-    ]
-    return {"metrics": rows, **_by_poses(rows)}
+    found = [read_result(path, Errors) for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))]
+    rows = [row for metrics in found for row in metrics["planes"]]
+    geometry = next((metrics["geometry"] for metrics in found if "geometry" in metrics), None)
+    return {"metrics": rows, "geometry_off": geometry, **_by_poses(rows)}
+
+
+def _is_of(row: dict[str, Any], method: str, poses: str) -> bool:
+    """Return whether errors are those of a method's planes; of stated poses, errors say whether they are true."""
+    return row["method"] == method and poses in ("stated", row["poses"])
 
 
 def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -196,37 +204,6 @@ def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
     depths = sorted({plane["depth_mm"] for result in results.values() for plane in result["planes"]})
-    planes = f"{depths[0]:g} mm" if len(depths) == 1 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
+    few = " and ".join(f"{depth:g}" for depth in depths)
+    planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
     return f"{directory.resolve().name}: planes at {planes}"
-
-
-def _set_sections(directory: Path) -> list[dict[str, Any]]:
-    """Return what the page says of each set, once of one that was reconstructed several times."""
-    known: dict[bytes, Path] = {}
-    for path in _below(directory, OVERVIEW_FILE):
-        known.setdefault(path.read_bytes(), path.parent)
-    return [_set_section(folder) for folder in known.values()]
-
-
-def _set_section(folder: Path) -> dict[str, Any]:
-    """Return what the page says of one set."""
-    overview = read_result(folder / OVERVIEW_FILE, Overview)
-    pictures = {
-        key: _pixel_for_pixel(folder / name, crop=key != "integral_image") if (folder / name).is_file() else None
-        for key, name in (
-            ("integral_image", INTEGRAL_IMAGE),
-            ("reference_view", REFERENCE_VIEW),
-            ("noise_reference", REFERENCE_OF_NOISE),
-        )
-    }
-    return {**overview, "pictures": pictures, "budget": photon_budget(overview)}
-
-
-def _pixel_for_pixel(path: Path, *, crop: bool) -> str:
-    """Return a picture as it is; of one too large to be shown so, the middle, since to shrink noise would hide it."""
-    if not crop:
-        return data_uri(path.read_bytes(), ".png")
-    picture = read_frame(path).pixels_dn
-    (top, left) = ((size - min(size, _MOST_SHOWN_PX)) // 2 for size in picture.shape[:2])
-    middle = picture[top : top + _MOST_SHOWN_PX, left : left + _MOST_SHOWN_PX]
-    return data_uri(encoded(middle, ".png"), ".png")

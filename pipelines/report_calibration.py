@@ -53,8 +53,9 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> dict[s
     return {
         **_origin(directory, path, inputs),
         "rows": rows,
+        "content": content,
         "likelihood": content["likelihood"],
-        "temperature_c": content.get("temperature_c"),
+        "temperature_c": (content.get("temperature_c") or {}).get("mean"),
         "frames": len(content["frames"]),
         "unusable": {kind: len(content.get(f"{kind}_pixels", [])) for kind in ("hot", "noisy", "dead")},
         "warnings": content.get("warnings", []),
@@ -98,9 +99,9 @@ def _link(directory: Path, path: Path) -> str:
 
 
 def photon_budget(overview: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the light on a pixel by each formula, and the shares of the variance of eq. (6).
+    """Return the light on a pixel by each formula, and the shares of the variance of eq. (6); None without light.
 
-    None where the set does not say how many electrons a photon makes, or where there is no light.
+    Light is in electrons, and in photons too where the quantum efficiency is known.
 
     Parameters
     ----------
@@ -110,29 +111,41 @@ def photon_budget(overview: dict[str, Any]) -> dict[str, Any] | None:
     efficiency, dark_e = overview.get("quantum_efficiency"), overview.get("dark_e")
     light, exposure_s = overview["brightness"], overview["exposure_s"]
     signal_e = light["mean_signal_e"]
-    if not efficiency or dark_e is None or signal_e <= 0:
+    if dark_e is None or signal_e <= 0:
         return None
     counts = (
-        ("the paper's linear formula, eq. (7): SNR · n_r² / η", light["photons_linear"]),
-        ("moments: a uniform object of this SNR, eq. (4) being a ratio of powers", light["photons_from_moments"]),
-        ("counted: mean signal above dark / η", signal_e / efficiency),
+        ("the paper’s linear formula, eq. (7)", light["electrons_linear"]),
+        ("moments: a uniform object of this SNR, eq. (4) being a ratio of powers", light["electrons_from_moments"]),
+        ("counted: mean signal above dark", signal_e),
     )
     variance = noise_variance_e2(
-        signal_e / efficiency / exposure_s,
+        signal_e / exposure_s,
         exposure_s,
-        quantum_efficiency=efficiency,
+        quantum_efficiency=1.0,
         dark_current_e_per_s=dark_e / exposure_s,
         read_noise_e=overview["read_noise_e"],
     )
     parts = (("read noise", overview["read_noise_e"] ** 2), ("light", signal_e), ("dark current", dark_e))
     return {
-        "photons": [
-            {"words": words, "per_px": photons, "flux": photons / exposure_s, "all_views": photons * overview["views"]}
-            for words, photons in counts
-            if photons is not None
+        "light": [
+            {"words": words, **_in_photons(electrons, efficiency, exposure_s, overview["views"])}
+            for words, electrons in counts
+            if electrons is not None
         ],
+        "in_photons": efficiency is not None,
         "variance_e2": variance,
         "shares": [{"words": words, "e2": part, "share": part / variance} for words, part in parts],
+    }
+
+
+def _in_photons(electrons: float, efficiency: float | None, exposure_s: float, views: int) -> dict[str, float | None]:
+    """Return light per pixel in electrons and photons of one view, photons per second, and photons of all views."""
+    photons = None if efficiency is None else electrons / efficiency
+    return {
+        "electrons": electrons,
+        "photons": photons,
+        "flux": None if photons is None else photons / exposure_s,
+        "all_views": None if photons is None else photons * views,
     }
 
 

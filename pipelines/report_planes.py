@@ -1,6 +1,7 @@
 """The planes of a report: read from disk, on one grey scale, side by side and on sliders, with their focus curve."""
 
 from dataclasses import dataclass
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,11 @@ from pipelines.pages import INK, data_uri, inked, svg
 # So many depths stand side by side; more of them are shown on a slider only.
 _MOST_ROWS = 6
 _GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
+
+# Of the curves of several planes; told apart by colour and by mark.
+_LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D"))
+
+_POSES = ("measured", "nominal", "true", "stated")
 
 _OF_A_SESSION = "reconstructions"
 
@@ -32,6 +38,7 @@ class Plane:
 
     column: str
     method: str
+    poses: str
     depth_mm: float
     path: Path
     records: list[dict[str, Any]]
@@ -57,18 +64,44 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_fil
             # The folder of a method says no more than its name, and that of a session's reconstructions nothing.
             parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
             column = f"{parts[-1]}/{method}" if parts else method
-            planes.append(Plane(column, method, records[0]["depth_mm"], path, records))
-    order = list(METHOD_NAMES)
+            planes.append(Plane(column, method, _poses(result), records[0]["depth_mm"], path, records))
+    methods = list(METHOD_NAMES)
     return sorted(
-        planes, key=lambda p: (p.column.rpartition("/")[0], order.index(p.method) if p.method in order else 9)
+        planes,
+        key=lambda plane: (
+            _POSES.index(plane.poses),
+            plane.column.rpartition("/")[0],
+            methods.index(plane.method) if plane.method in methods else len(methods),
+        ),
     )
 
 
-def column_title(column: str) -> str:
-    """Return what stands above a column: the set's folder, where there are several, and the method."""
-    where, _, method = column.rpartition("/")
-    name = METHOD_NAMES.get(method, method)
-    return f"{where} set: {name}" if where else name
+def _poses(result: dict[str, Any]) -> str:
+    """Return which poses planes were made with."""
+    return str(result["options"].get("poses", "stated"))
+
+
+def column_titles(planes: list[Plane]) -> dict[str, str]:
+    """Return what stands above each column: the method, with the poses or the set's folder where these differ."""
+    columns = {plane.column: plane for plane in planes}
+    by_poses = {column: (plane.method, plane.poses) for column, plane in columns.items()}
+    told_apart = len(set(by_poses.values())) == len(columns) and len({plane.poses for plane in planes}) > 1
+    titles = {}
+    for column, plane in columns.items():
+        where, name = column.rpartition("/")[0], METHOD_NAMES.get(plane.method, plane.method)
+        if told_apart and plane.poses != "stated":
+            titles[column] = f"{name}, {plane.poses} poses"
+        else:
+            titles[column] = f"{where} set: {name}" if where else name
+    return titles
+
+
+def best_column(planes: list[Plane]) -> str:
+    """Return the column that a report leads with: of measured poses, where there are any, by the foremost method."""
+    methods = ("pmlem", "pmlem-osl", "mlem", "backprojection")
+    poses = ("measured", "stated", "nominal", "true")
+    ranks = {p.column: (poses.index(p.poses), methods.index(p.method) if p.method in methods else 9) for p in planes}
+    return min(ranks, key=lambda column: ranks[column])
 
 
 def shared_white(planes: list[Plane], columns: list[str]) -> float:
@@ -100,18 +133,18 @@ def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], w
     return rows
 
 
-def slider(planes: list[Plane], columns: list[str], white: float) -> list[dict[str, Any]]:
+def slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[dict[str, Any]]:
     """Return the pictures of the sliders: per column the planes by depth."""
     return [
         {
-            "title": column_title(column),
+            "title": title,
             "planes": [
                 _slide(plane, white)
                 for plane in sorted(planes, key=lambda plane: plane.depth_mm)
                 if plane.column == column
             ],
         }
-        for column in columns
+        for column, title in titles.items()
     ]
 
 
@@ -120,11 +153,6 @@ def _slide(plane: Plane, white: float) -> dict[str, Any]:
     pixels = plane.pixels()
     picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
     return {"depth_mm": plane.depth_mm, "samples": pixels.shape[1], "src": picture}
-
-
-def first_column(columns: list[str]) -> int:
-    """Return which column the slider shows first: one that was penalised, where there is one."""
-    return next((index for index, name in enumerate(columns) if "pmlem" in name), 0)
 
 
 def first_depth(depths: list[float], focus: dict[str, Any] | None) -> int:
@@ -155,5 +183,36 @@ def focus_curve(focus: dict[str, Any]) -> str:
     axes.set_xlabel("depth (mm)", color=INK)
     axes.set_ylabel("detail both halves\nof the views agree on (e⁻²)", color=INK)
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
+    inked(axes)
+    return svg(figure)
+
+
+def weight_curves(planes: list[Plane]) -> str | None:
+    """Return how well each penalty weight predicts the views that were held out, as SVG; None where none were.
+
+    Parameters
+    ----------
+    planes : list of Plane
+        Of one column.
+    """
+    from matplotlib.figure import Figure
+
+    records = [(plane.depth_mm, record) for plane in planes for record in plane.records]
+    known = [(depth, record) for depth, record in records if record.get("penalty_weight_curve")]
+    if not known:
+        return None
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for (depth_mm, record), (colour, marker) in zip(known, cycle(_LINES)):
+        curve = sorted(record["penalty_weight_curve"], key=lambda point: float(point["weight"]))
+        weights = [point["weight"] for point in curve]
+        worse = np.array([point["held_out"] for point in curve]) - min(point["held_out"] for point in curve)
+        colour_name = "" if record["channel"] == "grey" else f", {record['channel']}"
+        axes.plot(weights, worse, marker=marker, markersize=4, color=colour, label=f"{depth_mm:g} mm{colour_name}")
+        axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
+    axes.set_xscale("log")
+    axes.set_xlabel("penalty weight β")
+    axes.set_ylabel("held-out views: −log likelihood\nabove its least")
+    axes.legend(frameon=False, labelcolor=INK)
     inked(axes)
     return svg(figure)

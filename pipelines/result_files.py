@@ -102,6 +102,7 @@ class Noise(msgspec.Struct):
     dark_current_e_per_s: Measured
     likelihood: str
     frames: list[dict[str, Any]]
+    temperature_c: dict[str, float] | None = None
 
 
 class StageFigure(msgspec.Struct):

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from pipelines.arguments import Count, NotNegative, Positive
 from pipelines.console import say
 from pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
@@ -15,7 +13,7 @@ from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS
 from pipelines.hashes import Hashes
 from pipelines.measured_poses import GEOMETRY_FILE
 from pipelines.planes import Method, Settings
-from pipelines.provenance import provenance
+from pipelines.provenance import first_difference, provenance
 from pipelines.reconstruct import (
     DEFAULT_METHOD,
     Request,
@@ -221,19 +219,8 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
             return f"{file} is not there yet"
         content = json.loads((session / file).read_bytes())
         origin = content.get("provenance", content)
-        now = json.loads(msgspec.json.encode(provenance(step.name, options, inputs)))
-        if why := _first_difference(file, origin, now):
-            return why
+        now = provenance(step.name, options, inputs)
+        if why := first_difference(origin, now):
+            return f"{file} was made with another {why}"
     missing = [name for name in step.outputs if not (session / name).is_file()]
     return f"{missing[0]} is missing" if missing else None
-
-
-def _first_difference(file: str, origin: dict[str, Any], now: dict[str, Any]) -> str | None:
-    """Return in words the first thing in which the origin of a result differs from what it would be now."""
-    for key, called in (("inputs", "input"), ("options", "option"), ("versions", "version")):
-        before, after = origin.get(key, {}), now[key]
-        changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
-        if changed:
-            more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-            return f"{file} was made with another {called}: {changed[0]}{more}"
-    return None

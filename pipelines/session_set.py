@@ -12,7 +12,7 @@ from pipelines.elemental_set import Camera, ElementalSet, LoadedSet, View
 from pipelines.errors import BadValue, MissingFile
 from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from pipelines.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
-from rig.plan import CapturePlan, Stop
+from rig.plan import CapturePlan, StepKind, Stop
 from rig.session.frames import planned_frames
 from rig.session.opening import read_plan, taken_frames
 from rig.session.session import PLAN
@@ -72,7 +72,8 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         measured_in=measured_in / GEOMETRY_FILE if measured_in.is_dir() else measured_in,
         poses="nominal",
         described_in=PLAN,
-        noise_reference=_noise_reference(folder),
+        noise_reference=tuple(path for path, _ in _at_centre(folder, "noise_reference")),
+        bright_view=next(iter(_at_centre(folder, "bright")), None),
     )
 
 
@@ -103,11 +104,11 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
     return sum(at_centre), whole
 
 
-def _noise_reference(folder: Path) -> tuple[Path, ...]:
-    """Return the exposures of nothing at the centre node."""
+def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
+    """Return the frames of a kind at the centre node, each with its exposure in s."""
     centre = read_plan(folder).plan.centre
-    taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == "noise_reference"]
-    return tuple(path for frame, path in taken if frame.stop == centre and path.is_file())
+    taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == kind and frame.stop == centre]
+    return [(path, frame.exposure_s) for frame, path in taken if path.is_file()]
 
 
 def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
-from pipelines.brightness import OBJECT_REGION
 from pipelines.console import progress, say
 from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
 from pipelines.errors import BadValue
 from pipelines.exposures import stated_noise, write_exposures
 from pipelines.files import building_folder, write_json
 from pipelines.image_files import mask_picture, write_frame, write_plane, write_png
+from pipelines.object_region import OBJECT_REGION
 from pipelines.provenance import provenance
 from pipelines.truth import TRUTH_FILE, TruePlane, Truth
 from recon.metrics import expected_snr_from_powers, photons_from_linear_snr, photons_from_moments, signal_scale_for_snr

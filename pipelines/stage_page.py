@@ -25,10 +25,15 @@ _FIGURES: tuple[tuple[str, str, str, float], ...] = (
 )
 
 
+# In OpenCV's order.
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
 def write_stage_page(out: Path, geometry: RigGeometry, content: dict[str, Any]) -> Path:
     """Write geometry.html into `out` and return its path."""
     page = template("geometry.html").render(
         rows=stage_rows(content["stage"]),
+        lens=lens_rows(content["lens"]),
         drawing=node_drawing(content),
         maps=sigma_maps(content),
         geometry=content,
@@ -47,11 +52,22 @@ def stage_rows(stage: dict[str, Any]) -> list[dict[str, str]]:
     return [_row(stage[name], words, unit, factor) for name, words, unit, factor in _FIGURES]
 
 
+def lens_rows(lens: dict[str, Any]) -> list[dict[str, str]]:
+    """Return the table of the `lens` of geometry.json."""
+    in_px = ("focal length fx", "focal length fy", "principal point cx", "principal point cy")
+    words = [*((name, "px") for name in in_px), *((f"distortion {name}", "") for name in _DISTORTION)]
+    values = [*(lens[f"{name}_px"] for name in ("fx", "fy", "cx", "cy")), *lens["distortion"]]
+    return [
+        _row({"value": value, "sigma": sigma}, *name, 1.0)
+        for value, sigma, name in zip(values, lens["sigma"], words, strict=False)
+    ]
+
+
 def _row(estimate: dict[str, Any], words: str, unit: str, factor: float) -> dict[str, str]:
     """Return a line of the table, with as many digits as the uncertainty deserves."""
     if estimate["value"] is None or estimate["sigma"] is None:
         return {"words": words, "value": "–", "sigma": "", "unit": "", "why": estimate.get("why") or ""}
     sigma = estimate["sigma"] * factor
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 7)) if sigma > 0 else 3
-    value = f"{estimate['value'] * factor:.{digits}f}"
+    value = f"{estimate['value'] * factor:.{digits}f}".replace("-", "−")
     return {"words": words, "value": value, "sigma": f"± {sigma:.{digits}f}", "unit": unit, "why": ""}

@@ -23,14 +23,12 @@ accumulator of its own: sums are deterministic for a given number of workers.
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-from numba import types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from recon.elementary import compiled, inlined
-from recon.pixel_models import WORK_ROWS, form_ratio
+from recon.pixel_models import WORK_ROWS, form_ratio_of_block
+from recon.pointers import advanced, index, pointer
 
 BLOCK_PX = 64
 TILE_ROWS = 8
@@ -41,35 +39,20 @@ COLUMN_TAPS, ROW_TAPS = 4, 3
 EDGE_TOLERANCE = 1e-3
 
 FORWARD, ADJOINT, RATIO, VALUE, REACH = 0, 1, 2, 3, 4
-_SCATTERED, _IN_STEP, _OUTSIDE = 0, 1, 2
+# How a block lies on a plane; in step with it, by how many rows and columns of taps it needs.
+_OUTSIDE, _SCATTERED, _IN_STEP_2_2, _IN_STEP_2_3, _IN_STEP_3_3, _IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
 
 # Vectors are fastest where they do not straddle the processor's cache lines.
 _LINE_BYTES = 64
 
 # Where the rows of the scratch begin. Rows of shifted products have a margin on either side that stays zero.
-_EXPECTED, _COUNTED, _OBSERVED, _BACKGROUND, _VARIANCE = (row * BLOCK_PX for row in range(5))
+_EXPECTED, _COUNTED = 0, BLOCK_PX
 _MARGIN = 16
 _PRODUCT_PX = BLOCK_PX + 2 * _MARGIN
-_PRODUCTS = 5 * BLOCK_PX + _MARGIN
-_PLACES = 5 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * _PRODUCT_PX
+_PRODUCTS = 2 * BLOCK_PX + _MARGIN
+_PLACES = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * _PRODUCT_PX
 _COLUMN, _ROW, _WEIGHT = (row * BLOCK_PX for row in range(3))
 _PLACE_SIZE = 3 * BLOCK_PX
-
-# Unsigned: numba would test signed ones for being negative, which keeps loops from becoming vectors
-_index = np.uintp
-
-
-@intrinsic
-def _pointer(_context, array):
-    """Return where a contiguous array begins.
-
-    What works on blocks is given pointers: arrays are counted references, and counting them costs more than the sums.
-    """
-
-    def build(context, builder, signature, arguments):
-        return context.make_array(signature.args[0])(context, builder, arguments[0]).data
-
-    return types.CPointer(array.dtype)(array), build
 
 
 class Geometry(NamedTuple):
@@ -139,10 +122,10 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
     greatest, least = np.int32(2**30), np.int32(-(2**30))
     row_from, row_to, column_from, column_to = greatest, least, greatest, least
     # Held in registers: stores to the scratch would make the compiler load them again for every pixel
-    a, b, c = homographies[matrix], homographies[matrix + _index(1)], homographies[matrix + _index(2)]
-    d, e, f = homographies[matrix + _index(3)], homographies[matrix + _index(4)], homographies[matrix + _index(5)]
-    g, h, i = homographies[matrix + _index(6)], homographies[matrix + _index(7)], homographies[matrix + _index(8)]
-    for k in range(_index(BLOCK_PX)):
+    a, b, c = homographies[matrix], homographies[matrix + index(1)], homographies[matrix + index(2)]
+    d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
+    g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
+    for k in range(index(BLOCK_PX)):
         at = pixel + k
         x, y, response = maps[at], maps[at + layer], maps[at + layer + layer]
         scale = g * x + h * y + i
@@ -156,9 +139,9 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
         # scale > 0 also says that the plane is met in front of the camera
         sees = (scale > zero) & (abs(column - within_column) <= margin) & (abs(row - within_row) <= margin)
         advance = within_column - number(np.int32(k))
-        scratch[place + _index(_COLUMN) + k] = advance
-        scratch[place + _index(_ROW) + k] = within_row
-        scratch[place + _index(_WEIGHT) + k] = response if sees else zero
+        scratch[place + index(_COLUMN) + k] = advance
+        scratch[place + index(_ROW) + k] = within_row
+        scratch[place + index(_WEIGHT) + k] = response if sees else zero
         whole_column, whole_row = np.int32(np.floor(advance)), np.int32(within_row)
         row_from, row_to = min(row_from, whole_row if sees else greatest), max(row_to, whole_row if sees else least)
         column_from = min(column_from, whole_column if sees else greatest)
@@ -174,9 +157,15 @@ def _arrangement(row_from, row_to, column_from, column_to, start, stride, sample
     """
     if row_to < row_from:
         return _OUTSIDE
-    in_step = row_to - row_from < ROW_TAPS - 1 and column_to - column_from < COLUMN_TAPS - 1
+    rows, columns = row_to - row_from + 2, column_to - column_from + 2
     end = start + (ROW_TAPS - 1) * stride + BLOCK_PX + _MARGIN
-    return _IN_STEP if in_step and start >= 0 and end <= samples else _SCATTERED
+    if rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
+        return _SCATTERED
+    if columns > 3:
+        return _IN_STEP_3_4
+    if rows > 2:
+        return _IN_STEP_3_3
+    return _IN_STEP_2_3 if columns > 2 else _IN_STEP_2_2
 
 
 @inlined
@@ -186,106 +175,141 @@ def _tent(distance):
 
 
 @inlined
-def _row_weights(down):
-    """Return the tents of the three rows; they sum to one."""
+def _row_weights(down, rows):
+    """Return the tents of the rows; they sum to one."""
     number = type(down)
     zero, one = number(0), number(1)
+    if rows == 2:
+        return one - down, down, zero
     upper = one - down if down < one else zero
     lower = down - one if down > one else zero
     return upper, one - upper - lower, lower
 
 
-@compiled
-def _gather_in_step(samples, start, stride, row_from, column_from, scratch, place):
+@inlined
+def _gather_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
     """Add to `_EXPECTED` what the block's pixels see: the plane, interpolated bilinearly, times the weight."""
     number = type(scratch[0])
     row, column = number(row_from), number(column_from)
-    upper = _index(start)
-    middle = upper + _index(stride)
-    lower = middle + _index(stride)
-    one, two, three = _index(1), _index(2), _index(3)
-    for k in range(_index(BLOCK_PX)):
-        along = scratch[place + _index(_COLUMN) + k] - column
-        t0, t1, t2, t3 = _tent(along), _tent(along - number(1)), _tent(along - number(2)), _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + _index(_ROW) + k] - row)
-        at = upper + k
-        above = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        at = middle + k
-        here = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        at = lower + k
-        below = t0 * samples[at] + t1 * samples[at + one] + t2 * samples[at + two] + t3 * samples[at + three]
-        seen = scratch[place + _index(_WEIGHT) + k] * (u0 * above + u1 * here + u2 * below)
-        scratch[_index(_EXPECTED) + k] += seen
+    across, down = advanced(scratch, place + index(_COLUMN)), advanced(scratch, place + index(_ROW))
+    weights = advanced(scratch, place + index(_WEIGHT))
+    for k in range(index(BLOCK_PX)):
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        seen = u0 * _along_row(columns, along, samples, k)
+        seen += u1 * _along_row(columns, along, samples, index(stride) + k)
+        if rows > 2:
+            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + k)
+        scratch[index(_EXPECTED) + k] += weights[k] * seen
 
 
-@compiled
-def _scatter_in_step(samples, start, stride, row_from, column_from, scratch, place):
-    """Add `_EXPECTED` to the plane with the weights that `_gather_in_step` reads it with.
+@inlined
+def _along_row(columns, along, samples, at):
+    """Return a row of the plane, interpolated."""
+    number = type(along)
+    if columns == 2:
+        return samples[at] + along * (samples[at + index(1)] - samples[at])
+    seen = _tent(along) * samples[at] + _tent(along - number(1)) * samples[at + index(1)]
+    seen += _tent(along - number(2)) * samples[at + index(2)]
+    if columns > 3:
+        seen += _tent(along - number(3)) * samples[at + index(3)]
+    return seen
+
+
+@inlined
+def _scatter_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
+    """Add `_EXPECTED` to the plane with the weights that `_gather_taps` reads it with.
 
     Products of all taps are formed first and then added, shifted, once per row of samples: stores that overlap loads
     soon after would make the processor wait. A pixel that does not count may hold anything, a NaN as well.
     """
     number = type(scratch[0])
     row, column, zero = number(row_from), number(column_from), number(0)
-    size, base = _index(_PRODUCT_PX), _index(_PRODUCTS)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
-        value = weight * scratch[_index(_EXPECTED) + k] if weight != zero else zero
-        along = scratch[place + _index(_COLUMN) + k] - column
-        v0, v1 = value * _tent(along), value * _tent(along - number(1))
-        v2, v3 = value * _tent(along - number(2)), value * _tent(along - number(3))
-        u0, u1, u2 = _row_weights(scratch[place + _index(_ROW) + k] - row)
-        at = base + k
-        scratch[at], scratch[at + size] = u0 * v0, u0 * v1
-        scratch[at + _index(2) * size], scratch[at + _index(3) * size] = u0 * v2, u0 * v3
-        scratch[at + _index(4) * size], scratch[at + _index(5) * size] = u1 * v0, u1 * v1
-        scratch[at + _index(6) * size], scratch[at + _index(7) * size] = u1 * v2, u1 * v3
-        scratch[at + _index(8) * size], scratch[at + _index(9) * size] = u2 * v0, u2 * v1
-        scratch[at + _index(10) * size], scratch[at + _index(11) * size] = u2 * v2, u2 * v3
-    first = _index(start)
-    for _ in range(ROW_TAPS):
-        second, third = base + size - _index(1), base + _index(2) * size - _index(2)
-        fourth = base + _index(3) * size - _index(3)
-        for k in range(_index(BLOCK_PX + _MARGIN)):
-            even = scratch[base + k] + scratch[second + k]
-            samples[first + k] += even + (scratch[third + k] + scratch[fourth + k])
-        first += _index(stride)
-        base += _index(COLUMN_TAPS) * size
+    across, down = advanced(scratch, place + index(_COLUMN)), advanced(scratch, place + index(_ROW))
+    weights = advanced(scratch, place + index(_WEIGHT))
+    size = index(_PRODUCT_PX)
+    upper = advanced(scratch, index(_PRODUCTS))
+    middle, lower = advanced(upper, index(columns) * size), advanced(upper, index(2 * columns) * size)
+    for k in range(index(BLOCK_PX)):
+        value = weights[k] * scratch[index(_EXPECTED) + k] if weights[k] != zero else zero
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        for tap in range(columns):
+            share = value * _tent(along - number(tap))
+            upper[index(tap) * size + k] = u0 * share
+            middle[index(tap) * size + k] = u1 * share
+            if rows > 2:
+                lower[index(tap) * size + k] = u2 * share
+    for r in range(rows):
+        products, target = advanced(upper, index(r * columns) * size), advanced(samples, index(r * stride))
+        for k in range(index(BLOCK_PX + _MARGIN)):
+            added = products[k]
+            for tap in range(1, columns):
+                added += products[index(tap) * (size - index(1)) + k]
+            target[k] += added
+
+
+@compiled
+def _gather_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Interpolate with as few taps as the block's lie allows; each number of taps is compiled by itself."""
+    samples = advanced(samples, index(start))
+    if how == _IN_STEP_2_2:
+        _gather_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_2_3:
+        _gather_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_3_3:
+        _gather_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _gather_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+
+
+@compiled
+def _scatter_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Scatter with the taps of `_gather_in_step`."""
+    samples = advanced(samples, index(start))
+    if how == _IN_STEP_2_2:
+        _scatter_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_2_3:
+        _scatter_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == _IN_STEP_3_3:
+        _scatter_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _scatter_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
 
 
 @inlined
 def _corner(scratch, place, k, start, height, stride):
     """Return the upper left of the four samples around a pixel's point, and the fractions down and right of it."""
     number = type(scratch[0])
-    column = scratch[place + _index(_COLUMN) + k] + number(np.int32(k))
-    row = scratch[place + _index(_ROW) + k]
+    column = scratch[place + index(_COLUMN) + k] + number(np.int32(k))
+    row = scratch[place + index(_ROW) + k]
     left, upper = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
-    return _index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
+    return index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
 
 
 @compiled
 def _gather_scattered(samples, start, height, stride, scratch, place):
     """Do as `_gather_in_step` does, pixel by pixel."""
-    zero, one, below = type(scratch[0])(0), _index(1), _index(stride)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(_WEIGHT) + k]
         if weight != zero:
             at, down, right = _corner(scratch, place, k, start, height, stride)
             upper, lower = samples[at], samples[at + below]
             upper += right * (samples[at + one] - upper)
             lower += right * (samples[at + below + one] - lower)
-            scratch[_index(_EXPECTED) + k] += weight * (upper + down * (lower - upper))
+            scratch[index(_EXPECTED) + k] += weight * (upper + down * (lower - upper))
 
 
 @compiled
 def _scatter_scattered(samples, start, height, stride, scratch, place):
     """Do as `_scatter_in_step` does, pixel by pixel."""
-    zero, one, below = type(scratch[0])(0), _index(1), _index(stride)
-    for k in range(_index(BLOCK_PX)):
-        weight = scratch[place + _index(_WEIGHT) + k]
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(_WEIGHT) + k]
         if weight != zero:
             at, down, right = _corner(scratch, place, k, start, height, stride)
-            value = weight * scratch[_index(_EXPECTED) + k]
+            value = weight * scratch[index(_EXPECTED) + k]
             lower = value * down
             upper = value - lower
             samples[at] += upper - upper * right
@@ -301,34 +325,34 @@ def _locate_on_all(homographies, matrix, views, layout, planes, samples, maps, l
     `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that one's row and column.
     """
     meets = False
-    for plane in range(_index(planes)):
+    for plane in range(index(planes)):
         start, height, width = (
-            layout[_index(3) * plane],
-            layout[_index(3) * plane + _index(1)],
-            layout[_index(3) * plane + _index(2)],
+            layout[index(3) * plane],
+            layout[index(3) * plane + index(1)],
+            layout[index(3) * plane + index(2)],
         )
         row_from, row_to, column_from, column_to = _locate(
-            homographies, matrix + _index(9) * plane * views, maps, layer, pixel, height, width, scratch, _place(plane)
+            homographies, matrix + index(9) * plane * views, maps, layer, pixel, height, width, scratch, _place(plane)
         )
         start += row_from * width + column_from
         how = _arrangement(row_from, row_to, column_from, column_to, start, width, samples)
-        block = _index(4) * plane
-        blocks[block], blocks[block + _index(1)] = how, start
-        blocks[block + _index(2)], blocks[block + _index(3)] = row_from, column_from
+        block = index(4) * plane
+        blocks[block], blocks[block + index(1)] = how, start
+        blocks[block + index(2)], blocks[block + index(3)] = row_from, column_from
         meets |= how != _OUTSIDE
     return meets
 
 
 @inlined
 def _place(plane):
-    return _index(_PLACES) + plane * _index(_PLACE_SIZE)
+    return index(_PLACES) + plane * index(_PLACE_SIZE)
 
 
 @compiled
 def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
     """Multiply the weights of a block's pixels on every plane."""
-    for plane in range(_index(planes)):
-        weight = _place(plane) + _index(_WEIGHT)
+    for plane in range(index(planes)):
+        weight = _place(plane) + index(_WEIGHT)
         for k in range(count):
             scratch[weight + k] *= type(scratch[0])(factors[pixel + k])
         pixel += to_next_plane
@@ -338,33 +362,33 @@ def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
 def _gather(samples, layout, planes, scratch, blocks):
     """Set `_EXPECTED` to what a block's pixels see of all planes, and `_COUNTED` to their greatest weight."""
     zero = type(scratch[0])(0)
-    for k in range(_index(2 * BLOCK_PX)):
-        scratch[_index(_EXPECTED) + k] = zero
-    for plane in range(_index(planes)):
-        block, place, width = _index(4) * plane, _place(plane), layout[_index(3) * plane + _index(2)]
+    for k in range(index(2 * BLOCK_PX)):
+        scratch[index(_EXPECTED) + k] = zero
+    for plane in range(index(planes)):
+        block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
         if blocks[block] == _OUTSIDE:
             continue
-        for k in range(_index(BLOCK_PX)):
-            at = _index(_COUNTED) + k
-            scratch[at] = max(scratch[at], scratch[place + _index(_WEIGHT) + k])
-        if blocks[block] == _IN_STEP:
-            start, row, column = blocks[block + _index(1)], blocks[block + _index(2)], blocks[block + _index(3)]
-            _gather_in_step(samples, start, width, row, column, scratch, place)
+        for k in range(index(BLOCK_PX)):
+            at = index(_COUNTED) + k
+            scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
+        if blocks[block] > _SCATTERED:
+            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
+            _gather_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         else:
-            start, height = layout[_index(3) * plane], layout[_index(3) * plane + _index(1)]
+            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _gather_scattered(samples, start, height, width, scratch, place)
 
 
 @compiled
 def _scatter(samples, layout, planes, scratch, blocks):
     """Add `_EXPECTED` to all planes."""
-    for plane in range(_index(planes)):
-        block, place, width = _index(4) * plane, _place(plane), layout[_index(3) * plane + _index(2)]
-        if blocks[block] == _IN_STEP:
-            start, row, column = blocks[block + _index(1)], blocks[block + _index(2)], blocks[block + _index(3)]
-            _scatter_in_step(samples, start, width, row, column, scratch, place)
+    for plane in range(index(planes)):
+        block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
+        if blocks[block] > _SCATTERED:
+            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
+            _scatter_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         elif blocks[block] == _SCATTERED:
-            start, height = layout[_index(3) * plane], layout[_index(3) * plane + _index(1)]
+            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
             _scatter_scattered(samples, start, height, width, scratch, place)
 
 
@@ -392,12 +416,6 @@ def workspace(planes: int, dtype: np.dtype[Any]) -> Workspace:
     return Workspace(raw[skipped : skipped + size], models, np.zeros(4 * planes, np.intp))
 
 
-@inlined
-def _row(scratch, row):
-    """Return a row of the scratch as an array that is not counted."""
-    return numba.carray(_pointer(scratch[row : row + BLOCK_PX]), (BLOCK_PX,))
-
-
 @compiled
 def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
     """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
@@ -420,26 +438,20 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
         The worker's own.
     """
     rows, columns, padded = geometry.detector
-    count_of_planes, count_of_views = geometry.layout.shape[0], _index(geometry.lattice_of_view.size)
+    count_of_planes, count_of_views = geometry.layout.shape[0], index(geometry.lattice_of_view.size)
     samples = accumulator.size if operation == ADJOINT else planes.size
-    expected, counted, observed = (
-        _row(space.scratch, _EXPECTED),
-        _row(space.scratch, _COUNTED),
-        _row(space.scratch, _OBSERVED),
-    )
-    background, variance = _row(space.scratch, _BACKGROUND), _row(space.scratch, _VARIANCE)
-    models = numba.carray(_pointer(space.models), space.models.shape)
-    scratch, blocks, layout = _pointer(space.scratch), _pointer(space.blocks), _pointer(geometry.layout)
+    scratch, blocks, layout = pointer(space.scratch), pointer(space.blocks), pointer(geometry.layout)
+    expected, counted, models = scratch, advanced(scratch, index(_COUNTED)), pointer(space.models)
     homographies, maps, layer = (
-        _pointer(geometry.homographies),
-        _pointer(geometry.maps),
-        _index(geometry.maps.size // 3),
+        pointer(geometry.homographies),
+        pointer(geometry.maps),
+        index(geometry.maps.size // 3),
     )
-    planes_at, added_at, seen_at, images_at = _pointer(planes), _pointer(accumulator), _pointer(seen), _pointer(images)
-    background_at, variance_at = _pointer(pixels.background), _pointer(pixels.variance)
-    valid_at, transmission_at = _pointer(geometry.valid), _pointer(geometry.transmission)
+    planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
+    background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
+    valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
     masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
-    per_plane = count_of_views * _index(rows * columns)
+    per_plane = count_of_views * index(rows * columns)
     model, level = pixels.model, pixels.level
     value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
@@ -449,35 +461,35 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                 begin, end = geometry.reach[view, row, 0], geometry.reach[view, row, 1]
                 met_from, met_to = end, begin
                 for first in range(begin, end, BLOCK_PX):
-                    at = _index((lattice * rows + row) * padded + first)
+                    at = index((lattice * rows + row) * padded + first)
                     if not _locate_on_all(
-                        homographies, _index(9 * view), count_of_views, layout, count_of_planes, samples,
+                        homographies, index(9 * view), count_of_views, layout, count_of_planes, samples,
                         maps, layer, at, scratch, blocks,
                     ):  # fmt: skip
                         continue
                     met_from, met_to = min(met_from, first), first + BLOCK_PX
                     if operation == REACH:
                         continue
-                    count = _index(min(BLOCK_PX, columns - first))
-                    at = _index((view * rows + row) * columns + first)
+                    count = index(min(BLOCK_PX, columns - first))
+                    at = index((view * rows + row) * columns + first)
                     if masked:
-                        _weigh(valid_at, at, _index(0), count_of_planes, count, scratch)
+                        _weigh(valid_at, at, index(0), count_of_planes, count, scratch)
                     if occluded:
                         _weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
-                    pixel = _index((image * rows + row) * columns + first)
+                    pixel = index((image * rows + row) * columns + first)
                     if operation == ADJOINT:
-                        _copy(images_at, pixel, scratch, _index(_EXPECTED), count)
+                        _copy(images_at, pixel, scratch, index(_EXPECTED), count)
                     else:
                         _gather(planes_at, layout, count_of_planes, scratch, blocks)
                     if operation == FORWARD:
-                        _copy(scratch, _index(_EXPECTED), seen_at, pixel, count)
+                        _copy(scratch, index(_EXPECTED), seen_at, pixel, count)
                         continue
                     if operation != ADJOINT:
-                        at = _index((lattice * rows + row) * columns + first)
-                        _copy(images_at, pixel, scratch, _index(_OBSERVED), count)
-                        _copy(background_at, at, scratch, _index(_BACKGROUND), count)
-                        _copy(variance_at, at, scratch, _index(_VARIANCE), count)
-                        value += form_ratio(model, expected, observed, background, variance, counted, level, models)
+                        at = index((lattice * rows + row) * columns + first)
+                        value += form_ratio_of_block(
+                            model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
+                            advanced(variance_at, at), counted, level, models,
+                        )  # fmt: skip
                     if operation != VALUE:
                         _scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:

@@ -15,6 +15,7 @@ negative log-likelihood with respect to (H f) is 1 − r, and that negative log-
 import numpy as np
 
 from recon.elementary import compiled, exponential, logarithm
+from recon.pointers import advanced, index, pointer
 
 SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES = 0, 1, 2
 
@@ -32,7 +33,7 @@ _NEWTON_STEPS = 6
 
 @compiled
 def form_ratio(model, expected, observed, background, variance, response, level, work):
-    """Replace H f of a block of pixels by the ratio; return the block's negative log-likelihood.
+    """Replace H f of some pixels by the ratio; return their negative log-likelihood.
 
     Parameters
     ----------
@@ -49,19 +50,35 @@ def form_ratio(model, expected, observed, background, variance, response, level,
     work : array (WORK_ROWS, pixels or more)
         Scratch.
     """
-    if model == POISSON_GAUSSIAN:
-        return _poisson_gaussian(expected, observed, background, variance, response, work)
-    if model == LEAST_SQUARES:
-        return _least_squares(expected, observed, background, variance, response, level)
-    return _shifted_poisson(expected, observed, background, variance, response)
+    return form_ratio_of_block(
+        model,
+        index(expected.size),
+        pointer(expected),
+        pointer(observed),
+        pointer(background),
+        pointer(variance),
+        pointer(response),
+        level,
+        pointer(work),
+    )
 
 
 @compiled
-def _shifted_poisson(expected, observed, background, variance, response):
-    number = expected.dtype.type
+def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work):
+    """Do as `form_ratio` does, with pointers to `count` numbers each."""
+    if model == POISSON_GAUSSIAN:
+        return _poisson_gaussian(count, expected, observed, background, variance, response, work)
+    if model == LEAST_SQUARES:
+        return _least_squares(count, expected, observed, background, variance, response, level)
+    return _shifted_poisson(count, expected, observed, background, variance, response)
+
+
+@compiled
+def _shifted_poisson(count, expected, observed, background, variance, response):
+    number = type(expected[0])
     zero, tiny, infinite = number(0), number(1e-37), number(np.inf)
     total = zero
-    for k in range(expected.size):
+    for k in range(count):
         shifted = max(observed[k] + variance[k], zero)
         mean = expected[k] + background[k] + variance[k]
         ratio = shifted / mean if mean > zero else zero
@@ -73,11 +90,11 @@ def _shifted_poisson(expected, observed, background, variance, response):
 
 
 @compiled
-def _least_squares(expected, observed, background, variance, response, level):
-    number = expected.dtype.type
+def _least_squares(count, expected, observed, background, variance, response, level):
+    number = type(expected[0])
     zero, one, half, level = number(0), number(1), number(0.5), number(level)
     total = zero
-    for k in range(expected.size):
+    for k in range(count):
         miss = observed[k] - expected[k] - background[k]
         scaled = miss / (level * response[k] + background[k] + variance[k])
         total += half * scaled * miss if response[k] != zero else zero
@@ -86,27 +103,28 @@ def _least_squares(expected, observed, background, variance, response, level):
 
 
 @compiled
-def _poisson_gaussian(expected, observed, background, variance, response, work):
+def _poisson_gaussian(count, expected, observed, background, variance, response, work):
     """Sum over the count N outwards from the likeliest, each term from its neighbour by one multiplication."""
-    number = expected.dtype.type
+    number = type(expected[0])
     zero, one, half, limit = number(0), number(1), number(0.5), number(80)
-    count = expected.size
-    mode, mean, sigma2, step = work[0, :count], work[1, :count], work[2, :count], work[3, :count]
-    term, shrink, mass, moment = work[4, :count], work[5, :count], work[6, :count], work[7, :count]
+    mode, mean = work, advanced(work, count)
+    sigma2, step = advanced(mean, count), advanced(mean, index(2) * count)
+    term, shrink = advanced(step, count), advanced(step, index(2) * count)
+    mass, moment = advanced(shrink, count), advanced(shrink, index(2) * count)
     for k in range(count):
         mean[k] = max(expected[k] + background[k], number(_LEAST_MEAN_E))
         sigma2[k] = max(variance[k], number(_LEAST_VARIANCE_E2))
         shrink[k] = exponential(-one / sigma2[k])
-    widest = _likeliest_counts(mode, observed, mean, sigma2, response, step)
+    widest = _likeliest_counts(count, mode, observed, mean, sigma2, response, step)
     reach = int(_SPREADS * np.sqrt(widest)) + _EXTRA
-    mass[:], moment[:], term[:] = one, zero, one
     for k in range(count):
+        mass[k], moment[k], term[k] = one, zero, one
         step[k] = exponential(min((observed[k] - mode[k] - half) / sigma2[k] + logarithm(mean[k]), limit))
-    _sum_upwards(reach, mode, step, shrink, term, mass, moment)
-    term[:] = one
+    _sum_upwards(count, reach, mode, step, shrink, term, mass, moment)
     for k in range(count):
+        term[k] = one
         step[k] = exponential(min((mode[k] - observed[k] - half) / sigma2[k] - logarithm(mean[k]), limit))
-    _sum_downwards(reach, mode, step, shrink, term, mass, moment)
+    _sum_downwards(count, reach, mode, step, shrink, term, mass, moment)
     total = zero
     for k in range(count):
         miss = observed[k] - mode[k]
@@ -118,11 +136,11 @@ def _poisson_gaussian(expected, observed, background, variance, response, work):
 
 
 @compiled
-def _sum_upwards(reach, mode, step, shrink, term, mass, moment):
+def _sum_upwards(count, reach, mode, step, shrink, term, mass, moment):
     """Add the terms of the counts above the mode to `mass`, and times their distance to `moment`."""
     for away in range(1, reach + 1):
-        distance = step.dtype.type(away)
-        for k in range(step.size):
+        distance = type(step[0])(away)
+        for k in range(count):
             term[k] *= step[k] / (mode[k] + distance)
             mass[k] += term[k]
             moment[k] += distance * term[k]
@@ -130,35 +148,35 @@ def _sum_upwards(reach, mode, step, shrink, term, mass, moment):
 
 
 @compiled
-def _sum_downwards(reach, mode, step, shrink, term, mass, moment):
+def _sum_downwards(count, reach, mode, step, shrink, term, mass, moment):
     """Likewise for the counts below; a term is zero at a count of −1, and from there on."""
     for away in range(1, reach + 1):
-        distance = step.dtype.type(away)
-        for k in range(step.size):
-            term[k] *= step[k] * (mode[k] - distance + step.dtype.type(1))
+        distance = type(step[0])(away)
+        for k in range(count):
+            term[k] *= step[k] * (mode[k] - distance + type(step[0])(1))
             mass[k] += term[k]
             moment[k] -= distance * term[k]
             step[k] *= shrink[k]
 
 
 @compiled
-def _likeliest_counts(mode, observed, mean, sigma2, response, target):
+def _likeliest_counts(count, mode, observed, mean, sigma2, response, target):
     """Set `mode` to the N that maximises λᴺ/N! exp(−(g − N)²/2σ²); return the largest variance of N given g.
 
     It is the whole part of the root of n + σ² ln n = g + σ² ln λ + ½, and zero where that root is below one. Newton's
     steps from the left of the root of a concave increasing function stay left of it.
     """
-    number = mode.dtype.type
+    number = type(mode[0])
     zero, one = number(0), number(1)
-    for k in range(mode.size):
+    for k in range(count):
         target[k] = observed[k] + sigma2[k] * logarithm(mean[k]) + number(0.5)
         mode[k] = max(target[k] - sigma2[k] * logarithm(max(target[k], one)), one)
     for _ in range(_NEWTON_STEPS):
-        for k in range(mode.size):
+        for k in range(count):
             n, v = mode[k], sigma2[k]
             mode[k] = max(n - (n + v * logarithm(n) - target[k]) / (one + v / n), one)
     widest = zero
-    for k in range(mode.size):
+    for k in range(count):
         n = np.floor(mode[k]) if target[k] >= one else zero
         n = n if response[k] != zero else zero
         mode[k] = n

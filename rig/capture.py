@@ -22,6 +22,7 @@ from rig.stages.drift import DriftWatch
 from rig.stages.protocol import Point
 from rig.stages.recovery import recover
 from rig.survey import refuse_what_cannot_be_done
+from rig.sweeps import board_doubts
 
 type Decode = Callable[[Path], Pixels | None]
 
@@ -187,6 +188,8 @@ class Capture:
         self._last = session.commit(frame, written, detail)
         self._watch.visited(self._last)
         self._warnings = tuple(f"{frame.name}: {warning}" for warning in warnings) or self._warnings
+        if frame.kind == "charuco":
+            self._judge_boards(frame)
         self._pace.exposed(begun_s, frame.exposure_s, repeated=repeated)
         self._repeated = True
         if pixels is not None:
@@ -205,6 +208,13 @@ class Capture:
         ]
         findings = check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier)
         return findings.values, findings.warnings
+
+    def _judge_boards(self, frame: PlannedFrame) -> None:
+        """Warn where a sweep, or all of them, show too little of the boards."""
+        checks = {number: taken.detail["checks"] for number, taken in self._session.valid().items()}
+        corners = {number: int(found["board_corners"]) for number, found in checks.items() if "board_corners" in found}
+        for doubt in board_doubts(frame, self._session.frames, corners, self._settings.checks.board_corners):
+            self._warn(doubt)
 
     def _find_settling(self, frame: PlannedFrame) -> float:
         """Return how long to rest: as measured in this session before, or now."""

@@ -40,7 +40,7 @@ def check_frame(
     boards: Sequence[Board] = (),
     earlier_sharpness: Sequence[float] = (),
 ) -> Findings:
-    """Measure what matters in a frame of this kind.
+    """Measure what matters in a frame of this kind; of boards `rig.sweeps` judges, by more than one frame.
 
     Parameters
     ----------
@@ -128,11 +128,6 @@ def _judge(
         least := limits.sharpness_share * float(np.median(earlier_sharpness))
     ):
         warnings.append(f"sharpness {values['sharpness']:.3f}, limit {least:.3f}; look for a swing or a touched focus")
-    if values.get("board_corners", np.inf) < limits.board_corners:
-        warnings.append(
-            f"{values['board_corners']:.0f} board corners found, limit {limits.board_corners}; "
-            "move the board into view, or correct [[board]]"
-        )
     if values.get("leak_dn", 0.0) > limits.leak_dn:
         warnings.append(
             f"parts differ by {values['leak_dn']:.1f} DN in the dark, limit {limits.leak_dn:g}; look for stray light"

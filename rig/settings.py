@@ -54,7 +54,7 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
     sharpness_share : float
         Smallest sharpness of a lit frame, as a share of the median of its step.
     board_corners : int
-        Smallest number of board corners found in a charuco frame.
+        Fewest board corners that make a charuco frame useful.
     leak_dn : float
         Largest difference of brightness between two parts of a frame that should be dark.
     """
@@ -99,16 +99,24 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Frames of each exposure time.
     at : str, optional
         `grid` or `centre`; without it, `centre` for dark and flat, `grid` for the rest.
+    photons_per_s : float, optional
+        Of a flat step, where the light has been measured: photons per pixel and second, mean over the detector. From it
+        follows the quantum efficiency.
     """
 
     kind: StepKind
     exposure_s: float | tuple[float, ...]
     frames_per_node: int = 1
     at: str | None = None
+    photons_per_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.at not in (None, "grid", "centre"):
             raise ValueError(f"step.at = {self.at!r}; give 'grid' or 'centre'")
+        if self.photons_per_s is not None and not (self.kind == "flat" and 0.0 < self.photons_per_s < math.inf):
+            raise ValueError(
+                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; it is positive, and for flats only"
+            )
         self.step()
 
     def step(self) -> Step:

@@ -35,7 +35,10 @@ class GeometrySettings:
     most_transfer_sigma_px : float
         Largest standard deviation allowed there, rms over views and image.
     most_holdout_ratio : float
-        Largest residual of boards left out, relative to the fit's.
+        Largest residual of boards left out, relative to the fit's; where corners fit to a few thousandths of a pixel,
+        what leaving boards out adds may be many times that and yet too little to matter.
+    negligible_holdout_px : float
+        So much, rms, is never refused.
 
     Raises
     ------
@@ -47,11 +50,17 @@ class GeometrySettings:
     depths_mm: tuple[float, ...] = (500.0, 700.0)
     most_transfer_sigma_px: float = 0.5
     most_holdout_ratio: float = 1.3
+    negligible_holdout_px: float = 0.1
 
     def __post_init__(self) -> None:
         if self.lens_model not in LENS_MODELS:
             raise ValueError(f"lens model '{self.lens_model}' is not known; take one of {', '.join(LENS_MODELS)}")
-        numbers = (*self.depths_mm, self.most_transfer_sigma_px, self.most_holdout_ratio)
+        numbers = (
+            *self.depths_mm,
+            self.most_transfer_sigma_px,
+            self.most_holdout_ratio,
+            self.negligible_holdout_px,
+        )
         if not self.depths_mm or not all(np.isfinite(number) and number > 0 for number in numbers):
             raise ValueError(f"depths and limits must be positive, and at least one depth given; got {numbers}")
 
@@ -98,7 +107,7 @@ def calibrate_geometry(
         _require_residuals(bundle, gathered)
     require_determined(geometry, gathered, settings.depths_mm, settings.most_transfer_sigma_px)
     geometry = replace(geometry, holdout_ratio=holdout_ratio(bundle, gathered))
-    _require_fit(geometry.holdout_ratio, settings.most_holdout_ratio)
+    _require_fit(geometry, settings)
     return geometry
 
 
@@ -171,10 +180,14 @@ def _lens_and_poses(bundle: Bundle, covariance: NDArray[np.float64], order: list
     return result
 
 
-def _require_fit(ratio: float | None, most_holdout_ratio: float) -> None:
+def _require_fit(geometry: RigGeometry, settings: GeometrySettings) -> None:
     """Refuse a fit that does not explain boards that it has not seen."""
-    if ratio is not None and ratio > most_holdout_ratio:
+    ratio, limit = geometry.holdout_ratio, settings.most_holdout_ratio
+    if ratio is None or ratio <= limit:
+        return
+    added_px = geometry.rms_inlier_px * np.sqrt(ratio**2 - 1)
+    if added_px > settings.negligible_holdout_px:
         raise PoorFit(
-            f"boards left out of the fit are off by {ratio:.2f} times its residual, limit {most_holdout_ratio}; "
-            "check square_mm and the flatness of the boards, try --lens opencv8, or show more boards"
+            f"boards left out of the fit are off by {ratio:.2f} times its residual of {geometry.rms_inlier_px:.3g} px, "
+            f"limit {limit}; check square_mm and the flatness of the boards, try --lens opencv8, or show more boards"
         )

@@ -266,7 +266,10 @@ def _from_flats(fitted: Fitted, gain: Estimate, response: Response | None, quant
     if (bend := fitted.bend) is not None:
         se = bend.standard_error("nonlinearity_per_dn")
         nonlinearity = _interval(bend.values["nonlinearity_per_dn"], se, quantile)
-    efficiency = Estimate(None, why="no flat states its photons per pixel (`photons` in noise.toml)")
+    efficiency = Estimate(
+        None,
+        why="no flat states its photons per pixel (`photons` in noise.toml, or `photons_per_s` in rig.toml)",
+    )
     if gain.value is not None:
         means_dn = fitted.moments.flats.mean_dn
         charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]

@@ -138,7 +138,7 @@ class NoiseCalibration:
             fields |= {name: values for name, values in maps.items() if values is not None}
         return NoiseModel(
             **fields,
-            quantum_efficiency=min(efficiency or 1.0, 1.0),
+            quantum_efficiency=None if efficiency is None else min(efficiency, 1.0),
             saturation_dn=self.saturation_dn,
         )
 

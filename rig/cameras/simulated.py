@@ -10,6 +10,8 @@ from rig.simulation.lab import SimulatedLab
 TRUE_POSE = "true_rt_cam_ref"
 
 _READOUT_S = 0.05
+# Of the cooled sensor, whose dark current does not drift.
+_TEMPERATURE_C = -20.0
 _TIFF_HEADER_BYTES = 512
 
 
@@ -48,7 +50,11 @@ class SimulatedCamera:
         truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
         pixels = self._lab.expose(exposure_s, number)
         self._clock.sleep_s(exposure_s + _READOUT_S)
-        return Exposure(".tiff", pixels=pixels, metadata={"camera": "simulated camera", TRUE_POSE: truth})
+        return Exposure(
+            ".tiff",
+            pixels=pixels,
+            metadata={"camera": "simulated camera", "temperature_c": _TEMPERATURE_C, TRUE_POSE: truth},
+        )
 
     def close(self) -> None:
         """Disconnect."""

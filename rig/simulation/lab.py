@@ -18,6 +18,9 @@ from rig.simulation.scene import TexturedPlane, render
 from rig.simulation.sensor import through_mosaic
 from rig.stages.protocol import Point
 
+# Of a white object's light, what a flat has of it.
+_FLAT = 0.5
+
 # After a stop the carriage swings along both axes, as an undamped gantry does.
 _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
 
@@ -94,7 +97,7 @@ class SimulatedLab:
         """Return a frame in DN, taken now from where the camera is; its noise follows from its number alone."""
         light: NDArray[np.floating] = np.zeros_like(self._illumination)
         if self._flat:
-            light = 0.5 * self._illumination
+            light = _FLAT * self._illumination
         elif self._planes:
             pose = self.rt_cam_ref(exposure_s)[np.newaxis]
             light = next(render(self._planes, self.experiment.optics, pose, samples_per_px=1)).light
@@ -109,6 +112,12 @@ class SimulatedLab:
         after_s = self._still_s() + 0.5 * exposure_s
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
         return self._carriage.rt_cam_ref(x_mm + swing_mm, y_mm + swing_mm)
+
+
+def flat_photons_per_s(settings: SimulatedSettings) -> float:
+    """Return the light of a flat, photons per pixel and second, mean over the detector."""
+    illumination = lab_experiment(settings).optics.relative_illumination()
+    return float(_FLAT * settings.lit_photons_per_s * illumination.mean(dtype=np.float64))
 
 
 def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:

@@ -115,6 +115,25 @@ def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
     return canvas.plane("airplane", x_mm, y_mm, depth_mm, shading=0.2)
 
 
+def sailing_boat(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
+    """Return a toy sailing boat of 180 mm, seen from its side, at x, y and a depth."""
+    canvas = _Canvas(190, 190)
+    canvas.box(-3, -84, 2, 44, (0.75, 0.55, 0.15))
+    canvas.polygon([(2, -92), (30, -84), (2, -76)], _RED)
+    canvas.polygon([(5, -72), (5, 30), (80, 30)], _WHITE)
+    canvas.polygon([(5, 6), (5, 16), (70, 16), (62, 6)], _BLUE)
+    canvas.text("F 16", 11, -3, 12, _DARK)
+    canvas.polygon([(-7, -66), (-7, 30), (-72, 30)], _YELLOW)
+    canvas.polygon([(-7, -34), (-7, -18), (-40, -18), (-29, -34)], (0.85, 0.35, 0.20))
+    canvas.polygon([(-90, 40), (90, 40), (68, 84), (-64, 84)], _RED)
+    canvas.polygon([(-90, 40), (90, 40), (86, 48), (-85, 48)], _WHITE)
+    canvas.polygon([(-73, 70), (75, 70), (68, 84), (-64, 84)], _BLUE)
+    for x_mm_porthole in (-50, -20, 10, 40):
+        canvas.ellipse(x_mm_porthole, 58, 7, 7, _GREY)
+        canvas.ellipse(x_mm_porthole, 58, 4.5, 4.5, _DARK)
+    return canvas.plane("boat", x_mm, y_mm, depth_mm, shading=0.2)
+
+
 def star_chart(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.0, spokes: int = 24) -> TexturedPlane:
     """Return a Siemens star on a white disc, at x, y and a depth: full contrast at every fineness."""
     canvas = _Canvas(2.1 * radius_mm, 2.1 * radius_mm)

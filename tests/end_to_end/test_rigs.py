@@ -8,7 +8,8 @@ import pytest
 from pipelines.demo_truth import true_set, write_truth
 from pipelines.frames import read_frame
 from pipelines.metrics import assess
-from pipelines.reconstruct import DEFAULT_METHOD, Request, plane_name, reconstruct_set
+from pipelines.plane_files import plane_name
+from pipelines.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
 from pipelines.run import run_steps, session_steps
 from pipelines.session_set import load_session
 from tests.pipelines.sessions import captured, rig_toml

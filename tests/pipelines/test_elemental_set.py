@@ -239,7 +239,7 @@ class TestNoiseJson:
 
     def test_an_unknown_quantum_efficiency_hinders_nothing(self, folder: Path) -> None:
         self.write(folder, quantum_efficiency={"value": None, "why": "no photons were counted"})
-        assert load_set(folder).noise.quantum_efficiency == 1.0
+        assert load_set(folder).noise.quantum_efficiency is None
 
     def test_maps_beside_it_take_the_place_of_its_numbers(self, folder: Path) -> None:
         offset_dn = np.arange(192.0).reshape(12, 16)

@@ -58,7 +58,7 @@ def _names(folder: Path) -> set[str]:
 
 
 OVERVIEW = {"overview.json", "integral_image.png", "reference_view.png", "noise_reference.png"}
-PLANES = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png")}
+PLANES = {f"plane_{depth}.{suffix}" for depth in ("00500.0", "00700.0") for suffix in ("tiff", "png", "json")}
 
 
 def test_several_methods_have_a_folder_each(results: Path) -> None:

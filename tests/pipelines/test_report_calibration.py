@@ -29,7 +29,7 @@ NOISE: dict[str, Any] = {
     "likelihood": "marginal Gaussian",
     "frames": [{"file": "dark.tiff", "kind": "dark", "exposure_s": 0.1}] * 12,
     "hot_pixels": [[1, 2]],
-    "temperature_c": -20.0,
+    "temperature_c": {"mean": -20.0, "min": -20.1, "max": -19.9},
     "warnings": ["the darks drift"],
 }
 
@@ -81,7 +81,7 @@ def test_a_session_shows_its_noise_and_geometry_wherever_the_page_stands(
     assert "all darks have one exposure time" in text
     assert "1 hot" in text
     assert "the darks drift" in text
-    assert "-20.0 °C" in text
+    assert "−20.0 °C" in text
     assert "5450 corners" in text
     assert "approached from one side" in text
     assert text.count("<svg") == 2
@@ -150,7 +150,7 @@ def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, 
 
 
 def _overview(**light: Any) -> dict[str, Any]:
-    brightness = {"mean_signal_e": 0.96, "photons_linear": 3.84, "photons_from_moments": 1.92} | light
+    brightness = {"mean_signal_e": 0.96, "electrons_linear": 1.92, "electrons_from_moments": 0.96} | light
     whole = {"views": 49, "exposure_s": 0.1, "read_noise_e": 12**0.5, "quantum_efficiency": 0.5, "dark_e": 0.02}
     return whole | {"brightness": brightness}
 
@@ -158,14 +158,14 @@ def _overview(**light: Any) -> dict[str, Any]:
 def test_the_photon_budget_is_that_of_the_papers_equations() -> None:
     budget = photon_budget(_overview())
     assert budget is not None
-    linear, moments, counted = budget["photons"]
+    linear, moments, counted = budget["light"]
     # Eq. (7): 0.16 · 12 / 0.5 photons; at 0.1 s ten times as many per second; 49 views see 49 times as many
-    assert (linear["per_px"], linear["flux"]) == pytest.approx((0.16 * 12 / 0.5, 38.4))
+    assert (linear["photons"], linear["flux"]) == pytest.approx((0.16 * 12 / 0.5, 38.4))
     assert linear["all_views"] == pytest.approx(3.84 * 49)
     # (4) with a Poisson signal: μ² + μ = 0.16 · 12 e⁻², less the little that dark current does
-    mu_e = moments["per_px"] * 0.5
+    mu_e = moments["electrons"]
     assert mu_e**2 + mu_e == pytest.approx(0.16 * 12, rel=0.03)
-    assert counted["per_px"] == pytest.approx(0.96 / 0.5)
+    assert counted["photons"] == pytest.approx(0.96 / 0.5)
     # Eq. (6)
     assert budget["variance_e2"] == pytest.approx(0.96 + 0.02 + 12)
     assert {part["words"]: part["share"] for part in budget["shares"]} == pytest.approx(
@@ -175,10 +175,59 @@ def test_the_photon_budget_is_that_of_the_papers_equations() -> None:
 
 @pytest.mark.parametrize(
     "overview",
-    [_overview(mean_signal_e=-0.1), _overview() | {"quantum_efficiency": None}, {**_overview(), "dark_e": None}],
+    [_overview(mean_signal_e=-0.1), {**_overview(), "dark_e": None}],
 )
-def test_without_light_or_efficiency_there_is_no_budget(overview: dict[str, Any]) -> None:
+def test_without_light_there_is_no_budget(overview: dict[str, Any]) -> None:
     assert photon_budget(overview) is None
+
+
+def test_without_a_quantum_efficiency_a_budget_has_electrons_only() -> None:
+    budget = photon_budget(_overview() | {"quantum_efficiency": None})
+    assert budget is not None
+    assert [row["electrons"] for row in budget["light"]] == [1.92, 0.96, 0.96]
+    assert {row[key] for row in budget["light"] for key in ("photons", "flux", "all_views")} == {None}
+    assert budget["variance_e2"] == pytest.approx(12.98)
+
+
+def test_a_page_says_no_photons_where_the_quantum_efficiency_is_unknown(session: Path, done: Command) -> None:
+    path = session / "reconstructions" / "scene" / "overview.json"
+    content = json.loads(path.read_text())
+    assert content["brightness"]["photons_from_moments"] > 0
+    content["quantum_efficiency"] = None
+    content["brightness"] |= {"photons_linear": None, "photons_from_moments": None}
+    path.write_text(json.dumps(content))
+    done("report", session)
+    text = (session / "report.html").read_text()
+    assert "photons/px" not in text
+    assert "photons in one view" not in text
+    assert "photons need it: state the light of a flat" in text
+
+
+def test_the_page_leads_with_the_planes_beside_one_view(session: Path, done: Command) -> None:
+    done("report", session)
+    text = (session / "report.html").read_text()
+    places = [
+        text.index(words)
+        for words in ('class="facts"', 'id="result"', "What the camera saw.", "What was there, 500 mm.")
+    ]
+    later = [text.index(f'id="{name}"') for name in ("errors", "noise", "geometry", "light", "provenance")]
+    assert places + later == sorted(places + later)
+
+
+def test_weights_tried_and_certificates_are_shown(session: Path, done: Command) -> None:
+    path = session / "reconstructions" / "scene" / "reconstruction.json"
+    content = json.loads(path.read_text())
+    done("report", session)
+    assert 'id="weight"' not in (session / "report.html").read_text()
+    curve = [{"weight": 0.1 * 2**k, "held_out": 50.0 + (k - 2) ** 2} for k in range(5)]
+    certificate = {"kind": "bound", "value": 0.00823, "reached": False}
+    content["planes"][0] |= {"penalty_weight_curve": curve, "penalty_weight": 0.4, "certificate": certificate}
+    path.write_text(json.dumps(content))
+    done("report", session)
+    text = (session / "report.html").read_text()
+    part = text[text.index('id="weight"') : text.index('id="noise"')]
+    assert part.count("<svg") == 1
+    assert "0.823 %: stopped early" in part
 
 
 def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> None:
@@ -202,7 +251,7 @@ def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> Non
 def test_one_set_reconstructed_twice_is_shown_once(session: Path, done: Command) -> None:
     shutil.copytree(session / "reconstructions" / "scene", session / "reconstructions" / "again")
     done("report", session)
-    assert (session / "report.html").read_text().count("What the camera saw:") == 1
+    assert (session / "report.html").read_text().count('alt="The reference view"') == 1
 
 
 def test_views_are_shown_pixel_for_pixel_and_large_ones_cropped(session: Path, done: Command) -> None:
@@ -214,4 +263,4 @@ def test_views_are_shown_pixel_for_pixel_and_large_ones_cropped(session: Path, d
     before = 'class="pixels" src="data:image/png;base64,'
     start = text.index(before) + len(before)
     (folder / "shown.png").write_bytes(base64.b64decode(text[start : text.index('"', start)]))
-    np.testing.assert_array_equal(read_frame(folder / "shown.png").pixels_dn, picture[30:670, 130:770])
+    np.testing.assert_array_equal(read_frame(folder / "shown.png").pixels_dn, picture[80:620, 180:720])

@@ -202,6 +202,18 @@ def test_a_board_of_another_size_is_found_out_by_leaving_it_out() -> None:
         calibrated(wrong)
 
 
+def test_what_leaving_a_board_out_adds_is_refused_in_pixels_not_in_multiples_of_almost_nothing() -> None:
+    larger = replace(six_boards(6, 8, 40.0)[2], square_mm=40.02)
+    slightly = simulated(
+        11, noise_px=0.002, standing=[*six_boards(6, 8, 40.0)[:2], larger, *six_boards(6, 8, 40.0)[3:]]
+    )
+    ratio = calibrated(slightly).holdout_ratio
+    assert ratio is not None
+    assert ratio > 1.3
+    with pytest.raises(PoorFit, match=r"times its residual of 0\.0"):
+        calibrated(slightly, GeometrySettings(negligible_holdout_px=0.001))
+
+
 def test_a_node_without_boards_is_left_out_and_the_others_stay() -> None:
     given = simulated(12)
     fewer = replace(given, observations=[one for one in given.observations if one.node != (0, 2)])

@@ -340,7 +340,6 @@ def test_good_frames_give_no_warning(kind: str) -> None:
         ("bright", lambda frame: np.where(frame > 3000, 65535, frame), "saturated"),
         ("bright", lambda frame: frame // 100, "contrast"),
         ("flat", lambda frame: frame // 10, "median"),
-        ("charuco", lambda frame: frame[:, : frame.shape[1] // 8], "board corners"),
         ("dark", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[1] > 140), "stray light"),
         ("noise_reference", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[0] < 20), "stray light"),
     ],

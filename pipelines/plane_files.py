@@ -1,0 +1,110 @@
+"""A plane as files: TIFF, preview, the record that vouches for both; and its colours until all of them are there."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.files import sha256, write_json, writing
+from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.planes import Method
+from pipelines.provenance import first_difference
+
+# Holds the colours of planes that want others, until the planes are written.
+PARTS = ".parts"
+
+
+def plane_name(depth_mm: float) -> str:
+    """Return the file name, without suffix, of the plane at a depth."""
+    return f"plane_{depth_mm:07.1f}"
+
+
+@dataclass(frozen=True)
+class PlaneFiles:
+    """Where a plane of one method lies, and what it has to be made of.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the method's planes.
+    method : Method
+        By which it is reconstructed.
+    depth_mm : float
+        Of the plane.
+    channels : tuple of str
+        Its colours, in their order.
+    origin : dict
+        Its provenance, were it made now: what says otherwise of itself is made anew.
+    """
+
+    folder: Path
+    method: Method
+    depth_mm: float
+    channels: tuple[str, ...]
+    origin: dict[str, Any]
+
+    @property
+    def path(self) -> Path:
+        """Where the plane itself is."""
+        return self.folder / f"{plane_name(self.depth_mm)}.tiff"
+
+    def finished(self) -> dict[str, Any] | None:
+        """Return the record of the plane, None unless it and its files are whole and made of what they have to be."""
+        try:
+            record: dict[str, Any] = json.loads(self.path.with_suffix(".json").read_bytes())
+            if first_difference(record, self.origin):
+                return None
+            whole = all(sha256(self.folder / name) == known for name, known in record["sha256"].items())
+        except (OSError, ValueError, KeyError, AttributeError):
+            return None  # there is none, or it is no use
+        return record if whole else None
+
+    def missing(self) -> list[str]:
+        """Return the colours that are still to be reconstructed."""
+        return [channel for channel in self.channels if self._entry(channel) is None]
+
+    def save_part(self, channel: str, plane: NDArray[np.floating], entry: dict[str, Any]) -> None:
+        """Keep one colour (row, column) until the others are there; `entry` goes into the plane's record."""
+        content = msgspec.json.encode({"entry": entry, **self.origin})
+        with writing(self._part(channel)) as file:
+            np.savez(file, plane=plane, content=np.frombuffer(content, np.uint8))
+
+    def finish(self, pitch_mm: float) -> dict[str, Any]:
+        """Write the plane and its preview from its colours, then the record that vouches for them, and return that."""
+        colours, entries = [], []
+        for channel in self.channels:
+            with np.load(self._part(channel), allow_pickle=False) as part:
+                colours.append(part["plane"])
+                entries.append(msgspec.json.decode(part["content"].tobytes())["entry"])
+        plane = colours[0] if len(colours) == 1 else np.dstack(colours)
+        write_plane(self.path, plane, pitch_mm)
+        preview = self.path.with_suffix(".png")
+        write_png(preview, grey_levels(plane, white_level(plane)))
+        record = {
+            "format": 1,
+            "planes": [entry["record"] for entry in entries],
+            "focus": [entry["focus"] for entry in entries],
+            "sha256": {path.name: sha256(path) for path in (self.path, preview)},
+            **self.origin,
+        }
+        write_json(self.path.with_suffix(".json"), record)
+        for channel in self.channels:
+            self._part(channel).unlink()
+        return record
+
+    def _part(self, channel: str) -> Path:
+        return self.folder / PARTS / f"{plane_name(self.depth_mm)}_{channel}.npz"
+
+    def _entry(self, channel: str) -> dict[str, Any] | None:
+        """Return what is known of a colour that is there, None when it is not, or is made of something else."""
+        try:
+            with np.load(self._part(channel), allow_pickle=False) as part:
+                content: dict[str, Any] = msgspec.json.decode(part["content"].tobytes())
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile, msgspec.MsgspecError):
+            return None
+        return None if first_difference(content, self.origin) else content

@@ -1,0 +1,242 @@
+"""Planes of all colours, depths and methods: the tasks they fall into, each done once, wherever it is done."""
+
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel
+from pipelines.console import progress, say
+from pipelines.elemental_set import LoadedSet
+from pipelines.large_arrays import memory_or_file
+from pipelines.plane_files import PlaneFiles
+from pipelines.planes import Method, Settings, solve
+from recon.errors import GeometryMismatch
+from recon.focus import Focus, focus_measure, sharp_depths_mm
+from recon.images import ElementalImages
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+
+
+@dataclass(frozen=True)
+class PlaneTask:
+    """One colour at one depth, by the methods by which it is not there yet: paths and options, no pixels.
+
+    Attributes
+    ----------
+    layout : ChannelLayout
+        The colour.
+    depth_mm : float
+        Of the plane.
+    grid : PlaneGrid
+        Its samples.
+    files : tuple of PlaneFiles
+        Where the result of each method goes.
+    settings : Settings
+        Of the methods.
+    with_focus : bool
+        Whether the power of detail is wanted, too.
+    """
+
+    layout: ChannelLayout
+    depth_mm: float
+    grid: PlaneGrid
+    files: tuple[PlaneFiles, ...]
+    settings: Settings
+    with_focus: bool
+
+
+class Channel:
+    """One colour of a set, read: what all of its tasks share."""
+
+    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages) -> None:
+        self._loaded = loaded
+        self._images = images
+        self._phases = len(layout.lattices)
+        self._factory = OperatorFactory(loaded, layout, images)
+
+    def do(self, task: PlaneTask) -> list[str]:
+        """Reconstruct what a task asks for, save it, and return what there is to say of it.
+
+        Raises
+        ------
+        GeometryMismatch, NotConverged
+            Of the task's depth, or method.
+        """
+        try:
+            operator = self._factory.at_depth(task.depth_mm, task.grid)
+        except GeometryMismatch as failure:
+            raise GeometryMismatch(f"plane at {task.depth_mm:g} mm: {failure}") from failure
+        focus = focus_measure(operator, self._images, self._halves())._asdict() if task.with_focus else None
+        for files in task.files:
+            solution = solve(operator, self._images, files.method, task.settings)
+            flux_e = float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(task)
+            record = {
+                "depth_mm": task.depth_mm,
+                "method": files.method,
+                "channel": task.layout.name,
+                "file": files.path.name,
+                **asdict(task.grid),
+                **solution.record,
+                "flux_e": flux_e,
+            }
+            files.save_part(task.layout.name, solution.plane, {"record": record, "focus": focus})
+        return self._blind_views(operator, task.depth_mm)
+
+    def _samples_per_px(self, task: PlaneTask) -> float:
+        return float((task.grid.pitch_mm * self._loaded.settings.camera.fx_px / task.depth_mm) ** 2)
+
+    def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
+        views = self._loaded.settings.view
+        odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
+        odd = np.repeat(odd, self._phases)
+        return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
+
+    def _blind_views(self, operator: PlaneOperator, depth_mm: float) -> list[str]:
+        """Return words on views that see nothing of a plane: a pose may be wrong."""
+        blind = {
+            int(view) // self._phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()
+        }
+        if not blind:
+            return []
+        first = self._loaded.settings.view[min(blind)].image
+        return [
+            f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
+        ]
+
+
+# Who does the tasks of a set and a folder, in any order; yields each when it is saved, with what there is to say of it.
+type Crew = Callable[[LoadedSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]
+
+
+def one_by_one(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+    """Do tasks in this process, by all its threads, one colour at a time; it is in a file where memory is short."""
+    layout: ChannelLayout | None = None
+    for task in tasks:
+        if task.layout is not layout:
+            channel = None  # the channel before goes before the next is read
+            channel = Channel(loaded, task.layout, load_channel(loaded, task.layout, memory_or_file(out)))
+            layout = task.layout
+        assert channel is not None
+        yield task, channel.do(task)
+
+
+class Sweep:
+    """The planes of one call: those that are not there yet are made, and written as soon as all their colours are.
+
+    Parameters
+    ----------
+    loaded : LoadedSet
+        The set.
+    grids : dict of float to PlaneGrid
+        The samples of the plane at each depth in mm.
+    files : sequence of PlaneFiles
+        Of each method and depth.
+    origins : dict of Method to dict
+        The provenance of all planes of a method together.
+    settings : Settings
+        Of the methods.
+    with_focus : bool
+        Whether a curve of focus against depth is wanted.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedSet,
+        grids: dict[float, PlaneGrid],
+        files: Sequence[PlaneFiles],
+        origins: dict[Method, dict[str, Any]],
+        settings: Settings,
+        *,
+        with_focus: bool,
+    ) -> None:
+        self._loaded = loaded
+        self._layouts = channel_layouts(loaded)
+        self._grids = grids
+        self._files = files
+        self.origins = origins
+        self._settings = settings
+        self._with_focus = with_focus
+        self._finished: dict[tuple[Method, float], dict[str, Any]] = {}
+
+    def needed_bytes(self) -> int:
+        """Return about how much disk the results take: planes, previews, and the report that shows them again."""
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self.origins)
+        return samples * len(self._layouts) * (np.dtype(np.float32).itemsize + 3)
+
+    def run(self, crew: Crew, out: Path) -> None:
+        """Have the tasks done that are not, and finish each plane at once."""
+        for files in self._files:
+            if record := files.finished():
+                self._finished[files.method, files.depth_mm] = record
+        if self._finished:
+            say(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
+        tasks = self._tasks()
+        self._finish_whole(self._files)
+        with closing(crew(self._loaded, out, tasks)) as done:
+            for task, words in progress(done, "reconstructing planes", len(tasks)):
+                for line in words:
+                    say(line)
+                self._finish_whole(task.files)
+
+    def _tasks(self) -> list[PlaneTask]:
+        """Return what is to be done, one channel after the other."""
+        wanted = [files for files in self._files if (files.method, files.depth_mm) not in self._finished]
+        missing = {(files.method, files.depth_mm): files.missing() for files in wanted}
+        tasks = []
+        for layout in self._layouts:
+            for depth, grid in self._grids.items():
+                left = tuple(
+                    files for files in wanted if files.depth_mm == depth and layout.name in missing[files.method, depth]
+                )
+                if left:
+                    tasks.append(PlaneTask(layout, depth, grid, left, self._settings, self._with_focus))
+        return tasks
+
+    def _finish_whole(self, candidates: Sequence[PlaneFiles]) -> None:
+        """Write the planes whose colours are complete."""
+        for files in candidates:
+            key = (files.method, files.depth_mm)
+            if key not in self._finished and not files.missing():
+                self._finished[key] = files.finish(self._grids[files.depth_mm].pitch_mm)
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        """The entries of reconstruction.json: by channel, depth, method."""
+        methods = list(dict.fromkeys(files.method for files in self._files))
+        return [
+            self._finished[method, depth]["planes"][index]
+            for index in range(len(self._layouts))
+            for depth in self._grids
+            for method in methods
+        ]
+
+    @property
+    def written(self) -> dict[tuple[Method, float], Path]:
+        """The files of the planes."""
+        return {(files.method, files.depth_mm): files.path for files in self._files}
+
+    def focus(self) -> dict[str, Any] | None:
+        """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
+        if not self._with_focus:
+            return None
+        method = self._files[0].method
+        depths = list(self._grids)
+        curve = [_sum(self._finished[method, depth]["focus"]) for depth in depths]
+        return {
+            "depth_mm": depths,
+            "detail_e2": [point.detail_e2 for point in curve],
+            "sigma_e2": [point.sigma_e2 for point in curve],
+            "sharp_mm": sharp_depths_mm(depths, curve),
+        }
+
+
+def _sum(of_channels: Sequence[dict[str, float]]) -> Focus:
+    """Return what all channels together say of a depth."""
+    detail_e2 = sum(focus["detail_e2"] for focus in of_channels)
+    return Focus(detail_e2, float(np.linalg.norm([focus["sigma_e2"] for focus in of_channels])))

@@ -1,0 +1,135 @@
+"""A sweep on dask.distributed: the same planes, and what is lost when a worker dies or a task fails."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numba
+import pytest
+
+from pipelines.cluster import crew_of
+from pipelines.elemental_set import LoadedSet, load_set
+from pipelines.files import UNFINISHED
+from pipelines.reconstruct import Request, reconstruct_set
+from pipelines.sweep import PlaneTask
+
+type Command = Callable[..., CompletedProcess[str]]
+
+distributed = pytest.importorskip("distributed")
+
+DEPTHS_MM = [450.0, 500.0, 550.0, 600.0, 650.0, 700.0]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Two processes of one thread each, and a scheduler in this one, as `--workers 2` starts them."""
+    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0", "memory_limit": 0}
+    with distributed.LocalCluster(**options, env={"NUMBA_NUM_THREADS": "1"}, silence_logs=50) as started:
+        yield started
+
+
+@pytest.fixture
+def one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sum in the order in which one thread does."""
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+
+
+def _kill_one_that_works(cluster: Any) -> None:
+    """Kill a worker that is at a task, as nothing can be caught."""
+    with distributed.Client(cluster, set_as_default=False) as client:
+        processes = client.run(os.getpid)
+    address = next(state.address for state in cluster.scheduler.workers.values() if state.processing)
+    os.kill(processes[address], signal.SIGKILL)
+
+
+def _planes(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulated_scene: Path, tmp_path: Path) -> None:
+    loaded = load_set(simulated_scene)
+    request = Request(DEPTHS_MM, ["pmlem"], with_focus=True)
+    reconstruct_set(loaded, tmp_path / "local", request)
+    crew = crew_of(None, cluster.scheduler_address)
+    done: list[float] = []
+
+    def killing(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+        for task, words in crew(loaded, out, tasks):
+            done.append(task.depth_mm)
+            if len(done) == 1:
+                _kill_one_that_works(cluster)
+            yield task, words
+
+    before = len(cluster.scheduler.transition_log)
+    reconstruct_set(loaded, tmp_path / "spread", request, killing)
+    changes = [(entry[1], entry[2]) for entry in list(cluster.scheduler.transition_log)[before:]]
+    assert ("processing", "released") in changes  # what it was at is taken from it
+    # Nothing that is finished is done again, but for a plane nobody had been told of
+    assert changes.count(("processing", "memory")) <= len(DEPTHS_MM) + 1
+    assert sorted(done) == DEPTHS_MM
+    assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")
+    assert not list((tmp_path / "spread").glob(f".*{UNFINISHED}"))
+
+
+def test_a_task_that_fails_is_the_failure_of_the_command(
+    cluster: Any, scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    words = ("--depth-mm", 500, "--method", "pmlem-osl", "--penalty-weight", 50)
+    ended = faintfield(
+        "reconstruct", scene, "--out", tmp_path / "out", *words, "--scheduler", cluster.scheduler_address
+    )
+    assert ended.returncode == 1
+    assert "NotConverged: penalty weight 50 makes most denominators" in ended.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_workers_of_this_machine_give_colour_planes_with_saturated_pixels(
+    tmp_path: Path, done: Command, small_options: tuple[object, ...]
+) -> None:
+    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 60)
+    settings = tmp_path / "set" / "elemental.toml"
+    text = settings.read_text()
+    settings.write_text(text.replace("saturation_dn = 65535", "saturation_dn = 8000"))
+    assert settings.read_text() != text
+    words = ("reconstruct", tmp_path / "set", *("--depth-mm", 500, "--depth-mm", 700, "--passes", 1))
+    done(*words, "--out", tmp_path / "local")
+    done(*words, "--out", tmp_path / "spread", "--workers", 1)
+    assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")
+
+
+def test_without_workers_there_is_no_dask(
+    simulated_scene: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    monkeypatch.setitem(sys.modules, "dask", None)
+    words = ("reconstruct", simulated_scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
+    ended = faintfield(*words, "--workers", 2)
+    assert ended.returncode == 1
+    assert "MissingPackage: dask.distributed is not installed" in ended.stderr
+    assert "pip install 'faintfield[cluster]'" in ended.stderr
+    assert faintfield(*words).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (("--workers", 2, "--scheduler", "tcp://127.0.0.1:1"), 2, "give one of them"),
+        (("--scheduler", "tcp://127.0.0.1:1"), 1, "ClusterFailed: no scheduler answers at tcp://127.0.0.1:1"),
+        (("--workers", 0), 2, "--workers"),
+    ],
+)
+def test_workers_that_cannot_be_are_refused(
+    words: tuple[object, ...], code: int, said: str, simulated_scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    import dask
+
+    with dask.config.set({"distributed.comm.timeouts.connect": "0.2s"}):
+        ended = faintfield("reconstruct", simulated_scene, "--out", tmp_path / "out", "--depth-mm", 500, *words)
+    assert ended.returncode == code
+    assert said in ended.stderr

@@ -1,0 +1,145 @@
+"""`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+type Command = Callable[..., CompletedProcess[str]]
+
+zarr = pytest.importorskip("zarr")
+ome_zarr_models = pytest.importorskip("ome_zarr_models")
+
+SWEEP = ("--sweep-mm", "500:700:3", "--method", "backprojection")
+
+
+def _image(folder: Path) -> tuple[Any, Any]:
+    """Return the group and its metadata, which the library has checked against the specification."""
+    group = zarr.open_group(folder, mode="r")
+    image = ome_zarr_models.open_ome_zarr(group)
+    assert type(image).__name__ == "Image"
+    assert image.ome_attributes.version == "0.5"
+    (multiscale,) = image.ome_attributes.multiscales
+    return group, multiscale
+
+
+def _scales(multiscale: Any) -> list[tuple[list[float], list[float]]]:
+    found = []
+    for dataset in multiscale.datasets:
+        scale, translation = dataset.coordinateTransformations
+        found.append((list(scale.scale), list(translation.translation)))
+    return found
+
+
+def _planes(out: Path) -> list[dict[str, Any]]:
+    planes: list[dict[str, Any]] = json.loads((out / "reconstruction.json").read_text())["planes"]
+    return planes
+
+
+def test_a_sweep_has_its_depths_in_mm_and_its_samples_in_milliradians(
+    scene: Path, tmp_path: Path, done: Command
+) -> None:
+    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    done("export", "zarr", out, stack)
+    group, multiscale = _image(stack)
+    assert [(axis.name, axis.type, axis.unit) for axis in multiscale.axes] == [
+        ("c", "channel", None),
+        ("z", "space", "millimeter"),
+        ("y", "space", None),  # no length is right at every depth
+        ("x", "space", None),
+    ]
+    ((scale, translation),) = _scales(multiscale)
+    first = _planes(out)[0]
+    assert scale[:2] == [1.0, pytest.approx(100.0)]
+    assert translation[:2] == [0.0, 500.0]
+    for axis, start in ((3, first["origin_mm"][0]), (2, first["origin_mm"][1])):
+        assert scale[axis] * first["depth_mm"] / 1e3 == pytest.approx(first["pitch_mm"])
+        assert translation[axis] * first["depth_mm"] / 1e3 == pytest.approx(start)
+    assert group.attrs["faintfield"]["row_and_column"] == "mrad"
+    pixels = group["0"][:]
+    assert pixels.dtype == np.float32
+    np.testing.assert_array_equal(pixels[0], [tifffile.imread(out / plane["file"]) for plane in _planes(out)])
+
+
+def test_planes_of_one_pitch_are_in_millimetres(scene: Path, tmp_path: Path, done: Command) -> None:
+    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
+    done("reconstruct", scene, "--out", out, "--sweep-mm", "500:501:2", "--method", "backprojection", "--pitch-mm", 5)
+    done("export", "zarr", out, stack)
+    _, multiscale = _image(stack)
+    assert [axis.unit for axis in multiscale.axes] == [None, "millimeter", "millimeter", "millimeter"]
+    ((scale, translation),) = _scales(multiscale)
+    assert scale == [1.0, pytest.approx(1.0), 5.0, 5.0]
+    assert translation[2:] == [pytest.approx(value) for value in _planes(out)[0]["origin_mm"][::-1]]
+
+
+def test_large_colour_planes_are_there_at_several_resolutions(
+    tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.export_zarr._COARSEST_PX", 30)
+    monkeypatch.setattr("pipelines.export_zarr._CHUNK_PX", 40)
+    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 20)
+    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
+    done("reconstruct", tmp_path / "set", "--out", out, "--depth-mm", 500, "--method", "backprojection")
+    done("export", "zarr", out, stack)
+    group, multiscale = _image(stack)
+    plane = np.moveaxis(tifffile.imread(out / "plane_00500.0.tiff"), 2, 0)
+    assert [dataset.path for dataset in multiscale.datasets] == ["0", "1", "2"]
+    assert [group[level].shape for level in "012"] == [(3, 1, 72, 96), (3, 1, 36, 48), (3, 1, 18, 24)]
+    assert group["0"].chunks == (1, 1, 40, 40)
+    np.testing.assert_array_equal(group["0"][:, 0], plane)
+    # A sample of any resolution is the mean of those it stands for, and lies in their middle
+    finest = _scales(multiscale)[0]
+    for level, (scale, translation) in zip((1, 2), _scales(multiscale)[1:], strict=True):
+        size = 2**level
+        block = plane[1, 2 * size : 3 * size, 5 * size : 6 * size]
+        assert group[str(level)][1, 0, 2, 5] == pytest.approx(block.mean(), rel=1e-5)
+        for axis, index in ((2, 2), (3, 5)):
+            middle = finest[1][axis] + finest[0][axis] * (index * size + (size - 1) / 2)
+            assert translation[axis] + scale[axis] * index == pytest.approx(middle)
+
+
+def test_an_older_export_is_replaced_and_nothing_else(
+    scene: Path, tmp_path: Path, done: Command, faintfield: Command
+) -> None:
+    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    for _ in range(2):
+        done("export", "zarr", out, stack)
+    refused = faintfield("export", "zarr", out, scene)
+    assert refused.returncode == 1
+    assert "OutputExists" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700), "not in equal steps"),
+        (("--sweep-mm", "500:700:2", "--pitch-mm", 5), "planes are of 2 sizes"),
+        (("--depth-mm", 500, "--method", "mlem"), "holds planes of 2 calls or methods"),
+    ],
+)
+def test_planes_that_fit_no_stack_are_refused(
+    words: tuple[object, ...], said: str, simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
+) -> None:
+    out = tmp_path / "out"
+    assert (
+        faintfield("reconstruct", simulated_scene, "--out", out, *words, "--method", "backprojection").returncode == 0
+    )
+    ended = faintfield("export", "zarr", out, tmp_path / "stack.zarr")
+    assert ended.returncode == 1
+    assert said in ended.stderr
+    assert not (tmp_path / "stack.zarr").exists()
+
+
+def test_without_zarr_the_extra_is_named(tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    ended = faintfield("export", "zarr", tmp_path, tmp_path / "stack.zarr")
+    assert ended.returncode == 1
+    assert "pip install 'faintfield[zarr]'" in ended.stderr

@@ -1,0 +1,120 @@
+"""Arrays that memory has no room for: when they go to a file, that none stays behind, and that memory stays free."""
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numpy as np
+import pytest
+import tifffile
+
+from pipelines import large_arrays
+from pipelines.channels import channel_layouts, load_channel
+from pipelines.elemental_set import load_set
+from pipelines.errors import DiskFull
+from pipelines.large_arrays import available_bytes, memory_or_file
+
+type Command = Callable[..., CompletedProcess[str]]
+type SetMaker = Callable[..., Path]
+
+# Back-projects a set with little more memory than the process has; argument 4 says what the system claims to have free.
+_LIMITED = """
+import re, resource, sys
+from pathlib import Path
+from pipelines import large_arrays, overview, report
+from pipelines.elemental_set import load_set
+from pipelines.reconstruct import Request, reconstruct_set
+loaded, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
+out, request = Path(sys.argv[2]), Request([500.0], ["backprojection"])
+reconstruct_set(warm, out.with_name("warm-out"), request)
+large_arrays.available_bytes = lambda: int(sys.argv[4])
+taken = int(re.search(r"VmData:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
+resource.setrlimit(resource.RLIMIT_DATA, (taken + int(sys.argv[3]),) * 2)
+reconstruct_set(loaded, out, request)
+"""
+
+
+def test_memory_that_is_free_is_less_than_there_is() -> None:
+    assert 0 < available_bytes() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"), [("4000000\n", 4000000 - 1000000), ("max\n", 8000 * 1024), ("90000000\n", 8000 * 1024)]
+)
+def test_the_limit_of_a_control_group_counts(
+    limit: str, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = tmp_path / "groups" / "slurm" / "job"
+    (tmp_path / "self").mkdir()
+    job.mkdir(parents=True)
+    (tmp_path / "meminfo").write_text("MemTotal:  9000 kB\nMemAvailable:    8000 kB\n")
+    (tmp_path / "self" / "cgroup").write_text("0::/slurm/job\n")
+    (job.parent / "memory.max").write_text(limit)
+    (job.parent / "memory.stat").write_text("anon 1000000\nfile 2500000\n")
+    monkeypatch.setattr(large_arrays, "_PROC", tmp_path)
+    monkeypatch.setattr(large_arrays, "_CGROUPS", tmp_path / "groups")
+    assert available_bytes() == expected
+
+
+def test_large_arrays_are_in_files_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(large_arrays, "available_bytes", lambda: 8000)
+    allocate = memory_or_file(tmp_path / "out")
+    small = allocate((10, 100), np.float32)
+    assert small.flags.owndata
+    assert not (tmp_path / "out").exists()
+    large = allocate((10, 101), np.float32)
+    large[:] = np.arange(1010).reshape(10, 101)
+    assert not large.flags.owndata
+    assert large.dtype == np.float32
+    np.testing.assert_array_equal(large.sum(dtype=float), 1009 * 505)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_disk_without_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(large_arrays, "available_bytes", lambda: 0)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(DiskFull, match="no space left"):
+        memory_or_file(tmp_path)((10, 10), np.float32)
+    assert resource.getrlimit(resource.RLIMIT_FSIZE) == before
+
+
+def test_a_channel_in_files_is_that_in_memory(make_set: SetMaker, tmp_path: Path) -> None:
+    images = np.random.default_rng(20110919).integers(100, 2000, (3, 12, 16)).astype(np.uint16)
+    images[1, 3, 4] = 65535
+    noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "saturation_dn": 60000.0}
+    loaded = load_set(make_set(list(images), noise=noise))
+    (layout,) = channel_layouts(loaded)
+    in_memory = load_channel(loaded, layout)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(large_arrays, "available_bytes", lambda: 0)
+        in_files = load_channel(loaded, layout, memory_or_file(tmp_path))
+    assert not in_files.electrons.flags.owndata
+    np.testing.assert_array_equal(in_files.electrons, in_memory.electrons)
+    assert in_memory.valid is not None
+    assert in_files.valid is not None
+    assert np.count_nonzero(~in_files.valid) == 1
+    np.testing.assert_array_equal(in_files.valid, in_memory.valid)
+
+
+@pytest.mark.parametrize(("free_bytes", "succeeds"), [(1 << 20, True), (1 << 40, False)])
+def test_a_set_larger_than_memory_is_reconstructed(
+    free_bytes: int, succeeds: bool, make_set: SetMaker, tmp_path: Path
+) -> None:
+    """80 MB of electrons where 40 MB may be taken: by memory map they are done, in memory they cannot be."""
+    rng = np.random.default_rng(20110919)
+    frame = rng.integers(100, 2000, (500, 400)).astype(np.uint16)
+    make_set([frame[:100, :100]] * 4, name="warm")
+    folder = make_set([frame] * 100, name="large")
+    assert tifffile.imread(folder / "view_99.tiff").size * 4 * 100 == 80_000_000
+    words = [folder, tmp_path / "out", 40_000_000, free_bytes]
+    ended = subprocess.run(
+        [sys.executable, "-c", _LIMITED, *map(str, words)], capture_output=True, check=False, text=True
+    )
+    assert (ended.returncode == 0) == succeeds, ended.stderr
+    assert ("MemoryError" in ended.stderr) == (not succeeds)
+    assert (tmp_path / "out" / "plane_00500.0.tiff").is_file() == succeeds

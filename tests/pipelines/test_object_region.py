@@ -1,0 +1,74 @@
+"""The object region: as a set states it, or segmented on a view in plenty of light."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from pipelines.brightness import brightness
+from pipelines.elemental_set import load_set
+from pipelines.image_files import mask_picture, write_png
+from pipelines.object_region import OBJECT_REGION, object_region, segmented
+
+type SetMaker = Callable[..., Path]
+
+SIZE = (48, 64)
+NOISE = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.0}
+
+
+def _object() -> NDArray[np.bool_]:
+    row, column = np.indices(SIZE)
+    return np.asarray((row - 20) ** 2 + (column - 30) ** 2 < 15**2)
+
+
+def _light_e(darkest: float) -> NDArray[np.float32]:
+    """Return an object whose brightness runs from `darkest` to 1000 e⁻, with its shot noise, on a dark ground."""
+    brightness_e = np.where(_object(), np.linspace(darkest, 1000, SIZE[1]), 1.0)
+    generator = np.random.default_rng(5)
+    return np.asarray(generator.poisson(brightness_e) + generator.normal(0, 3, SIZE), np.float32)
+
+
+@pytest.mark.parametrize("darkest", [250.0, 600.0])
+def test_dark_parts_of_an_object_belong_to_it(darkest: float) -> None:
+    found = segmented(_light_e(darkest), np.ones(SIZE, bool))
+    assert found is not None
+    assert np.mean(found == _object()) > 0.995
+
+
+def test_unusable_pixels_are_no_object_and_move_no_threshold() -> None:
+    light_e, usable = _light_e(250.0), np.ones(SIZE, bool)
+    light_e[2, 3], usable[2, 3] = 1e6, False
+    found = segmented(light_e, usable)
+    assert found is not None
+    assert not found[2, 3]
+    assert np.mean(found == _object()) > 0.995
+
+
+def test_a_view_of_one_brightness_has_no_region() -> None:
+    assert segmented(np.full(SIZE, 7.0, np.float32), np.ones(SIZE, bool)) is None
+
+
+def test_the_bright_view_tells_where_eq_4_looks_unless_the_set_does(make_set: SetMaker, tmp_path: Path) -> None:
+    dark_dn = np.where(_object(), 108, 100).astype(np.uint16)
+    loaded = load_set(make_set([dark_dn], noise=NOISE))
+    assert object_region(loaded) == (None, "whole view")
+    bright = tmp_path / "bright.tiff"
+    tifffile.imwrite(bright, np.asarray(np.clip(100 + 2 * _light_e(600.0), 0, 65535), np.uint16))
+    loaded = replace(loaded, bright_view=(bright, 0.1))
+    found = brightness(loaded)
+    assert found.region == "object region of the bright view"
+    assert found.mean_signal_e == pytest.approx(4.0, rel=0.01)
+    write_png(loaded.folder / OBJECT_REGION, mask_picture(~_object()))
+    assert brightness(loaded).region == "object region"
+    assert brightness(loaded).mean_signal_e == pytest.approx(0.0, abs=1e-6)
+
+
+def test_without_a_quantum_efficiency_light_is_in_electrons_alone(make_set: SetMaker) -> None:
+    view = np.full(SIZE, 108, np.uint16)
+    counted = brightness(load_set(make_set([view], noise=NOISE)))
+    assert counted.electrons_from_moments is not None
+    assert (counted.photons_linear, counted.photons_from_moments) == (None, None)

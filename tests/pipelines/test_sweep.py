@@ -1,0 +1,135 @@
+"""Planes that are there stay, whatever ended the run that made them; what is made of something else is made anew."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from pipelines.cli import run
+from pipelines.elemental_set import load_set
+from pipelines.files import UNFINISHED
+from pipelines.plane_files import PARTS
+from pipelines.planes import solve
+from pipelines.reconstruct import Request, reconstruct_set
+from recon.errors import GeometryMismatch
+
+type Command = Callable[..., CompletedProcess[str]]
+
+SWEEP = ("--sweep-mm", "500:700:3", "--method", "backprojection")
+
+# Runs a command and kills the process, as nothing can be caught, when it has flushed something for the n-th time.
+_KILLED = """
+import os, signal, sys
+left, fsync = int(sys.argv[1]), os.fsync
+def killing(descriptor):
+    global left
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    fsync(descriptor)
+os.fsync = killing
+from pipelines.cli import main
+main(sys.argv[2:])
+"""
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    """Return all files but for what they say of times: of the page, and of the wall time."""
+    found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    del found["report.html"]
+    record = json.loads(found["reconstruction.json"])
+    del record["wall_time_s"]
+    return found | {"reconstruction.json": json.dumps(record).encode()}
+
+
+def _written(folder: Path) -> dict[str, int]:
+    """Return when each plane was written."""
+    return {path.name: path.stat().st_mtime_ns for path in folder.glob("plane_*.tiff")}
+
+
+@pytest.fixture(scope="module")
+def colour_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small set of a Bayer camera, to be read only."""
+    folder = tmp_path_factory.mktemp("colour") / "scene"
+    words = ("simulate", folder, "--size-px", 96, 72, "--rows", 3, "--columns", 3, "--colour", "bayer")
+    assert run([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_sweep_killed_at_any_moment_and_run_again_has_the_files_of_one_that_was_not(
+    seed: int, colour_scene: Path, tmp_path: Path, done: Command
+) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    done("reconstruct", colour_scene, "--out", whole, *SWEEP)
+    anywhere, in_a_file = np.random.default_rng(seed).integers(2, 9, 2) * 2  # of some 40; each file, then its folder
+    for moment in (anywhere - seed % 2, in_a_file - 1):
+        words = ["reconstruct", colour_scene, "--out", killed, *SWEEP]
+        ended = subprocess.run(
+            [sys.executable, "-c", _KILLED, str(moment), *map(str, words)], capture_output=True, check=False
+        )
+        assert ended.returncode == -9
+        assert not (killed / "reconstruction.json").exists()
+    assert list(killed.rglob(f"*{UNFINISHED}"))
+    done("reconstruct", colour_scene, "--out", killed, *SWEEP)
+    assert _contents(killed) == _contents(whole)
+
+
+def test_what_is_there_is_not_made_again(scene: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    first, contents = _written(out), _contents(out)
+    assert "3 of 3 planes are there" in done("reconstruct", scene, "--out", out, *SWEEP).stderr
+    assert _written(out) == first
+    assert _contents(out) == contents
+
+
+def test_only_what_is_made_of_something_else_is_made_again(scene: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    first = _written(out)
+    with (out / "plane_00600.0.tiff").open("r+b") as file:
+        file.seek(-4, 2)
+        file.write(b"\0\0\x80\x3f")
+    again = _contents(out)
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    changed = {name for name, when in _written(out).items() if when != first[name]}
+    assert changed == {"plane_00600.0.tiff"}
+    assert again["plane_00600.0.tiff"] != (out / "plane_00600.0.tiff").read_bytes()
+    view = scene / "view_r0_c0.tiff"
+    tifffile.imwrite(view, tifffile.imread(view) + np.uint16(1))
+    assert "are there" not in done("reconstruct", scene, "--out", out, *SWEEP).stderr
+
+
+def test_planes_of_other_options_are_not_mixed_in(scene: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    first = _written(out)
+    ended = done("reconstruct", scene, "--out", out, "--depth-mm", 500, "--depth-mm", 650, "--method", "mlem")
+    assert "are there" not in ended.stderr
+    record = json.loads((out / "reconstruction.json").read_text())
+    assert [(plane["depth_mm"], plane["method"]) for plane in record["planes"]] == [(500.0, "mlem"), (650.0, "mlem")]
+    assert _written(out)["plane_00600.0.tiff"] == first["plane_00600.0.tiff"]
+    assert "2 of 3 planes are there" in done("reconstruct", scene, "--out", out, *SWEEP).stderr
+
+
+def test_a_failure_leaves_the_planes_before_it(
+    simulated_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*arguments: Any) -> Any:
+        if (tmp_path / "plane_00500.0.tiff").is_file():
+            raise GeometryMismatch("made up")
+        return solve(*arguments)
+
+    monkeypatch.setattr("pipelines.sweep.solve", failing)
+    with pytest.raises(GeometryMismatch, match="made up"):
+        reconstruct_set(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
+    assert {path.name for path in tmp_path.iterdir()} == {f"plane_00500.0.{kind}" for kind in ("tiff", "png", "json")}
+    assert not (tmp_path / PARTS).exists()
