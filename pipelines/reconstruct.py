@@ -75,7 +75,7 @@ def reconstruct(
     depth_mm: list[float] | None = None,
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
-    sweep_px: str | None = None,
+    sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
     depth_map: bool = False,
     method: list[Method] | None = None,
     penalty_weight: NotNegative | Literal["auto"] = "auto",

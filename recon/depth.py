@@ -34,7 +34,8 @@ _LEAST_SEEN = 0.3
 # Nor is a depth the best that few others were compared with.
 _LEAST_COMPARED = 2 / 3
 
-_LEAST_LIGHT_SIGMAS = 4.0
+# What is darker than its noise allows to tell, or than a thirtieth of the picture, is as dark as stray light.
+_LEAST_LIGHT_SIGMAS, _LEAST_LIGHT = 4.0, 0.03
 
 
 class Agreement(NamedTuple):
@@ -60,7 +61,7 @@ class DepthMap:
         The plane, between planes by a parabola; everywhere, also where nothing is known of it.
     confidence : float array (row, column)
         Probability of that depth within a step, or 2 % of the depth, by the likelihood of the views alone; zero where
-        no light stands out of the noise.
+        no light stands out of the noise, and where the depth is the first or the last of the sweep.
     """
 
     index: Image
@@ -119,7 +120,8 @@ def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> Depth
     step = np.abs(np.gradient(depths_mm))[best]
     near = np.abs(depths_mm[:, np.newaxis, np.newaxis] - chosen) <= np.maximum(1.01 * step, 0.02 * chosen)
     confidence = np.where(near, posterior, 0).sum(axis=0)
-    confidence[~(comparable & _lit(planes, best))] = 0
+    within = (best > 0) & (best < len(planes) - 1)  # what is likeliest at an end may lie beyond it
+    confidence[~(within & comparable & _lit(planes, best))] = 0
     return DepthMap(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
 
 
@@ -185,4 +187,4 @@ def _lit(planes: list[Agreement], best: NDArray[np.intp]) -> NDArray[np.bool_]:
         for name in ("light", "light_variance")
     )
     level = np.sqrt(np.mean(np.square(np.maximum(light, 0), dtype=np.float64)))
-    return np.asarray((light > _LEAST_LIGHT_SIGMAS * np.sqrt(variance)) & (light > 0.1 * level))
+    return np.asarray((light > _LEAST_LIGHT_SIGMAS * np.sqrt(variance)) & (light > _LEAST_LIGHT * level))
