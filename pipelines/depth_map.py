@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,15 @@ from pipelines.errors import WrongUsage
 from pipelines.files import write_whole
 from pipelines.frames import read_frame
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
+from pipelines.large_arrays import memory_or_file
 from pipelines.planes import Method
 from recon.depth import Agreement, DepthMap, agreement, bins_for, depth_map
 
 LEAST_DEPTHS = 5
+
+# Bins are no larger than leave so many across the detector.
+_LEAST_ACROSS = 8
+
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
 
 # Depths that are less probable than this are marked, not shown.
@@ -37,39 +43,65 @@ def require_sweep(depths: Sequence[float]) -> None:
         )
 
 
-def mapped_depths(loaded: LoadedSet, depths_mm: Sequence[float]) -> tuple[DepthMap, int]:
-    """Return where each sample is sharp among the depths, in their order, and how many pixels across a sample has.
+@dataclass(frozen=True)
+class Compared:
+    """How the views agree at each depth, all colours together.
 
-    The evidence of all colours adds up; one colour's images are in memory at a time.
+    Attributes
+    ----------
+    planes : list of Agreement
+        In the order of the depths.
+    depths_mm : sequence of float
+        The depths.
+    bins_px : int
+        So many detector pixels across have been added up.
+    """
+
+    planes: list[Agreement]
+    depths_mm: Sequence[float]
+    bins_px: int
+
+    def depth_map(self) -> DepthMap:
+        """Return where each sample is sharp."""
+        return depth_map(self.planes, np.asarray(self.depths_mm))
+
+
+def compared_depths(loaded: LoadedSet, depths_mm: Sequence[float], out: Path, least_bins_px: int = 1) -> Compared:
+    """Compare the views at each depth; one colour's images are in memory at a time, or in a file in `out`.
+
+    Pixels are added up in bins of at least `least_bins_px`: more where the light asks for it.
     """
     planes: list[Agreement] = []
     bins = 0
     for layout in channel_layouts(loaded):
-        images = load_channel(loaded, layout)
-        factory = OperatorFactory(loaded, layout, images)
+        images = load_channel(loaded, layout, memory_or_file(out))
+        step = max(layout.lattices[0].step)
         if not bins:
             middle_mm = sorted(depths_mm)[len(depths_mm) // 2]
-            bins = bins_for(factory.at_depth(middle_mm, plane_grid(loaded, middle_mm)), images)
-            bins = min(bins, min(layout.lattices[0].shape) // 8)
+            needed = bins_for(
+                OperatorFactory(loaded, layout, images).at_depth(middle_mm, plane_grid(loaded, middle_mm)), images
+            )
+            bins = min(max(needed, -(-least_bins_px // step)), min(layout.lattices[0].shape) // _LEAST_ACROSS)
         images = images.binned(bins)
         factory = OperatorFactory(loaded, layout, images, bins=bins)
-        step = max(layout.lattices[0].step)
         found = [
             agreement(factory.at_depth(depth, plane_grid(loaded, depth).binned(bins * step)), images)
             for depth in progress(depths_mm, f"comparing views, {layout.name}")
         ]
-        if planes:
-            found = [
-                Agreement(*(a + b for a, b in zip(*pair, strict=True))) for pair in zip(planes, found, strict=True)
-            ]
-        planes = found
-    return depth_map(planes, np.asarray(depths_mm)), bins * step
+        planes = [_both(*pair) for pair in zip(planes, found, strict=True)] if planes else found
+    return Compared(planes, depths_mm, bins * step)
+
+
+def _both(one: Agreement, other: Agreement) -> Agreement:
+    """Return what two colours say together."""
+    return Agreement(*(a + b for a, b in zip(one, other, strict=True)))
 
 
 def write_depth_map(
     loaded: LoadedSet,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
+    out: Path,
 ) -> dict[str, Any]:
     """Write the maps and the picture into each folder of planes, and return what reconstruction.json says of them.
 
@@ -81,9 +113,12 @@ def write_depth_map(
         The planes' files; each method has a folder.
     disparities_px : mapping of depth in mm to px
         Of every depth, where disparities were asked for: the map then is in px.
+    out : Path
+        Where a file may lie that holds the images while memory is short.
     """
     depths = sorted({depth for _, depth in planes})
-    found, bins = mapped_depths(loaded, depths)
+    compared = compared_depths(loaded, depths, out)
+    found, bins = compared.depth_map(), compared.bins_px
     scale = [disparities_px[depth] if disparities_px else depth for depth in depths]
     unit, name = ("px", "disparity_px") if disparities_px else ("mm", "depth_mm")
     shape = plane_grid(loaded, depths[0]).shape
