@@ -73,16 +73,18 @@ def best_focus(loaded: LoadedSet, out: Path, range_mm: tuple[float, float] | Non
         found = compared.depth_map()
         sure = found.confidence >= SURE
         if np.count_nonzero(sure) < LEAST_SAMPLES:
-            raise _nothing(sure, ranges[0])
-        first, last = np.quantile(found.index[sure], _MOST_OF_THE_SURE) + (-_MARGIN_STEPS, _MARGIN_STEPS)
+            raise _nothing(ranges[0])
+        first, last = np.quantile(found.index[sure], _MOST_OF_THE_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
         if last - first > _WORTH_ANOTHER * _DEPTHS:
             break
         inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
         ranges.append((float(1 / inverse[0]), float(1 / inverse[1])))
     places = places_of_focus(found, _DEPTHS)
     if not places:
-        raise _nothing(sure, ranges[0])
-    depths = [round(_refined(loaded, out, compared, place, float(np.median(found.index[place]))), 1) for place in places]
+        raise _nothing(ranges[0])
+    depths = [
+        round(_refined(loaded, out, compared, place, float(np.median(found.index[place]))), 1) for place in places
+    ]
     depths = sorted(set(depths))
     say(f"planes of best focus between {near_mm:g} and {far_mm:g} mm: {', '.join(f'{d:g}' for d in depths)} mm")
     record = {
@@ -98,9 +100,8 @@ def best_focus(loaded: LoadedSet, out: Path, range_mm: tuple[float, float] | Non
 def searched_range_mm(loaded: LoadedSet) -> tuple[float, float]:
     """Return between which depths a set can show anything, from its own poses.
 
-    The near end is where the views share a quarter of the reference view, in the mean. The far end is where they no longer
-    do (cameras that look inwards), or else where a plane moves in the outermost view, on the way to infinity, by no
-    more than one step of the search.
+    The near end is where the views share a quarter of the reference view, in the mean. The far end is where they no
+    longer do (cameras that look inwards), or else one step of the search before infinity.
     """
     baseline_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max())
     if baseline_mm <= 0:
@@ -125,11 +126,11 @@ def _overlap(loaded: LoadedSet, depth_mm: float) -> float:
     plane = fronto_parallel_rt_ref_plane(depth_mm)
     centres = loaded.principal_points_px()
     camera = loaded.settings.camera
-    # Rays are those of the camera's principal point; a view's own shifts its picture.
+    # The lens knows the camera's principal point; where a view has its own, its picture is shifted
+    shifts = centres - np.array([camera.cx_px, camera.cy_px])
     seen = [
-        transfer(loaded.lens, rt, plane, pixels + [camera.cx_px, camera.cy_px] - centres[loaded.reference_view])
-        + (centre - [camera.cx_px, camera.cy_px])
-        for rt, centre in zip(loaded.poses_rt_cam_ref, centres, strict=True)
+        transfer(loaded.lens, rt, plane, pixels - shifts[loaded.reference_view]) + shift
+        for rt, shift in zip(loaded.poses_rt_cam_ref, shifts, strict=True)
     ]
     inside = np.all((np.array(seen) > -0.5) & (np.array(seen) < np.array(camera.size_px) - 0.5), axis=2)
     return float(inside.mean())
@@ -154,8 +155,9 @@ def _refined(loaded: LoadedSet, out: Path, compared: Compared, place: NDArray[np
     return likeliest_depth_mm(around.planes, around.depths_mm, place)
 
 
-def _nothing(sure: NDArray[np.bool_], range_mm: tuple[float, float]) -> NothingInFocus:
+def _nothing(range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
-        f"between {range_mm[0]:.4g} and {range_mm[1]:.4g} mm the views agree on {np.count_nonzero(sure)} of {sure.size} "
-        f"places, and {LEAST_SAMPLES} are needed; give another range by --sweep-mm FIRST:LAST:COUNT, or --depth-mm"
+        f"between {range_mm[0]:.4g} and {range_mm[1]:.4g} mm there is no depth at which the views agree on at least "
+        f"{LEAST_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep-mm "
+        "FIRST:LAST:COUNT, more light, or --depth-mm"
     )

@@ -14,11 +14,13 @@ from pipelines.channels import OperatorFactory, channel_layouts, load_channel, p
 from pipelines.console import progress
 from pipelines.elemental_set import LoadedSet
 from pipelines.errors import WrongUsage
-from pipelines.files import write_whole
+from pipelines.files import sha256, write_json, write_whole
 from pipelines.frames import read_frame
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.large_arrays import memory_or_file
+from pipelines.plane_files import vouched_for
 from pipelines.planes import Method
+from recon.best_focus import SURE
 from recon.depth import Agreement, DepthMap, agreement, bins_for, depth_map
 
 LEAST_DEPTHS = 5
@@ -27,9 +29,7 @@ LEAST_DEPTHS = 5
 _LEAST_ACROSS = 8
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
-
-# Depths that are less probable than this are marked, not shown.
-SURE = 0.9
+DEPTH_MAP_FILE = "depth_map.json"
 
 _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
@@ -101,6 +101,7 @@ def write_depth_map(
     loaded: LoadedSet,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
+    origins: Mapping[Method, dict[str, Any]],
     out: Path,
 ) -> dict[str, Any]:
     """Write the maps and the picture into each folder of planes, and return what reconstruction.json says of them.
@@ -113,9 +114,15 @@ def write_depth_map(
         The planes' files; each method has a folder.
     disparities_px : mapping of depth in mm to px
         Of every depth, where disparities were asked for: the map then is in px.
+    origins : mapping of Method to dict
+        What each method's planes are made of: maps that were made of the same stay.
     out : Path
         Where a file may lie that holds the images while memory is short.
     """
+    folders = {method: path.parent for (method, _), path in planes.items()}
+    there = [_finished(folder, origins[method]) for method, folder in folders.items()]
+    if there and there[0] is not None and all(there):
+        return there[0]
     depths = sorted({depth for _, depth in planes})
     compared = compared_depths(loaded, depths, out)
     found, bins = compared.depth_map(), compared.bins_px
@@ -125,14 +132,8 @@ def write_depth_map(
     index, confidence = (_enlarged(part, shape, bins) for part in (found.index, found.confidence))
     values = np.interp(index, np.arange(len(depths)), scale)
     values[confidence < SURE] = np.nan
-    for method in dict.fromkeys(method for method, _ in planes):
-        folder = planes[method, depths[0]].parent
-        _write(folder, name, unit, values, confidence, scale)
-        sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
-        write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
-        write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
     known = np.isfinite(values)
-    return {
+    record = {
         "file": f"{name}.tiff",
         "confidence": f"{CONFIDENCE}.tiff",
         "all_in_focus": f"{ALL_IN_FOCUS}.tiff",
@@ -142,6 +143,22 @@ def write_depth_map(
         "sure_share": float(known.mean()),
         "median": float(np.median(values[known])) if known.any() else None,
     }
+    for method, folder in folders.items():
+        (folder / DEPTH_MAP_FILE).unlink(missing_ok=True)
+        _write(folder, name, unit, values, confidence, scale)
+        sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
+        write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
+        write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
+        files = [f"{stem}.{suffix}" for stem in (name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
+        hashes = {file: sha256(folder / file) for file in files}
+        write_json(folder / DEPTH_MAP_FILE, {"format": 1, "depth_map": record, "sha256": hashes, **origins[method]})
+    return record
+
+
+def _finished(folder: Path, origin: dict[str, Any]) -> dict[str, Any] | None:
+    """Return what is known of maps that are there, None unless they are whole and made of what they have to be."""
+    content = vouched_for(folder / DEPTH_MAP_FILE, origin)
+    return None if content is None else content["depth_map"]
 
 
 def _write(

@@ -123,7 +123,8 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return what the page says of the planes: the best, all side by side, on sliders, and where they are sharp."""
     planes = read_planes(directory, results, RECONSTRUCTION_FILE)
-    depths = sorted({plane.depth_mm for plane in planes})
+    depths = sorted({plane.depth_mm for plane in planes if not plane.name})
+    places = len({plane.place for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
     titles, best = column_titles(planes), best_column(planes)
     columns = list(titles)
@@ -134,7 +135,7 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
     return {
         "best": (of_best[0].method, of_best[0].poses),
         "best_title": titles[best],
-        "best_planes": [(row["depth_mm"], row["cells"][place]) for row in rows if row["cells"][place]],
+        "best_planes": [(row["words"], row["cells"][place]) for row in rows if row["cells"][place]],
         "weight_curves": weight_curves(of_best),
         "certificates": [
             (plane.depth_mm, record["certificate"])
@@ -144,10 +145,10 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
         ],
         "columns": list(titles.values()),
         "rows": rows,
-        "slider": slider(planes, titles, white) if len(depths) > 1 or len(columns) > 1 else None,
+        "slider": slider(planes, titles, white) if places > 1 or len(columns) > 1 else None,
         "slider_column": place,
-        "slider_depth": first_depth(depths, focus),
-        "depths": len(depths),
+        "slider_depth": first_depth([depth for depth, _ in sorted({plane.place for plane in planes})], focus),
+        "depths": places,
         "white": white,
         "focus_curve": focus_curve(focus) if focus else None,
         "sharp_mm": focus["sharp_mm"] if focus else [],

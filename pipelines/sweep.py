@@ -15,6 +15,7 @@ from pipelines.elemental_set import LoadedSet
 from pipelines.large_arrays import memory_or_file
 from pipelines.plane_files import PlaneFiles
 from pipelines.planes import Method, Settings, solve
+from pipelines.tilted import Place, TiltedPlane, words_of
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.images import ElementalImages
@@ -24,14 +25,14 @@ from recon.plane import PlaneGrid
 
 @dataclass(frozen=True)
 class PlaneTask:
-    """One colour at one depth, by the methods by which it is not there yet: paths and options, no pixels.
+    """One colour of one plane, by the methods by which it is not there yet: paths and options, no pixels.
 
     Attributes
     ----------
     layout : ChannelLayout
         The colour.
-    depth_mm : float
-        Of the plane.
+    place : Place
+        The plane's depth in mm, or its pose.
     grid : PlaneGrid
         Its samples.
     files : tuple of PlaneFiles
@@ -43,7 +44,7 @@ class PlaneTask:
     """
 
     layout: ChannelLayout
-    depth_mm: float
+    place: Place
     grid: PlaneGrid
     files: tuple[PlaneFiles, ...]
     settings: Settings
@@ -67,16 +68,13 @@ class Channel:
         GeometryMismatch, NotConverged
             Of the task's depth, or method.
         """
-        try:
-            operator = self._factory.at_depth(task.depth_mm, task.grid)
-        except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {task.depth_mm:g} mm: {failure}") from failure
+        operator = self._operator(task)
         focus = focus_measure(operator, self._images, self._halves())._asdict() if task.with_focus else None
         for files in task.files:
             solution = solve(operator, self._images, files.method, task.settings)
             flux_e = float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(task)
             record = {
-                "depth_mm": task.depth_mm,
+                **_where(task.place),
                 "method": files.method,
                 "channel": task.layout.name,
                 "file": files.path.name,
@@ -85,10 +83,23 @@ class Channel:
                 "flux_e": flux_e,
             }
             files.save_part(task.layout.name, solution.plane, {"record": record, "focus": focus})
-        return self._blind_views(operator, task.depth_mm)
+        return self._blind_views(operator, task.place)
+
+    def _operator(self, task: PlaneTask) -> PlaneOperator:
+        try:
+            if isinstance(task.place, TiltedPlane):
+                return self._factory.at_pose(np.array(task.place.rt_ref_plane), task.grid)
+            return self._factory.at_depth(task.place, task.grid)
+        except GeometryMismatch as failure:
+            raise GeometryMismatch(f"plane at {words_of(task.place)}: {failure}") from failure
 
     def _samples_per_px(self, task: PlaneTask) -> float:
-        return float((task.grid.pitch_mm * self._loaded.settings.camera.fx_px / task.depth_mm) ** 2)
+        """Return how many pixels of the reference view a sample takes, on the axis."""
+        place = task.place
+        depth_mm, foreshortened = (
+            (place.depth_mm, abs(place.normal[2])) if isinstance(place, TiltedPlane) else (place, 1.0)
+        )
+        return float((task.grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_mm) ** 2 * foreshortened)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
@@ -97,7 +108,7 @@ class Channel:
         odd = np.repeat(odd, self._phases)
         return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
 
-    def _blind_views(self, operator: PlaneOperator, depth_mm: float) -> list[str]:
+    def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
         """Return words on views that see nothing of a plane: a pose may be wrong."""
         blind = {
             int(view) // self._phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()
@@ -106,7 +117,7 @@ class Channel:
             return []
         first = self._loaded.settings.view[min(blind)].image
         return [
-            f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
+            f"{words_of(place)}: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
         ]
 
 
@@ -133,10 +144,10 @@ class Sweep:
     ----------
     loaded : LoadedSet
         The set.
-    grids : dict of float to PlaneGrid
-        The samples of the plane at each depth in mm.
+    grids : dict of Place to PlaneGrid
+        The samples of each plane.
     files : sequence of PlaneFiles
-        Of each method and depth.
+        Of each method and plane.
     origins : dict of Method to dict
         The provenance of all planes of a method together.
     settings : Settings
@@ -148,7 +159,7 @@ class Sweep:
     def __init__(
         self,
         loaded: LoadedSet,
-        grids: dict[float, PlaneGrid],
+        grids: dict[Place, PlaneGrid],
         files: Sequence[PlaneFiles],
         origins: dict[Method, dict[str, Any]],
         settings: Settings,
@@ -162,7 +173,7 @@ class Sweep:
         self.origins = origins
         self._settings = settings
         self._with_focus = with_focus
-        self._finished: dict[tuple[Method, float], dict[str, Any]] = {}
+        self._finished: dict[tuple[Method, Place], dict[str, Any]] = {}
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
@@ -173,7 +184,7 @@ class Sweep:
         """Have the tasks done that are not, and finish each plane at once."""
         for files in self._files:
             if record := files.finished():
-                self._finished[files.method, files.depth_mm] = record
+                self._finished[files.method, files.place] = record
         if self._finished:
             say(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
         tasks = self._tasks()
@@ -186,47 +197,49 @@ class Sweep:
 
     def _tasks(self) -> list[PlaneTask]:
         """Return what is to be done, one channel after the other."""
-        wanted = [files for files in self._files if (files.method, files.depth_mm) not in self._finished]
-        missing = {(files.method, files.depth_mm): files.missing() for files in wanted}
+        wanted = [files for files in self._files if (files.method, files.place) not in self._finished]
+        missing = {(files.method, files.place): files.missing() for files in wanted}
         tasks = []
         for layout in self._layouts:
-            for depth, grid in self._grids.items():
+            for place, grid in self._grids.items():
                 left = tuple(
-                    files for files in wanted if files.depth_mm == depth and layout.name in missing[files.method, depth]
+                    files for files in wanted if files.place == place and layout.name in missing[files.method, place]
                 )
                 if left:
-                    tasks.append(PlaneTask(layout, depth, grid, left, self._settings, self._with_focus))
+                    tasks.append(PlaneTask(layout, place, grid, left, self._settings, self._with_focus))
         return tasks
 
     def _finish_whole(self, candidates: Sequence[PlaneFiles]) -> None:
         """Write the planes whose colours are complete."""
         for files in candidates:
-            key = (files.method, files.depth_mm)
+            key = (files.method, files.place)
             if key not in self._finished and not files.missing():
-                self._finished[key] = files.finish(self._grids[files.depth_mm].pitch_mm)
+                self._finished[key] = files.finish(self._grids[files.place].pitch_mm)
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The entries of reconstruction.json: by channel, depth, method."""
+        """The entries of reconstruction.json: by channel, plane, method."""
         methods = list(dict.fromkeys(files.method for files in self._files))
         return [
-            self._finished[method, depth]["planes"][index]
+            self._finished[method, place]["planes"][index]
             for index in range(len(self._layouts))
-            for depth in self._grids
+            for place in self._grids
             for method in methods
         ]
 
     @property
     def written(self) -> dict[tuple[Method, float], Path]:
-        """The files of the planes."""
-        return {(files.method, files.depth_mm): files.path for files in self._files}
+        """The files of the planes that have a depth."""
+        return {
+            (files.method, files.place): files.path for files in self._files if not isinstance(files.place, TiltedPlane)
+        }
 
     def focus(self) -> dict[str, Any] | None:
         """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
         if not self._with_focus:
             return None
         method = self._files[0].method
-        depths = list(self._grids)
+        depths = [place for place in self._grids if not isinstance(place, TiltedPlane)]
         curve = [_sum(self._finished[method, depth]["focus"]) for depth in depths]
         return {
             "depth_mm": depths,
@@ -234,6 +247,13 @@ class Sweep:
             "sigma_e2": [point.sigma_e2 for point in curve],
             "sharp_mm": sharp_depths_mm(depths, curve),
         }
+
+
+def _where(place: Place) -> dict[str, Any]:
+    """Return what reconstruction.json says of where a plane is."""
+    if isinstance(place, TiltedPlane):
+        return {"name": place.name, "depth_mm": place.depth_mm, "rt_ref_plane": list(place.rt_ref_plane)}
+    return {"depth_mm": place}
 
 
 def _sum(of_channels: Sequence[dict[str, float]]) -> Focus:

@@ -101,7 +101,7 @@ class ElementalImages:
         if bins == 1:
             return self
         background_e, variance_e2 = (
-            binned(value, bins) * bins**2 if np.ndim(value) else float(value) * bins**2
+            float(value) * bins**2 if np.ndim(value) == 0 else binned(np.asarray(value), bins) * bins**2
             for value in (self.background_e, self.read_variance_e2)
         )
         electrons = np.stack([binned(image, bins) for image in self.electrons]) * self.electrons.dtype.type(bins**2)

@@ -16,6 +16,7 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.files import UNFINISHED
 from pipelines.reconstruct import Request, reconstruct_set
 from pipelines.sweep import PlaneTask
+from pipelines.tilted import Place
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -56,11 +57,11 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
     request = Request(DEPTHS_MM, ["pmlem"], with_focus=True)
     reconstruct_set(loaded, tmp_path / "local", request)
     crew = crew_of(None, cluster.scheduler_address)
-    done: list[float] = []
+    done: list[Place] = []
 
     def killing(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         for task, words in crew(loaded, out, tasks):
-            done.append(task.depth_mm)
+            done.append(task.place)
             if len(done) == 1:
                 _kill_one_that_works(cluster)
             yield task, words
