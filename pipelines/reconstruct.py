@@ -161,11 +161,11 @@ def reconstruct(
     if has_session(elemental_set):
         loaded = load_session(elemental_set, scene, geometry)
         out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    elif out is None:
+        raise WrongUsage("no folder for the results is named; give --out")
     else:
         loaded = load_set(elemental_set)
         loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
-    if out is None:
-        raise WrongUsage("no folder for the results is named; give --out")
     swept_of_px = depths_by_disparity(loaded, swept_px)
     of_disparity = depths_by_disparity(loaded, disparity_px or []) | swept_of_px
     depths = [*(depth for depth in depth_mm or [] if depth != "auto"), *swept, *of_disparity]

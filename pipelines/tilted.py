@@ -163,7 +163,7 @@ def tilted_grid(loaded: LoadedSet, plane: TiltedPlane, pitch_mm: float) -> Plane
             f"{_MOST_SAMPLES_PER_PIXEL} per detector pixel; give it a size_mm, or a larger --pitch-mm"
         )
     try:
-        return PlaneGrid.covering(*low.tolist(), *high.tolist(), pitch_mm)
+        return PlaneGrid.covering(float(low[0]), float(low[1]), float(high[0]), float(high[1]), pitch_mm)
     except ValueError as failure:
         raise GeometryMismatch(f"plane '{plane.name}': {failure}") from failure
 
