@@ -1,7 +1,7 @@
 """Words and progress for people, always on standard error; standard output is for results alone."""
 
 import logging
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 
 from rich.console import Console
 from rich.progress import (
@@ -27,7 +27,7 @@ def say(text: str) -> None:
     logger.info(text)
 
 
-def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Generator[T]:
     """Yield `items`, drawing a bar with a time to go on a terminal and nothing elsewhere.
 
     Parameters
@@ -47,5 +47,7 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Ite
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    # Only a terminal gets the thread that redraws: one that a caller leaves behind could not be joined at exit
+    drawn = console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
         yield from bar.track(items, description=label, total=total)

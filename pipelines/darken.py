@@ -1,5 +1,6 @@
 """`faintfield darken`: a photon-starved set from a bright one."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -157,9 +158,9 @@ def _write_dark_views(
 ) -> None:
     """Expose every view anew and write the set; a mosaic stays one."""
     names = _names(loaded)
-    paths = progress(loaded.image_paths, "exposing views")
-    signal_e = (_light(loaded, path, layouts) * scale_e for path in paths)
-    write_exposures(folder, names, signal_e, sensor, exposure_s, generator)
+    with closing(progress(loaded.image_paths, "exposing views")) as paths:
+        signal_e = (_light(loaded, path, layouts) * scale_e for path in paths)
+        write_exposures(folder, names, signal_e, sensor, exposure_s, generator)
     camera = loaded.settings.camera
     if loaded.flat is not None:
         write_plane(folder / _FLAT, loaded.flat, pitch_mm=1.0)

@@ -3,6 +3,7 @@
 import errno
 import hashlib
 import os
+import secrets
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -12,7 +13,7 @@ from typing import Any, BinaryIO
 
 import msgspec
 
-from pipelines.errors import CannotWrite, DiskFull, OutputExists
+from pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputExists
 
 # A short write of an array comes without a number: it, too, means that the disk is full.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -85,8 +86,10 @@ def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | N
         raise OutputExists(f"{out}: holds {reads}, which is read; name another folder")
     with reported_as_cannot_write(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        building = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        # The name is known before the folder is there: an interrupt at any moment finds what to remove
+        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
         try:
+            building.mkdir(mode=0o700)
             yield building
             os.chmod(building, 0o777 & ~_umask())
             _put_in_place(building, out)
@@ -146,9 +149,12 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Return the SHA-256 of a file's bytes, in hexadecimal; MissingFile where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as failure:
+        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
 
 @contextmanager

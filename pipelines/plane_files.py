@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.errors import MissingFile
 from pipelines.files import sha256, write_json, writing
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.planes import Method
@@ -111,6 +112,6 @@ def vouched_for(path: Path, origin: dict[str, Any]) -> dict[str, Any] | None:
         if first_difference(record, origin):
             return None
         whole = all(sha256(path.parent / name) == known for name, known in record["sha256"].items())
-    except (OSError, ValueError, KeyError, AttributeError):
+    except (OSError, MissingFile, ValueError, KeyError, AttributeError):
         return None  # there is none, or it is no use
     return record if whole else None

@@ -156,6 +156,8 @@ def reconstruct(
             "no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT, --disparity-px, --sweep-px or "
             "--plane-pose"
         )
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
+        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
     if has_session(elemental_set):
@@ -175,8 +177,6 @@ def reconstruct(
         depths, of_disparity = found.depths_mm, {}
     if depth_map:
         require_sweep(depths)
-    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
-        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty)
     request = Request(

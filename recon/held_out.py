@@ -169,6 +169,9 @@ class _Search:
         """Try the candidate of a step."""
         weight = self._guess * _FACTOR**step
         self.scores[step] = sum(fold.score(step, weight) for fold in self._folds)
+        # Others start from this one, or from the best when there are none beyond it
+        for fold in self._folds:
+            fold.solutions = {kept: fold.solutions[kept] for kept in {step, self.best()}}
 
     def best(self) -> int:
         """Return the step of the candidate that predicts best."""

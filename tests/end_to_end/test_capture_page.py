@@ -94,7 +94,7 @@ def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
     verdict = verify(running.folder)
     assert (verdict.problems, verdict.present, verdict.sealed) == ((), FRAMES, True)
     browser.wait_until("document.getElementById('frame').naturalWidth > 0")
-    browser.wait_until("document.body.innerText.includes('00015_dark_0_r0_c1')")
+    browser.wait_until("document.body.innerText.includes('00015_dark_0_r1_c1')")
     assert f"of {FRAMES} frames" in browser.text()
     assert browser.evaluate("document.querySelectorAll('#grid span').length") == 6
     assert browser.evaluate("document.querySelectorAll('#histogram path').length") == 1

@@ -72,7 +72,7 @@ def test_measured_poses_serve_as_well_as_true_ones_and_nominal_ones_do_not(
 ) -> None:
     measured, true, nominal = (errors["pmlem", poses, depth_mm] for poses in ("measured", "true", "nominal"))
     assert measured <= 1.1 * true
-    assert nominal >= 2 * measured
+    assert nominal > 1.3 * measured  # on the small grid; twice as much on the full one, see test_full_demo.py
     assert measured <= errors["backprojection", "measured", depth_mm] / 3
 
 

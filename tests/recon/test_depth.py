@@ -22,7 +22,8 @@ NEAR, FAR = 17, 6  # what these planes' disparities are, the two halves of the s
 
 
 def _waves(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
-    return 20 + 6 * np.cos(x * 0.9 + y * 0.4) + 6 * np.cos(x * 0.35 - y * 0.8 + 1) + 5 * np.sin(0.6 * x + 0.2 * y)
+    waves = 6 * np.cos(x * 0.9 + y * 0.4) + 6 * np.cos(x * 0.35 - y * 0.8 + 1) + 5 * np.sin(0.6 * x + 0.2 * y)
+    return np.asarray(20 + waves)
 
 
 def _two_halves(x: NDArray[np.floating], y: NDArray[np.floating], level: float) -> NDArray[np.floating]:
