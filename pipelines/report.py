@@ -18,7 +18,7 @@ from pipelines.report_calibration import (
     noise_section,
     records,
 )
-from pipelines.report_depth import depth_section
+from pipelines.report_depth import depth_sections
 from pipelines.report_lead import facts
 from pipelines.report_planes import (
     METHOD_NAMES,
@@ -89,9 +89,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         facts=facts(sets[0] if sets else None, **calibrations, against_truth=errors["geometry_off"], errors=led_by),
         sets=sets,
         **planes,
-        depth_maps=[
-            depth_section(folder, result["depth_map"]) for folder, result in results.items() if result.get("depth_map")
-        ],
+        depth_maps=depth_sections(directory, results),
         **calibrations,
         **errors,
         method_names=METHOD_NAMES,

@@ -126,8 +126,8 @@ def test_every_picture_says_what_it_is(page: _Page) -> None:
 def test_all_methods_and_depths_are_there_side_by_side_and_on_the_slider(text: str, page: _Page) -> None:
     alternatives = page.attributes("img", "alt")
     for title in METHOD_TITLES.values():
-        for depth in ("500.0", "600.0", "700.0"):
-            assert f"{title} at {depth:g} mm" in alternatives
+        for depth in (500, 600, 700):
+            assert f"{title} at {depth} mm" in alternatives
     found = re.search(r"const columns = (.*);\n", text)
     assert found is not None
     columns = json.loads(found[1])
