@@ -35,6 +35,7 @@ from pipelines.report_planes import (
 )
 from pipelines.report_sets import set_sections
 from pipelines.result_files import Errors, Result, read_result
+from pipelines.stacks import at_depths
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
@@ -202,7 +203,10 @@ def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
-    depths = sorted({plane["depth_mm"] for result in results.values() for plane in result["planes"]})
+    records = [plane for result in results.values() for plane in result["planes"]]
+    depths = sorted({record["depth_mm"] for record in at_depths(records)})
     few = " and ".join(f"{depth:g}" for depth in depths)
     planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
-    return f"{directory.resolve().name}: planes at {planes}"
+    parts = [f"planes at {planes}"] if depths else []
+    parts += list(dict.fromkeys(f"plane {record['name']}" for record in records if "rt_ref_plane" in record))
+    return f"{directory.resolve().name}: {', '.join(parts)}"
