@@ -160,6 +160,7 @@ def reconstruct(
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
+    tilted = [plane for path in plane_pose or [] for plane in read_plane_poses(path)]
     if has_session(elemental_set):
         loaded = load_session(elemental_set, scene, geometry)
         out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
@@ -187,7 +188,7 @@ def reconstruct(
         with_focus=bool(swept or swept_px) and found is None,
         with_depth_map=depth_map,
         disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
-        tilted=[plane for path in plane_pose or [] for plane in read_plane_poses(path)],
+        tilted=tilted,
         found=found.record if found else None,
     )
     return reconstruct_set(loaded, out, request, crew)

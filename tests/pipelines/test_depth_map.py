@@ -80,7 +80,7 @@ def test_the_maps_are_recorded_and_on_the_page(swept: Path) -> None:
     assert 480 < found["median"] < 720
     page = (swept / "report.html").read_text()
     assert 'id="depth-map"' in page
-    assert "hatched" in page
+    assert "Hatched where it is not known" in page
 
 
 def test_maps_that_are_there_stay_and_others_are_made_anew(scene: Path, swept: Path, done: Command) -> None:
