@@ -1,6 +1,6 @@
 """From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,12 @@ from pipelines.elemental_set import LoadedSet, noise_of_phase
 from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from pipelines.frames import Frame, read_frame
 from pipelines.large_arrays import Allocate
+from pipelines.tilted import Place, TiltedPlane
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages, binned
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
+from recon.scene import SceneOperator
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
@@ -255,19 +257,42 @@ class OperatorFactory:
 
     def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
         """Return H of the plane across the reference camera's axis at a depth."""
-        return self.at_pose(fronto_parallel_rt_ref_plane(depth_mm), grid)
+        return self.at(depth_mm, grid)
 
-    def at_pose(self, rt_ref_plane: NDArray[np.floating], grid: PlaneGrid) -> PlaneOperator:
-        """Return H of the plane of a pose (6,): Rodrigues rad and mm, from plane to reference."""
-        homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
-        return PlaneOperator(
-            np.repeat(homographies, self._phases, axis=0),
-            self._rays,
-            grid,
-            flat=self._response,
-            valid=self._images.valid,
-            lattice_of_view=np.tile(np.arange(self._phases), len(homographies)),
+    def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
+        """Return H of a plane at a depth, or of a pose."""
+        return PlaneOperator(self._homographies(place), self._rays, grid, **self._shared())
+
+    def of_scene(
+        self, grids: Mapping[Place, PlaneGrid], transmission: NDArray[np.float32] | None = None
+    ) -> SceneOperator:
+        """Return H of all planes together, in the order of `grids`.
+
+        Parameters
+        ----------
+        grids : mapping of Place to PlaneGrid
+            The samples of each plane.
+        transmission : float array (plane, view, row, column), optional
+            How much of each plane's light reaches each pixel; all by default.
+        """
+        homographies = np.stack([self._homographies(place) for place in grids])
+        return SceneOperator(
+            homographies, self._rays, list(grids.values()), transmission=transmission, **self._shared()
         )
+
+    def _homographies(self, place: Place) -> NDArray[np.float64]:
+        """Return the way from the rays of each view, and each phase of its mosaic, to a plane."""
+        rt_ref_plane = (
+            np.array(place.rt_ref_plane) if isinstance(place, TiltedPlane) else fronto_parallel_rt_ref_plane(place)
+        )
+        homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
+        return np.repeat(homographies, self._phases, axis=0)
+
+    def _shared(self) -> dict[str, Any]:
+        """Return what the operators of all planes have in common."""
+        views = len(self._loaded.settings.view)
+        lattices = np.tile(np.arange(self._phases), views)
+        return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:

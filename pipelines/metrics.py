@@ -25,9 +25,10 @@ def assess(
 ) -> dict[str, Any] | None:
     """Return the contents of metrics.json, None for a set without ground truth or without planes at its objects.
 
-    Two mean square errors per plane and method, over the region where the object is visible, the object scaled to 0…1:
-    `mse_bright` against the back-projection of the noise-free set (what more light would have shown), and
-    `mse_texture` against the object's true texture (which also counts the blur of other objects).
+    Three mean square errors per plane and method, the object scaled to 0…1. Over the region where the object is
+    visible: `mse_bright` against the back-projection of the noise-free set (what more light would have shown), and
+    `mse_texture` against the object's true texture (which also counts the blur of other objects there). Over the whole
+    plane: `mse_plane` against the texture, which is zero beside the object, where most of that blur lies.
 
     Parameters
     ----------
@@ -79,6 +80,7 @@ def _errors(
         "object": at_depth.name,
         "mse_bright": error,
         "mse_texture": mean_square_error(plane, texture, region),
+        "mse_plane": mean_square_error(plane, texture),
         "psnr_db": peak_snr_db(error),
     }
 

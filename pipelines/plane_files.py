@@ -1,4 +1,4 @@
-"""A plane as files: TIFF, preview, the record that vouches for both; and its colours until all of them are there."""
+"""A plane as files: TIFFs, preview, the record that vouches for them; and its colours until all of them are there."""
 
 import json
 import zipfile
@@ -19,6 +19,9 @@ from pipelines.tilted import Place, TiltedPlane
 
 # Holds the colours of planes that want others, until the planes are written.
 PARTS = ".parts"
+
+# What may be known of each sample besides its light; each has a file of its own.
+_BESIDE = ("sigma", "opacity")
 
 
 def plane_name(place: Place) -> str:
@@ -55,6 +58,10 @@ class PlaneFiles:
         """Where the plane itself is."""
         return self.folder / f"{plane_name(self.place)}.tiff"
 
+    def path_beside(self, name: str) -> Path:
+        """Return where the standard deviation or the opacity of each sample is."""
+        return self.folder / f"{plane_name(self.place)}_{name}.tiff"
+
     def finished(self) -> dict[str, Any] | None:
         """Return the record of the plane, None unless it and its files are whole and made of what they have to be."""
         return vouched_for(self.path.with_suffix(".json"), self.origin)
@@ -63,28 +70,39 @@ class PlaneFiles:
         """Return the colours that are still to be reconstructed."""
         return [channel for channel in self.channels if self._entry(channel) is None]
 
-    def save_part(self, channel: str, plane: NDArray[np.floating], entry: dict[str, Any]) -> None:
-        """Keep one colour (row, column) until the others are there; `entry` goes into the plane's record."""
+    def save_part(self, channel: str, arrays: dict[str, NDArray[np.floating]], entry: dict[str, Any]) -> None:
+        """Keep one colour until the others are there; `entry` goes into the plane's record.
+
+        `arrays` (row, column) are the `plane`, and what is known besides: `sigma`, `opacity`.
+        """
         content = msgspec.json.encode({"entry": entry, **self.origin})
         with writing(self._part(channel)) as file:
-            np.savez(file, plane=plane, content=np.frombuffer(content, np.uint8))
+            np.savez(file, allow_pickle=False, content=np.frombuffer(content, np.uint8), **arrays)
 
     def finish(self, pitch_mm: float) -> dict[str, Any]:
         """Write the plane and its preview from its colours, then the record that vouches for them, and return that."""
-        colours, entries = [], []
+        parts = []
         for channel in self.channels:
             with np.load(self._part(channel), allow_pickle=False) as part:
-                colours.append(part["plane"])
-                entries.append(msgspec.json.decode(part["content"].tobytes())["entry"])
-        plane = colours[0] if len(colours) == 1 else np.dstack(colours)
+                parts.append(dict(part))
+        entries = [msgspec.json.decode(part["content"].tobytes())["entry"] for part in parts]
+        plane = _together(parts, "plane")
         write_plane(self.path, plane, pitch_mm)
         preview = self.path.with_suffix(".png")
         write_png(preview, grey_levels(plane, white_level(plane)))
+        written = [self.path, preview]
+        for name in _BESIDE:
+            path = self.path_beside(name)
+            if all(name in part for part in parts):
+                write_plane(path, _together(parts, name), pitch_mm)
+                written.append(path)
+            else:
+                path.unlink(missing_ok=True)  # of the plane that was here before
         record = {
             "format": 1,
             "planes": [entry["record"] for entry in entries],
             "focus": [entry["focus"] for entry in entries],
-            "sha256": {path.name: sha256(path) for path in (self.path, preview)},
+            "sha256": {path.name: sha256(path) for path in written},
             **self.origin,
         }
         write_json(self.path.with_suffix(".json"), record)
@@ -115,3 +133,9 @@ def vouched_for(path: Path, origin: dict[str, Any]) -> dict[str, Any] | None:
     except (OSError, MissingFile, ValueError, KeyError, AttributeError):
         return None  # there is none, or it is no use
     return record if whole else None
+
+
+def _together(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:
+    """Return one array of all colours, (row, column[, colour])."""
+    colours = [part[name] for part in parts]
+    return colours[0] if len(colours) == 1 else np.dstack(colours)

@@ -1,23 +1,26 @@
 """One plane of one channel: run a method on it, watch it, and say how it went."""
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.data_fit import DataFit
 from recon.held_out import LEAST_VIEWS, chosen_weight
 from recon.images import ElementalImages, Image, LikelihoodName
 from recon.likelihoods import likelihood_of, negative_log_likelihood
 from recon.one_step_late import Step, oscillates, pmlem_one_step_late, settled, updated_samples
 from recon.operator import PlaneOperator
 from recon.penalties import Penalty, PenaltyName, total_variation
-from recon.pmlem import PmlemIterate, pmlem
-from recon.proximal import DualField
+from recon.pmlem import Dual, PmlemIterate, pmlem
+from recon.posed import PosedPlane, PosedScene
 from recon.solvers import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
+from recon.uncertainty import standard_deviation
 
-type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl"]
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
+
+# Methods that find all planes together, by `pipelines.joint`.
+TOGETHER: tuple[Method, ...] = ("joint", "occlusion")
 
 # Passes over the data that are made at most. MLEM is stopped early on purpose: carried on, it fits the noise.
 _PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
@@ -27,6 +30,9 @@ _SETTLED = 1e-3
 
 # PMLEM is carried on until its plane is this close to the optimum, in root mean square relative to the plane.
 _TOLERANCE = 0.01
+
+# Standard deviations are estimated by draws, the same every time.
+_SEED = 1
 
 # ε of eq. (3) relative to the square of the image's scale; the paper asks for less than 1 %.
 _EPSILON_OF_SCALE = 0.005
@@ -46,20 +52,34 @@ class Settings:
         How pixels are judged; "auto" chooses by their read noise.
     penalty : str
         What PMLEM holds against a plane; one-step-late knows the smoothed total variation of eq. (3) only.
+    uncertainty : bool
+        Whether the standard deviation of PMLEM's planes is asked for.
     """
 
     penalty_weight: float | None = None
     passes: int | None = None
     likelihood: LikelihoodName | Literal["auto"] = "auto"
     penalty: PenaltyName = "tv"
+    uncertainty: bool = False
 
 
 @dataclass(frozen=True)
 class Solution:
-    """A plane (row, column) in expected electrons, and the record of how it came about."""
+    """A plane of one channel.
 
-    plane: NDArray[np.floating]
+    Attributes
+    ----------
+    plane : float array (row, column)
+        In expected electrons.
+    record : dict
+        How it came about.
+    beside : dict of str to float array (row, column)
+        What else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to 1.
+    """
+
+    plane: Image
     record: dict[str, Any]
+    beside: dict[str, Image] = field(default_factory=dict)
 
 
 def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:
@@ -73,20 +93,23 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
     if method == "backprojection":
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
+    if method == "pmlem":
+        return certified(PosedPlane(operator, images), settings)[0]
     start = smooth_start(operator, images)
     images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
-    if method == "pmlem":
-        return _pmlem(operator, images, start, settings)
     return _one_step_late(operator, images, start, method, settings)
 
 
-def _pmlem(operator: PlaneOperator, images: ElementalImages, start: Image, settings: Settings) -> Solution:
-    """Run PMLEM to its certificate."""
-    fit = DataFit(operator, images, _level_e(operator, start))
-    seen = well_seen_samples(fit.sensitivity)
-    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[seen])))
+def certified(posed: PosedPlane | PosedScene, settings: Settings) -> list[Solution]:
+    """Run PMLEM to its certificate, and return the planes; the record of each is that of the one iteration."""
+    start = posed.start()
+    level_e = posed.level_e(start)
+    likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
+    posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
+    fit = posed.fit(level_e)
+    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[posed.well_seen()])))
     penalty = Penalty.for_noise(settings.penalty, noise_e)
-    choice = _chosen(operator, images, start, penalty, settings)
+    choice = _chosen(posed, start, penalty, settings)
     iterates = pmlem(
         fit, choice.start, penalty_weight=choice.weight, penalty=penalty, tolerance=_TOLERANCE, dual=choice.dual
     )
@@ -99,10 +122,18 @@ def _pmlem(operator: PlaneOperator, images: ElementalImages, start: Image, setti
         "passes_before": 1 + choice.passes,
         "penalty_weight_curve": choice.curve,
         "penalty": asdict(penalty),
-        "likelihood": images.likelihood.name,
+        "likelihood": likelihood.name,
         "certificate": _certificate(iterate),
     }
-    return Solution(iterate.plane, record)
+    planes = posed.planes_of(iterate.plane)
+    beside: list[dict[str, Image]] = [{} for _ in planes]
+    if settings.uncertainty:
+        generator = np.random.default_rng(_SEED)
+        for known, plane, metric in zip(beside, planes, posed.metrics(level_e, iterate.plane), strict=True):
+            known["sigma"] = standard_deviation(plane, metric, choice.weight, penalty, generator)
+    return [
+        Solution(plane, record | {"mean_e": mean_e(plane)}, known) for plane, known in zip(planes, beside, strict=True)
+    ]
 
 
 def _certificate(iterate: PmlemIterate) -> dict[str, Any]:
@@ -128,23 +159,21 @@ class _Choice:
     weight: float
     how: str
     start: Image
-    dual: DualField | None = None
+    dual: Dual
     passes: float = 0.0
     curve: list[dict[str, float]] | None = None
 
 
-def _chosen(
-    operator: PlaneOperator, images: ElementalImages, start: Image, penalty: Penalty, settings: Settings
-) -> _Choice:
+def _chosen(posed: PosedPlane | PosedScene, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
     """Return the penalty weight for PMLEM."""
     if settings.penalty == "none":
-        return _Choice(0.0, "none: no penalty", start)
+        return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
-        return _Choice(settings.penalty_weight, "given", start)
-    guess = universal_penalty_weight(operator, images, start)
-    if len(operator.all_views) < LEAST_VIEWS:
-        return _Choice(guess, "from the noise level: too few views to hold some out", start)
-    found = chosen_weight(operator, images, guess, penalty)
+        return _Choice(settings.penalty_weight, "given", start, posed.dual())
+    guess = posed.usual_weight(start)
+    if len(posed.views) < LEAST_VIEWS:
+        return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
+    found = chosen_weight(posed, guess, penalty)
     curve = [{"weight": tried.weight, "held_out": tried.held_out} for tried in found.tried]
     nearest = np.maximum(found.nearest.plane, 1e-3 * start)
     return _Choice(found.weight, "predicts held-out views best", nearest, found.nearest.dual, found.passes, curve)
@@ -208,5 +237,10 @@ def _record(
         "passes": passes,
         "objective": objective,
         "certificate": None,
-        "mean_e": float(np.mean(plane, dtype=np.float64)),
+        "mean_e": mean_e(plane),
     }
+
+
+def mean_e(plane: Image) -> float:
+    """Return the mean of a plane, summed in float64."""
+    return float(np.mean(plane, dtype=np.float64))

@@ -23,7 +23,7 @@ from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
 from pipelines.plane_files import PARTS, PlaneFiles
-from pipelines.planes import Method, Settings
+from pipelines.planes import TOGETHER, Method, Settings
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
@@ -87,9 +87,12 @@ def reconstruct(
     plane_pose: list[Path] | None = None,
     depth_map: bool = False,
     method: list[Method] | None = None,
+    joint: bool = False,
+    occlusion: bool = False,
     penalty_weight: NotNegative | Literal["auto"] = "auto",
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
+    uncertainty: bool = False,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     geometry: Path | None = None,
@@ -126,8 +129,12 @@ def reconstruct(
         From the sweep also how far away each pixel is, with the probability of that, and a picture that is sharp
         everywhere.
     method
-        pmlem (the default; to its optimum, certified), pmlem-osl and mlem (the paper's iterations), or backprojection;
-        give it once per method.
+        pmlem (the default; to its optimum, certified), joint and occlusion (the same for all planes together),
+        pmlem-osl and mlem (the paper's iterations), or backprojection; give it once per method.
+    joint
+        Short for --method joint: all planes are found together, so that none holds the blur of what stands in another.
+    occlusion
+        Short for --method occlusion: all planes together, and the nearer ones hide what is behind them.
     penalty_weight
         The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
         predict those held out, for pmlem-osl one from the noise level.
@@ -137,6 +144,9 @@ def reconstruct(
     likelihood
         How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
         above, which is faster. poisson ignores read noise; least-squares knows no counts.
+    uncertainty
+        Save the standard deviation of each sample beside the planes of pmlem and joint; see docs/physics.md for what
+        it covers.
     passes
         At most this many passes over the data.
     pitch_mm
@@ -158,6 +168,8 @@ def reconstruct(
         )
     if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
+    if plane_pose and (occlusion or "occlusion" in (method or [])):
+        raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
     tilted = [plane for path in plane_pose or [] for plane in read_plane_poses(path)]
@@ -179,10 +191,12 @@ def reconstruct(
     if depth_map:
         require_sweep(depths)
     weight = None if penalty_weight == "auto" else penalty_weight
-    settings = Settings(weight, passes, likelihood, penalty)
+    settings = Settings(weight, passes, likelihood, penalty, uncertainty)
+    asked: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
+    methods = [*(method or []), *(name for name, wanted in asked.items() if wanted)] or [DEFAULT_METHOD]
     request = Request(
         depths,
-        method or [DEFAULT_METHOD],
+        methods,
         settings,
         pitch_mm,
         with_focus=bool(swept or swept_px) and found is None,
@@ -276,7 +290,7 @@ def _sweep(loaded: LoadedSet, folders: dict[Method, Path], request: Request) -> 
 
     channels = tuple(layout.name for layout in layouts)
     files = [
-        PlaneFiles(folder, name, place, channels, origin(name, _only(request, place)))
+        PlaneFiles(folder, name, place, channels, origin(name, _made_with(request, name, place)))
         for place in grids
         for name, folder in folders.items()
     ]
@@ -284,8 +298,10 @@ def _sweep(loaded: LoadedSet, folders: dict[Method, Path], request: Request) -> 
     return Sweep(loaded, grids, files, origins, request.settings, with_focus=request.with_focus)
 
 
-def _only(request: Request, place: Place) -> Request:
-    """Return the part of a request that one plane is made of."""
+def _made_with(request: Request, method: Method, place: Place) -> Request:
+    """Return the part of a request that one plane is made of: all planes by methods that find them together."""
+    if method in TOGETHER:
+        return replace(request, with_depth_map=False)
     alone: dict[str, Any] = (
         {"depths_mm": [], "tilted": [place]} if isinstance(place, TiltedPlane) else {"depths_mm": [place], "tilted": []}
     )
@@ -305,6 +321,7 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
         "penalty_weight": "auto" if request.settings.penalty_weight is None else request.settings.penalty_weight,
         "penalty": request.settings.penalty,
         "likelihood": request.settings.likelihood,
+        "uncertainty": request.settings.uncertainty,
         "passes": request.settings.passes,
         "pitch_mm": request.pitch_mm,
         "focus": request.with_focus,
@@ -329,7 +346,7 @@ def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
 
 def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
     """Tell of planes whose certificate is not what was asked for."""
-    certificates = [record["certificate"] for record in records if record["method"] == "pmlem"]
+    certificates = [record["certificate"] for record in records if record["method"] in ("pmlem", *TOGETHER)]
     missed = [certificate["value"] for certificate in certificates if not certificate["reached"]]
     if missed:
         say(

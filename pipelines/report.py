@@ -30,6 +30,7 @@ from pipelines.report_planes import (
     shared_white,
     shown_depths,
     side_by_side,
+    sigmas,
     slider,
     weight_curves,
 )
@@ -121,7 +122,7 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
 
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return what the page says of the planes: the best, all side by side, on sliders, and where they are sharp."""
-    planes = read_planes(directory, results, RECONSTRUCTION_FILE)
+    planes = read_planes(directory, results)
     depths = sorted({plane.depth_mm for plane in planes if not plane.name})
     places = len({plane.place for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
@@ -146,6 +147,7 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
         "rows": rows,
         "slider": slider(planes, titles, white) if places > 1 or len(columns) > 1 else None,
         "slider_column": place,
+        "sigmas": sigmas(planes, titles, shown_depths(depths, focus)),
         "slider_depth": first_depth([depth for depth, _ in sorted({plane.place for plane in planes})], focus),
         "depths": places,
         "white": white,

@@ -29,6 +29,8 @@ METHOD_NAMES = {
     "mlem": "MLEM",
     "pmlem-osl": "PMLEM (one-step-late, TV)",
     "pmlem": "PMLEM",
+    "joint": "PMLEM, all planes together",
+    "occlusion": "PMLEM, all planes together, with occlusion",
 }
 
 
@@ -57,8 +59,13 @@ class Plane:
         """Return the plane (row, column[, colour]) in electrons."""
         return read_frame(self.path).pixels_dn
 
+    def sigma_e(self) -> NDArray[Any] | None:
+        """Return the standard deviation of each sample, None where none was asked for."""
+        name = self.records[0].get("sigma_file")
+        return None if name is None else read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn
 
-def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_file: str) -> list[Plane]:
+
+def read_planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[Plane]:
     """Return all planes, in the order of folders and depths; a colour plane has one record per channel."""
     planes = []
     for folder, result in results.items():
@@ -68,8 +75,7 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_fil
         where = folder.relative_to(directory)
         for name, records in by_file.items():
             path = folder / Path(name).name
-            if not path.is_file():
-                raise MissingFile(f"{path}: is recorded in {folder / record_file} but missing; reconstruct again")
+            existing(path)
             method = records[0]["method"]
             # The folder of a method says no more than its name, and that of a session's reconstructions nothing.
             parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
@@ -84,6 +90,13 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]], record_fil
             methods.index(plane.method) if plane.method in methods else len(methods),
         ),
     )
+
+
+def existing(path: Path) -> Path:
+    """Return the path of a file that reconstruction.json names, and refuse one that is not there (MissingFile)."""
+    if not path.is_file():
+        raise MissingFile(f"{path}: is recorded in reconstruction.json but missing; reconstruct again")
+    return path
 
 
 def _poses(result: dict[str, Any]) -> str:
@@ -108,7 +121,7 @@ def column_titles(planes: list[Plane]) -> dict[str, str]:
 
 def best_column(planes: list[Plane]) -> str:
     """Return the column that a report leads with: of measured poses, where there are any, by the foremost method."""
-    methods = ("pmlem", "pmlem-osl", "mlem", "backprojection")
+    methods = ("occlusion", "joint", "pmlem", "pmlem-osl", "mlem", "backprojection")
     poses = ("measured", "stated", "nominal", "true")
     ranks = {p.column: (poses.index(p.poses), methods.index(p.method) if p.method in methods else 9) for p in planes}
     return min(ranks, key=lambda column: ranks[column])
@@ -141,6 +154,25 @@ def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], w
         cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
         rows.append({"words": _words(*place), "cells": cells})
     return rows
+
+
+def sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) -> dict[str, Any] | None:
+    """Return the standard deviations as pictures on one scale of their own, None where none were asked for."""
+    ordered = sorted(planes, key=lambda plane: plane.depth_mm)
+    known = [(plane, plane.sigma_e()) for plane in ordered if plane.depth_mm in depths]
+    found = [(plane, sigma) for plane, sigma in known if sigma is not None]
+    if not found:
+        return None
+    white = max(white_level(sigma) for _, sigma in found)
+    pictures = [
+        {
+            "title": f"{titles[plane.column]}, {plane.depth_mm:g} mm",
+            "median_e": float(np.median(sigma)),
+            "src": _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
+        }
+        for plane, sigma in found
+    ]
+    return {"white": white, "pictures": pictures}
 
 
 def slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[dict[str, Any]]:

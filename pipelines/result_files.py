@@ -22,6 +22,8 @@ class Record(msgspec.Struct):
     passes: int
     flux_e: float
     certificate: dict[str, Any] | None
+    sigma_file: str | None = None
+    opacity_file: str | None = None
 
 
 class Focus(msgspec.Struct):
@@ -66,6 +68,7 @@ class ErrorRow(msgspec.Struct):
     mse_bright: float
     mse_texture: float
     psnr_db: float | None
+    mse_plane: float | None = None
 
 
 class Errors(msgspec.Struct):

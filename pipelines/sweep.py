@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from pipelines.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel
 from pipelines.console import progress, say
 from pipelines.elemental_set import LoadedSet
+from pipelines.joint import solve_together
 from pipelines.large_arrays import memory_or_file
 from pipelines.plane_files import PlaneFiles
-from pipelines.planes import Method, Settings, solve
+from pipelines.planes import TOGETHER, Method, Settings, Solution, solve
 from pipelines.tilted import Place, TiltedPlane, words_of
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
@@ -27,16 +28,16 @@ from recon.plane import PlaneGrid
 class PlaneTask:
     """One colour of one plane, by the methods by which it is not there yet: paths and options, no pixels.
 
+    By methods that find all planes together, one colour of all planes.
+
     Attributes
     ----------
     layout : ChannelLayout
         The colour.
-    place : Place
-        The plane's depth in mm, or its pose.
-    grid : PlaneGrid
-        Its samples.
+    grids : dict of Place to PlaneGrid
+        The samples of each plane.
     files : tuple of PlaneFiles
-        Where the result of each method goes.
+        Where the result of each method and plane goes.
     settings : Settings
         Of the methods.
     with_focus : bool
@@ -44,8 +45,7 @@ class PlaneTask:
     """
 
     layout: ChannelLayout
-    place: Place
-    grid: PlaneGrid
+    grids: dict[Place, PlaneGrid]
     files: tuple[PlaneFiles, ...]
     settings: Settings
     with_focus: bool
@@ -68,38 +68,51 @@ class Channel:
         GeometryMismatch, NotConverged
             Of the task's depth, or method.
         """
-        operator = self._operator(task)
-        focus = focus_measure(operator, self._images, self._halves())._asdict() if task.with_focus else None
+        words: list[str] = []
+        focus: dict[Place, dict[str, Any] | None] = dict.fromkeys(task.grids)
+        for place, grid in task.grids.items():
+            operator = self._operator(place, grid)
+            words += self._blind_views(operator, place)
+            if task.with_focus:
+                focus[place] = focus_measure(operator, self._images, self._halves())._asdict()
+            for files in task.files:
+                if files.method not in TOGETHER and files.place == place:
+                    self._save(task, files, solve(operator, self._images, files.method, task.settings), focus[place])
+        together = [method for method in TOGETHER if any(files.method == method for files in task.files)]
+        solved = solve_together(self._factory, self._images, task.grids, together, task.settings) if together else {}
         for files in task.files:
-            solution = solve(operator, self._images, files.method, task.settings)
-            flux_e = float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(task)
-            record = {
-                **_where(task.place),
-                "method": files.method,
-                "channel": task.layout.name,
-                "file": files.path.name,
-                **asdict(task.grid),
-                **solution.record,
-                "flux_e": flux_e,
-            }
-            files.save_part(task.layout.name, solution.plane, {"record": record, "focus": focus})
-        return self._blind_views(operator, task.place)
+            if files.method in together:
+                self._save(task, files, solved[files.method][files.place], focus[files.place])
+        return words
 
-    def _operator(self, task: PlaneTask) -> PlaneOperator:
+    def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         try:
-            if isinstance(task.place, TiltedPlane):
-                return self._factory.at_pose(np.array(task.place.rt_ref_plane), task.grid)
-            return self._factory.at_depth(task.place, task.grid)
+            return self._factory.at(place, grid)
         except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {words_of(task.place)}: {failure}") from failure
+            raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
 
-    def _samples_per_px(self, task: PlaneTask) -> float:
+    def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: dict[str, Any] | None) -> None:
+        """Save one plane of this colour with its entry."""
+        grid = task.grids[files.place]
+        record = {
+            **_where(files.place),
+            "method": files.method,
+            "channel": task.layout.name,
+            "file": files.path.name,
+            **asdict(grid),
+            **solution.record,
+            "flux_e": float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(files.place, grid),
+            **{f"{name}_file": files.path_beside(name).name for name in solution.beside},
+        }
+        arrays = {"plane": solution.plane, **solution.beside}
+        files.save_part(task.layout.name, arrays, {"record": record, "focus": focus})
+
+    def _samples_per_px(self, place: Place, grid: PlaneGrid) -> float:
         """Return how many pixels of the reference view a sample takes, on the axis."""
-        place = task.place
         depth_mm, foreshortened = (
             (place.depth_mm, abs(place.normal[2])) if isinstance(place, TiltedPlane) else (place, 1.0)
         )
-        return float((task.grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_mm) ** 2 * foreshortened)
+        return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_mm) ** 2 * foreshortened)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
@@ -177,8 +190,9 @@ class Sweep:
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
-        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self.origins)
-        return samples * len(self._layouts) * (np.dtype(np.float32).itemsize + 3)
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self._layouts)
+        files = len(self.origins) * (2 if self._settings.uncertainty else 1) + ("occlusion" in self.origins)
+        return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, crew: Crew, out: Path) -> None:
         """Have the tasks done that are not, and finish each plane at once."""
@@ -198,16 +212,17 @@ class Sweep:
     def _tasks(self) -> list[PlaneTask]:
         """Return what is to be done, one channel after the other."""
         wanted = [files for files in self._files if (files.method, files.place) not in self._finished]
-        missing = {(files.method, files.place): files.missing() for files in wanted}
+        missing = [files.missing() for files in wanted]
         tasks = []
         for layout in self._layouts:
+            left = [files for files, channels in zip(wanted, missing, strict=True) if layout.name in channels]
+            alone = [files for files in left if files.method not in TOGETHER]
             for place, grid in self._grids.items():
-                left = tuple(
-                    files for files in wanted if files.place == place and layout.name in missing[files.method, place]
-                )
-                if left:
-                    tasks.append(PlaneTask(layout, place, grid, left, self._settings, self._with_focus))
-        return tasks
+                of_plane = tuple(files for files in alone if files.place == place)
+                tasks.append(PlaneTask(layout, {place: grid}, of_plane, self._settings, self._with_focus))
+            together = tuple(files for files in left if files.method in TOGETHER)
+            tasks.append(PlaneTask(layout, self._grids, together, self._settings, self._with_focus))
+        return [task for task in tasks if task.files]
 
     def _finish_whole(self, candidates: Sequence[PlaneFiles]) -> None:
         """Write the planes whose colours are complete."""

@@ -168,6 +168,11 @@ def tilted_grid(loaded: LoadedSet, plane: TiltedPlane, pitch_mm: float) -> Plane
         raise GeometryMismatch(f"plane '{plane.name}': {failure}") from failure
 
 
+def depth_of(place: Place) -> float:
+    """Return where the axis of the reference camera meets a plane, in mm."""
+    return place.depth_mm if isinstance(place, TiltedPlane) else place
+
+
 def words_of(place: Place) -> str:
     """Return what messages call a plane."""
     return f"'{place.name}'" if isinstance(place, TiltedPlane) else f"{place:g} mm"

@@ -6,12 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.data_fit import DataFit
-from recon.images import ElementalImages
-from recon.operator import PlaneOperator
 from recon.penalties import Penalty
 from recon.pmlem import PmlemIterate, pmlem
-from recon.solvers import smooth_start
+from recon.posed import Posed
 
 # One view in so many is held out.
 _HELD_OUT = 7
@@ -84,7 +81,7 @@ def _folds(views: int) -> int:
     return max(2, min(_HELD_OUT, views // 2))
 
 
-def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float, penalty: Penalty) -> ChosenWeight:
+def chosen_weight(posed: Posed, guess: float, penalty: Penalty) -> ChosenWeight:
     """Return the penalty weight under which the views that are kept best predict those held out.
 
     Candidates are tried from a larger weight to smaller ones, each starting from the solution of the one before, until
@@ -92,6 +89,8 @@ def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float
 
     Parameters
     ----------
+    posed : Posed
+        The plane, or the planes together.
     guess : float
         A weight to start from, for all views.
 
@@ -105,13 +104,13 @@ def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float
     The data's part of the objective grows with the number of views n and its noise with √n; a weight that balances
     that noise belongs to n views, and is carried over to all of them by the ratio of the roots.
     """
-    count = len(operator.all_views)
+    count = len(posed.views)
     if count < LEAST_VIEWS:
         raise ValueError(f"need at least {LEAST_VIEWS} views to hold some out, got {count}")
-    pixels_of_fold = images.electrons.size / _folds(count)
+    pixels_of_fold = posed.images.electrons.size / _folds(count)
     needed = min(int(np.ceil(_LEAST_PREDICTED / pixels_of_fold)), _folds(count))
     outs = [held_out_views(count, fold) for fold in range(needed)]
-    search = _Search([_Fold(operator, images, penalty, out) for out in outs], guess)
+    search = _Search([_Fold(posed, penalty, out) for out in outs], guess)
     step = 1
     search.score(step)
     while step > -_STEPS and search.best() <= step + 1:
@@ -127,15 +126,13 @@ def chosen_weight(operator: PlaneOperator, images: ElementalImages, guess: float
 class _Fold:
     """The views that are kept, those held out, and the solutions so far."""
 
-    def __init__(
-        self, operator: PlaneOperator, images: ElementalImages, penalty: Penalty, out: NDArray[np.intp]
-    ) -> None:
-        kept = np.setdiff1d(operator.all_views, out)
-        self._start = smooth_start(operator, images, kept)
-        level_e = float(self._start.mean(dtype=np.float64))
-        self._kept, self._out = (DataFit(operator, images, level_e, views) for views in (kept, out))
-        self._penalty = penalty
-        self._share = len(kept) / len(operator.all_views)
+    def __init__(self, posed: Posed, penalty: Penalty, out: NDArray[np.intp]) -> None:
+        kept = np.setdiff1d(posed.views, out)
+        self._start = posed.start(kept)
+        level_e = posed.level_e(self._start)
+        self._kept, self._out = (posed.fit(level_e, views) for views in (kept, out))
+        self._smooth_dual, self._penalty = posed.dual, penalty
+        self._share = len(kept) / len(posed.views)
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
 
@@ -148,7 +145,7 @@ class _Fold:
             penalty_weight=weight * self._share**0.5,
             penalty=self._penalty,
             tolerance=_TOLERANCE,
-            dual=None if near is None else near.dual,
+            dual=self._smooth_dual() if near is None else near.dual,
         )
         for iterate in iterates:
             if iterate.certificate.distance <= _TOLERANCE or iterate.passes >= _PASSES:

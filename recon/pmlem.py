@@ -5,7 +5,7 @@ whose metric w is nearly L's curvature, and finds the least of that and the pena
 work is thus done on the plane, where it is cheap, and few passes over the data are needed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,7 +14,7 @@ import numpy as np
 from recon.errors import NotConverged
 from recon.images import Image
 from recon.penalties import Penalty
-from recon.proximal import DualField
+from recon.proximal import DualField, Nearest
 
 # An inner problem is solved until what is left of it is this part of the last step, or of the tolerance.
 _INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.1, 0.5
@@ -48,6 +48,24 @@ class Fit(Protocol):
 
     def metric(self, plane: Image, /) -> Image:
         """Return a positive diagonal that is about as large as the curvature of L near a plane, or larger."""
+
+
+class Dual(Protocol):
+    """The penalty's dual field: `recon.proximal.DualField` of a plane, `recon.scene_dual.SceneDual` of several."""
+
+    def copy(self) -> "Dual":
+        """Return a copy that can be changed without changing this one."""
+
+    def plane(self, centre: Image, reach: Image) -> Image:
+        """Return `v − β/w ∇ᵀp`, not clipped at zero."""
+
+    def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
+        """Return `Σ φ(|∇x|)` and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`."""
+
+    def nearest(
+        self, centre: Image, metric: Image, weight: float, penalty: Penalty, enough: Callable[[Image], float], most: int
+    ) -> Nearest:
+        """Solve `min ½ Σ w (x − v)² + β Σ φ(|∇x|)` over x ≥ 0."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +106,7 @@ class PmlemIterate:
         Sweeps over the data so far.
     inner_steps : int
         Steps on the dual field so far.
-    dual : DualField
+    dual : Dual
         The penalty's dual field, to start a similar problem from.
     """
 
@@ -97,7 +115,7 @@ class PmlemIterate:
     certificate: Certificate
     passes: int
     inner_steps: int
-    dual: DualField
+    dual: Dual
 
 
 def pmlem(
@@ -107,7 +125,7 @@ def pmlem(
     penalty_weight: float,
     penalty: Penalty | None = None,
     tolerance: float = 0.01,
-    dual: DualField | None = None,
+    dual: Dual | None = None,
 ) -> Iterator[PmlemIterate]:
     """Yield planes of ever lower objective, each with its certificate; when to stop is the caller's business.
 
@@ -126,8 +144,8 @@ def pmlem(
         Total variation by default.
     tolerance : float
         The distance that the caller is after: inner problems are solved no better than it takes.
-    dual : DualField, optional
-        That of a similar problem; a copy is used.
+    dual : Dual, optional
+        That of a similar problem, of which a copy is used; by default that of one plane without roughness.
 
     Raises
     ------
@@ -143,7 +161,7 @@ def pmlem(
     penalty = penalty or Penalty()
     if penalty_weight == 0 or penalty.name == "none":
         penalty_weight, penalty = 0.0, Penalty("none")
-    dual = DualField.zero(start.shape, start.dtype) if dual is None else dual.copy()
+    dual = DualField.zero((start.shape[0], start.shape[1]), start.dtype) if dual is None else dual.copy()
     return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
@@ -155,7 +173,7 @@ class _Pmlem:
         self._scale = 1.0
         self._inner_steps = 0
 
-    def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
+    def iterates(self, plane: Image, dual: Dual) -> Iterator[PmlemIterate]:
         """Iterate for ever."""
         metric = self._fit.metric(plane)
         accepted: PmlemIterate | None = None
@@ -182,7 +200,7 @@ class _Pmlem:
                 yield accepted  # no step leads further down: as far as these numbers go
             plane, dual = self._step(accepted, gradient, metric)
 
-    def _step(self, here: PmlemIterate, gradient: Image, metric: Image) -> tuple[Image, DualField]:
+    def _step(self, here: PmlemIterate, gradient: Image, metric: Image) -> tuple[Image, Dual]:
         """Return the least of the quadratic and the penalty, and its dual field."""
         scaled = metric * metric.dtype.type(self._scale)
         centre = here.plane - gradient / scaled
@@ -203,7 +221,7 @@ class _Pmlem:
             np.maximum(plane, here.plane.dtype.type(_FALL) * here.plane, out=plane)
         return plane, dual
 
-    def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:
+    def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: Dual) -> Certificate:
         """Return how far a plane is from the optimum, in the metric it was found with."""
         reach = plane.dtype.type(self._weight) / metric
         after = dual.plane(plane - gradient / metric, reach)
@@ -217,4 +235,4 @@ class _Pmlem:
 
 def norm(plane: Image, metric: Image) -> float:
     """Return √ Σ w x², summed in float64."""
-    return float(np.sqrt(np.einsum("ij,ij,ij->", metric, plane, plane, dtype=np.float64)))
+    return float(np.sqrt(np.einsum("i,i,i->", metric.ravel(), plane.ravel(), plane.ravel(), dtype=np.float64)))

@@ -80,7 +80,7 @@ class SceneOperator:
         seen = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
         image_of_view = np.zeros(self.images_shape[0], np.intp)
         image_of_view[chosen] = np.arange(len(chosen))
-        self._sweep(kernels.FORWARD, chosen, image_of_view, planes=self._samples(planes), seen=seen)
+        self._sweep(kernels.FORWARD, chosen, image_of_view, planes=self.samples_of(planes), seen=seen)
         return seen
 
     def adjoint(self, images: Image, views: Views = None) -> list[Image]:
@@ -128,7 +128,7 @@ class SceneOperator:
             _read_only(self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0)),
             likelihood.level_e,
         )
-        samples, electrons, chosen = self._samples(planes), self._images(images.electrons), self._views(views)
+        samples, electrons, chosen = self.samples_of(planes), self._images(images.electrons), self._views(views)
         return self._sweep(operation, chosen, self.all_views, planes=samples, images=electrons, pixels=pixels)
 
     def _sweep(
@@ -168,15 +168,19 @@ class SceneOperator:
         _on_all(work, self._workers)
         for other in sums[1:]:
             sums[0] += other
-        return sum(values), self._of_planes(sums[0]) if scatters else []
+        return sum(values), self.planes_of(sums[0]) if scatters else []
 
-    def _of_planes(self, samples: Image) -> list[Image]:
-        """Return each plane (row, column) of all samples."""
+    def planes_of[Number: np.generic](self, samples: NDArray[Number]) -> list[NDArray[Number]]:
+        """Return each plane (row, column) of all samples (sample,), which lie one plane after the other."""
         parts = np.split(samples, self._geometry.layout[1:, 0])
         return [part.reshape(grid.shape) for part, grid in zip(parts, self.grids, strict=True)]
 
-    def _samples(self, planes: Sequence[Image]) -> Image:
-        """Return all planes, one after the other; a single one is not copied."""
+    def map_of_views(self, value: float | Image, views: NDArray[np.intp]) -> float | Image:
+        """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
+        return value if np.ndim(value) == 0 else self._map(value)[self._geometry.lattice_of_view[views]]
+
+    def samples_of(self, planes: Sequence[Image]) -> Image:
+        """Return all planes (sample,), one after the other; a single one is not copied."""
         if [plane.shape for plane in planes] != [grid.shape for grid in self.grids]:
             shapes = " and ".join(str(plane.shape) for plane in planes)
             wanted = " and ".join(str(grid.shape) for grid in self.grids)

@@ -10,10 +10,10 @@ from recon.operator import PlaneOperator
 from recon.smoothing import blurred
 
 # A standard deviation of 2 samples.
-_START_BLUR = (1, 1, 1, 1, 2)
+START_BLUR = (1, 1, 1, 1, 2)
 
 # Where the mean of the views is not positive there is no light to speak of.
-_LEAST_LEVEL_E = 1e-6
+LEAST_LEVEL_E = 1e-6
 
 
 def back_projection(
@@ -39,10 +39,10 @@ def smooth_start(
     """
     coverage = operator.coverage(views)
     light = operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
-    level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), _LEAST_LEVEL_E)
-    coverage = blurred(coverage, _START_BLUR)
+    level = max(float(light.sum(dtype=np.float64) / coverage.sum(dtype=np.float64)), LEAST_LEVEL_E)
+    coverage = blurred(coverage, START_BLUR)
     start = np.full_like(light, level)
-    np.divide(blurred(light, _START_BLUR), coverage, out=start, where=coverage > 1e-3 * coverage.max())
+    np.divide(blurred(light, START_BLUR), coverage, out=start, where=coverage > 1e-3 * coverage.max())
     return np.asarray(np.maximum(start, 0.01 * level, out=start))
 
 
@@ -58,7 +58,11 @@ def universal_penalty_weight(operator: PlaneOperator, images: ElementalImages, p
     is of the order of one, so this weight removes fluctuations of about that size. It is a starting point that needs no
     tuning, not the best weight for a scene.
     """
-    sensitivity = operator.sensitivity()
+    return universal_weight(operator.sensitivity(), images, plane)
+
+
+def universal_weight(sensitivity: Image, images: ElementalImages, plane: Image) -> float:
+    """Return `universal_penalty_weight` for samples of any shape whose sensitivity is known."""
     seen = well_seen_samples(sensitivity)
     per_view_e = plane[seen].mean() + np.mean(images.known_variance_e2())
     return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from pipelines.frames import read_frame
-from pipelines.planes import Method
+from pipelines.planes import TOGETHER, Method
 
-METHODS = get_args(Method.__value__)
+METHODS = [method for method in get_args(Method.__value__) if method not in TOGETHER]
 _ROOT = Path(__file__).parents[2]
 _MAIN = "from pipelines.cli import main; main({words!r})"
 

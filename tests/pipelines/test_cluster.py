@@ -61,7 +61,7 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
 
     def killing(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         for task, words in crew(loaded, out, tasks):
-            done.append(task.place)
+            done.extend(task.grids)
             if len(done) == 1:
                 _kill_one_that_works(cluster)
             yield task, words

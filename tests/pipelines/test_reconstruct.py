@@ -214,7 +214,7 @@ def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done:
     total = tifffile.imread(tmp_path / "out" / plane["file"]).sum(dtype=float)
     assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
     stated = {"method": "pmlem", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
-    others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "focus": False}
+    others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "uncertainty": False, "focus": False}
     others |= {"depth_map": None, "plane_pose": {}}
     assert record["options"] == stated | others
 

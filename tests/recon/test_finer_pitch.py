@@ -10,6 +10,7 @@ from recon.operator import PlaneOperator
 from recon.penalties import Penalty
 from recon.plane import PlaneGrid
 from recon.pmlem import pmlem
+from recon.posed import PosedPlane
 from recon.solvers import smooth_start, universal_penalty_weight
 
 SIZE = 48
@@ -28,7 +29,9 @@ def reconstructed(images: ElementalImages, shifts: Image, pitch: float) -> Image
     samples = int(SIZE / pitch)
     operator = PlaneOperator(homographies, rays, PlaneGrid((samples, samples), pitch, (0.0, 0.0)))
     start = smooth_start(operator, images)
-    weight = chosen_weight(operator, images, universal_penalty_weight(operator, images, start), Penalty()).weight
+    weight = chosen_weight(
+        PosedPlane(operator, images), universal_penalty_weight(operator, images, start), Penalty()
+    ).weight
     for iterate in pmlem(DataFit(operator, images, float(start.mean())), start, penalty_weight=weight):
         if iterate.certificate.distance < 0.01 or iterate.passes >= 25:
             break

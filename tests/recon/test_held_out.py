@@ -10,6 +10,7 @@ from recon.operator import PlaneOperator
 from recon.penalties import Penalty
 from recon.plane import PlaneGrid
 from recon.pmlem import pmlem
+from recon.posed import PosedPlane
 from recon.solvers import smooth_start, universal_penalty_weight
 
 
@@ -58,7 +59,7 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
                 break
         return float(np.mean((iterate.plane - truth)[8:-8, 8:-8] ** 2))
 
-    chosen = chosen_weight(operator, images, guess / 3, Penalty())  # a guess that is far off
+    chosen = chosen_weight(PosedPlane(operator, images), guess / 3, Penalty())  # a guess that is far off
     best = min(error(guess * 2 ** (step / 2)) for step in range(-3, 4))
     assert error(chosen.weight) <= 1.1 * best
     scores = {tried.weight: tried.held_out for tried in chosen.tried}
@@ -70,4 +71,4 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
 def test_too_few_views_are_refused() -> None:
     few = PlaneOperator(np.stack([np.eye(3)] * 3), np.zeros((4, 4, 2)), PlaneGrid((4, 4), 1.0, (0.0, 0.0)))
     with pytest.raises(ValueError, match="at least 4 views"):
-        chosen_weight(few, ElementalImages(np.ones((3, 4, 4))), 1.0, Penalty())
+        chosen_weight(PosedPlane(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())

@@ -1,0 +1,87 @@
+"""All planes of a scene together, in one channel: g = Σ_z H_z f_z + b, or with what nearer ones hide of farther."""
+
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from typing import Any
+
+from pipelines.channels import OperatorFactory
+from pipelines.console import say
+from pipelines.planes import Method, Settings, Solution, certified, mean_e
+from pipelines.tilted import Place, depth_of
+from recon.errors import GeometryMismatch
+from recon.images import ElementalImages
+from recon.occlusion import opacity, transmission
+from recon.plane import PlaneGrid
+from recon.posed import PosedScene
+from recon.scene import SceneOperator
+
+
+def solve_together(
+    factory: OperatorFactory,
+    images: ElementalImages,
+    grids: Mapping[Place, PlaneGrid],
+    methods: Collection[Method],
+    settings: Settings,
+) -> dict[Method, dict[Place, Solution]]:
+    """Reconstruct all planes of one channel together, so that none has to explain the light of the others.
+
+    Parameters
+    ----------
+    grids : mapping of Place to PlaneGrid
+        The samples of each plane.
+    methods : collection of Method
+        "joint", "occlusion" or both: by the latter planes hide those behind them, where that explains the images
+        better.
+
+    Returns
+    -------
+    dict of Method to dict of Place to Solution
+        By method and plane. All records tell of one iteration: its penalty weight, passes, objective and certificate.
+    """
+    operator = factory.of_scene(grids)
+    joint = certified(PosedScene(operator, images), settings)
+    found: dict[Method, list[Solution]] = {"joint": joint}
+    if "occlusion" in methods:
+        found["occlusion"] = _with_occlusion(factory, operator, images, grids, joint, settings)
+    return {method: dict(zip(grids, found[method], strict=True)) for method in methods}
+
+
+def _with_occlusion(
+    factory: OperatorFactory,
+    operator: SceneOperator,
+    images: ElementalImages,
+    grids: Mapping[Place, PlaneGrid],
+    joint: list[Solution],
+    settings: Settings,
+) -> list[Solution]:
+    """Find opacity from the planes, and the light once more behind it, with the penalty weight found without.
+
+    What is written of each plane is `α f`: where a plane lets through what is behind it, it is not there, and has no
+    light of its own. The certificate is that of f.
+    """
+    chosen = {key: joint[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
+    settings = replace(settings, penalty_weight=joint[0].record["penalty_weight"])
+    hidden = transmission(operator, [opacity(one.plane) for one in joint], [depth_of(place) for place in grids])
+    try:
+        occluded = factory.of_scene(grids, hidden)
+    except GeometryMismatch:
+        return _without_occlusion(joint, "a plane would be hidden from all views")
+    better = certified(PosedScene(occluded, images), settings)
+    if better[0].record["objective"] >= joint[0].record["objective"]:
+        return _without_occlusion(joint, "it explains the images no better")
+    return [_of_what_is_there(one, chosen) for one in better]
+
+
+def _of_what_is_there(one: Solution, record: dict[str, Any]) -> Solution:
+    """Return a plane as `α f`, with α beside it."""
+    alpha = opacity(one.plane)
+    plane = alpha * one.plane
+    return Solution(
+        plane, one.record | record | {"mean_e": mean_e(plane), "occlusion": True}, one.beside | {"opacity": alpha}
+    )
+
+
+def _without_occlusion(joint: list[Solution], why: str) -> list[Solution]:
+    """Return the planes as they are, and say so."""
+    say(f"occlusion is left out: {why}; the planes are those of joint")
+    return [replace(one, record=one.record | {"occlusion": False}) for one in joint]

@@ -1,0 +1,74 @@
+"""Planes found together: nearer the truth than each alone, and as files no different from other planes."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import numba
+import numpy as np
+import pytest
+import tifffile
+
+type Command = Callable[..., CompletedProcess[str]]
+
+BOTH = ("--depth-mm", 500, "--depth-mm", 700)
+
+
+def _errors(folder: Path) -> dict[str, float]:
+    """Return the mean over both planes of their error over the whole plane, by method."""
+    rows = json.loads((folder / "metrics.json").read_text())["planes"]
+    methods = dict.fromkeys(row["method"] for row in rows)
+    return {name: float(np.mean([row["mse_plane"] for row in rows if row["method"] == name])) for name in methods}
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
+
+
+def test_the_blur_of_the_other_object_goes_and_more_of_it_where_planes_hide_one_another(
+    tmp_path: Path, done: Command
+) -> None:
+    done("simulate", tmp_path / "set", "--size-px", 160, 120, "--rows", 5, "--columns", 5, "--snr", 2)
+    out = tmp_path / "out"
+    done("reconstruct", tmp_path / "set", *BOTH, "--method", "pmlem", "--joint", "--occlusion", "--out", out)
+    errors = _errors(out)
+    assert errors["joint"] < 0.5 * errors["pmlem"]
+    assert errors["occlusion"] < 0.8 * errors["joint"]
+    together = json.loads((out / "occlusion" / "reconstruction.json").read_text())["planes"]
+    assert [plane["occlusion"] for plane in together] == [True, True]
+    opacity = tifffile.imread(out / "occlusion" / together[0]["opacity_file"])
+    texture = tifffile.imread(tmp_path / "set" / "truth" / "plane_00500.0.tiff")
+    assert 0 <= opacity.min() <= opacity.max() <= 1
+    assert np.mean((opacity > 0.5) == (texture > 0)) > 0.95
+
+
+def test_what_is_found_beside_a_plane_is_vouched_for_with_it(scene: Path, tmp_path: Path, done: Command) -> None:
+    out = tmp_path / "out"
+    words = ("reconstruct", scene, *BOTH, "--joint", "--passes", 2, "--penalty-weight", 1, "--out", out)
+    done(*words, "--uncertainty")
+    first, sigma = _files(out), out / "plane_00700.0_sigma.tiff"
+    assert "2 of 2 planes are there" in done(*words, "--uncertainty").stderr
+    sigma.write_bytes(sigma.read_bytes()[:-4] + b"\0\0\x80\x3f")
+    assert "1 of 2 planes are there" in done(*words, "--uncertainty").stderr
+    assert _files(out) == first
+    assert "How sure: the standard deviation" in (out / "report.html").read_text()
+    done(*words)
+    assert set(_files(out)) == {name for name in first if "sigma" not in name}
+
+
+def test_a_plane_found_with_others_is_made_anew_with_other_others(scene: Path, tmp_path: Path, done: Command) -> None:
+    words = ("reconstruct", scene, "--joint", "--passes", 2, "--penalty-weight", 1, "--out", tmp_path)
+    done(*words, *BOTH)
+    assert "are there" not in done(*words, "--depth-mm", 500).stderr
+
+
+def test_workers_find_planes_together(
+    scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+    words = ("reconstruct", scene, *BOTH, "--occlusion", "--passes", 2, "--penalty-weight", 1)
+    done(*words, "--out", tmp_path / "local")
+    done(*words, "--out", tmp_path / "spread", "--workers", 1)
+    assert _files(tmp_path / "spread") == _files(tmp_path / "local")

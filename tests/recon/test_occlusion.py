@@ -1,0 +1,42 @@
+"""Opacity from light, and what it leaves of farther planes, against pictures whose answer is plain."""
+
+import numpy as np
+import pytest
+
+from recon.occlusion import opacity, transmission
+from recon.plane import PlaneGrid
+from recon.scene import SceneOperator
+
+
+def test_what_shines_is_opaque_and_faint_ghosts_are_not() -> None:
+    generator = np.random.default_rng(2)
+    plane = np.maximum(generator.normal(0, 0.1, (60, 80)), 0)
+    plane[20:40, 20:50] += 1.0
+    plane[20:40, 60:76] += 0.05
+    found = opacity(plane)
+    assert found[25:35, 25:45].min() > 0.99
+    assert found[:12].max() < 0.05
+    assert found[25:35, 64:72].max() < 0.1
+    assert 0 <= found.min() <= found.max() <= 1
+
+
+def test_a_plane_without_light_hides_nothing() -> None:
+    np.testing.assert_array_equal(opacity(np.zeros((5, 6))), 0)
+
+
+def test_only_farther_planes_are_hidden_each_by_all_before_it() -> None:
+    homographies = np.stack([np.eye(3)] * 6).reshape(3, 2, 3, 3)
+    homographies[:, 1, 0, 2] = 1.0  # the second view is a sample aside
+    rays = np.stack(np.meshgrid(np.arange(7.0), np.arange(5.0)), axis=-1)
+    grids = [PlaneGrid((5, 9), 1.0, (0.0, 0.0))] * 3
+    flat = np.full((5, 7), 0.5)
+    operator = SceneOperator(homographies, rays, grids, flat=flat, dtype=np.float64, workers=1)
+    opacities = [np.zeros((5, 9)) for _ in grids]
+    opacities[0][2, 4], opacities[1][2, 4], opacities[2][1, 1] = 0.5, 1.0, 1.0
+    found = transmission(operator, opacities, [600.0, 500.0, 900.0])
+    expected = np.ones((3, 2, 5, 7))
+    expected[0, 0, 2, 4] = expected[0, 1, 2, 3] = 0.0  # by the plane at 500 mm alone
+    expected[2, 0, 2, 4] = expected[2, 1, 2, 3] = 0.0  # by both
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    opacities[1][2, 4] = 0.4
+    assert transmission(operator, opacities, [600.0, 500.0, 900.0])[2, 0, 2, 4] == pytest.approx(0.3)

@@ -1,0 +1,158 @@
+"""Several planes solved together, against a primal-dual method on dense matrices and the solver of one plane."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from recon.held_out import chosen_weight
+from recon.images import ElementalImages, Image, Likelihood, LikelihoodName
+from recon.operator import PlaneOperator
+from recon.penalties import Penalty
+from recon.plane import PlaneGrid
+from recon.pmlem import PmlemIterate, pmlem
+from recon.posed import PosedPlane, PosedScene
+from recon.scene import SceneOperator
+from tests.recon.small_problems import problem
+
+WEIGHT = 0.8
+VIEWS, SIZE = 9, 12
+GRIDS = PlaneGrid((10, 9), 1.0, (1.0, 1.0)), PlaneGrid((7, 8), 1.5, (0.2, 0.4))
+
+
+def scene(likelihood: LikelihoodName = "shifted-poisson", *, occluded: bool = False, seed: int = 3) -> PosedScene:
+    """Two planes of unlike grids, which slide over each other from view to view."""
+    generator = np.random.default_rng(seed)
+    homographies = np.stack([np.eye(3)] * 2 * VIEWS).reshape(2, VIEWS, 3, 3)
+    homographies[0, :, :2, 2] = generator.uniform(-2.5, 2.5, (VIEWS, 2))
+    homographies[1, :, :2, 2] = generator.uniform(-0.5, 0.5, (VIEWS, 2))
+    rays = np.stack(np.meshgrid(np.arange(float(SIZE)), np.arange(float(SIZE))), axis=-1)
+    transmission = generator.uniform(0.2, 1, (2, VIEWS, SIZE, SIZE)) if occluded else None
+    operator = SceneOperator(homographies, rays, GRIDS, transmission=transmission, dtype=np.float64, workers=1)
+    near, far = np.zeros(GRIDS[0].shape), np.zeros(GRIDS[1].shape)
+    near[3:7, 2:6], far[1:5, 4:7] = 5.0, 3.0
+    mean = operator.forward([near, far])
+    electrons = generator.poisson(mean + 0.3) + generator.normal(0, 1, mean.shape)
+    judged_by = Likelihood(likelihood, level_e=2.0 if likelihood == "least-squares" else 0.0)
+    return PosedScene(operator, ElementalImages(electrons, 0.3, 1.0, likelihood=judged_by))
+
+
+def solved(posed: PosedScene | PosedPlane, weight: float, tolerance: float = 1e-7, most: int = 4000) -> PmlemIterate:
+    start = posed.start()
+    fit = posed.fit(posed.level_e(start))
+    for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=tolerance, dual=posed.dual()):
+        if iterate.certificate.distance <= tolerance or iterate.passes >= most:
+            break
+    return iterate
+
+
+def dense(operator: SceneOperator) -> Image:
+    """H as a matrix (pixel, sample), by what it makes of each sample."""
+    count = sum(grid.shape[0] * grid.shape[1] for grid in operator.grids)
+    return np.stack([operator.forward(operator.planes_of(one)).ravel() for one in np.eye(count)], axis=1)
+
+
+def differences() -> Image:
+    """∇ of both planes as a matrix (2 · samples, samples): all differences down, then all to the right."""
+    index = np.arange(sum(grid.shape[0] * grid.shape[1] for grid in GRIDS))
+    matrix = np.zeros((2, index.size, index.size))
+    first = 0
+    for grid in GRIDS:
+        part = index[first : first + grid.shape[0] * grid.shape[1]].reshape(grid.shape)
+        first += part.size
+        for axis, (here, there) in enumerate(((part[:-1], part[1:]), (part[:, :-1], part[:, 1:]))):
+            matrix[axis, here.ravel(), there.ravel()] = 1
+            matrix[axis, here.ravel(), here.ravel()] = -1
+    return matrix.reshape(-1, index.size)
+
+
+def objective_and_gradient(posed: PosedScene, matrix: Image, f: Image) -> tuple[float, Image]:
+    """The negative log-likelihood of all planes and its gradient, by formulas of their own."""
+    rows = matrix[matrix.any(axis=1)]
+    g = posed.images.electrons.ravel()[matrix.any(axis=1)]
+    mean = rows @ f + 0.3
+    if posed.images.likelihood.name == "least-squares":
+        variance = 2.0 + 0.3 + 1.0
+        return float(np.sum((g - mean) ** 2) / (2 * variance)), rows.T @ ((mean - g) / variance)
+    y, m = np.maximum(g + 1, 0), mean + 1
+    return float(np.sum(m - y * np.log(m))), rows.T @ (1 - y / m)
+
+
+def primal_dual(posed: PosedScene, weight: float, passes: int) -> Image:
+    """The optimum by Condat and Vũ's iteration with fixed steps."""
+    matrix, gradient_of = dense(posed.operator), differences()
+    samples = matrix.shape[1]
+    curvature = np.linalg.norm(matrix, 2) ** 2 * 4
+    step, dual_step = 1 / curvature, curvature / (16 * weight**2)
+    f, p = np.ones(samples), np.zeros(2 * samples)
+    for _ in range(passes):
+        slope = objective_and_gradient(posed, matrix, f)[1]
+        ahead = np.maximum(f - step * (slope + weight * (gradient_of.T @ p)), 0)
+        p = p + dual_step * weight * (gradient_of @ (2 * ahead - f))
+        p = (p.reshape(2, samples) / np.maximum(np.hypot(*p.reshape(2, samples)), 1)).ravel()
+        f = ahead
+    return f
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "occluded"), [("shifted-poisson", False), ("shifted-poisson", True), ("least-squares", False)]
+)
+def test_planes_together_are_what_a_primal_dual_method_finds(likelihood: LikelihoodName, occluded: bool) -> None:
+    posed = scene(likelihood, occluded=occluded)
+    best = primal_dual(posed, WEIGHT, 5000)
+    found = solved(posed, WEIGHT).plane
+    assert np.linalg.norm(found - best) <= 1e-4 * np.linalg.norm(best)
+    alone = [np.linalg.norm(part) for part in posed.operator.planes_of(best)]
+    assert min(alone) > 0.2 * max(alone)
+
+
+def test_the_objective_never_rises() -> None:
+    posed = scene()
+    start = posed.start()
+    iterates = pmlem(posed.fit(posed.level_e(start)), start, penalty_weight=WEIGHT, dual=posed.dual())
+    objectives = [next(iterates).objective for _ in range(30)]
+    assert all(after <= before * (1 + 1e-7) for before, after in pairwise(objectives))
+    assert objectives[-1] < objectives[0] - 10
+
+
+def test_one_plane_together_is_one_plane_alone() -> None:
+    posed = problem()
+    operator: PlaneOperator = posed.operator
+    alone = solved(PosedPlane(operator, posed.images), 1.5)
+    together = solved(PosedScene(operator._scene, posed.images), 1.5)  # noqa: SLF001 - the very same operator
+    np.testing.assert_allclose(together.plane.reshape(operator.grid.shape), alone.plane, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("occluded", [False, True])
+def test_the_metric_bounds_the_curvature_between_planes_too(occluded: bool) -> None:
+    posed = scene(occluded=occluded)
+    matrix, start = dense(posed.operator), posed.start()
+    light = matrix @ start + 1.3
+    hessian = matrix.T @ (matrix / light[:, None])
+    metric = posed.fit(posed.level_e(start)).metric(start)
+    scaled = hessian / np.sqrt(np.outer(metric, metric))
+    assert 0.5 < np.linalg.eigvalsh(scaled)[-1] <= 1 + 1e-9
+
+
+def test_views_that_are_left_out_do_not_count() -> None:
+    posed = scene()
+    kept = np.array([0, 2, 3, 5, 8])
+    generator = np.random.default_rng(1)
+    electrons = posed.images.electrons.copy()
+    electrons[[1, 4, 6, 7]] = generator.normal(100, 1, (4, SIZE, SIZE))
+    other = PosedScene(posed.operator, ElementalImages(electrons, 0.3, 1.0))
+    np.testing.assert_allclose(posed.start(kept), other.start(kept), rtol=1e-12)
+    first, second = posed.fit(1.0, kept), other.fit(1.0, kept)
+    value, gradient = first.value_and_gradient(posed.start())
+    assert second.value(posed.start()) == pytest.approx(value, rel=1e-12)
+    np.testing.assert_allclose(second.value_and_gradient(posed.start())[1], gradient, rtol=1e-12)
+    np.testing.assert_allclose(second.metric(posed.start()), first.metric(posed.start()), rtol=1e-12)
+    assert not np.allclose(posed.fit(1.0).metric(posed.start()), first.metric(posed.start()))
+
+
+def test_held_out_views_choose_one_weight_for_all_planes() -> None:
+    posed = scene()
+    chosen = chosen_weight(posed, posed.usual_weight(posed.start()), Penalty())
+    weights = [tried.weight for tried in chosen.tried]
+    assert min(weights) <= chosen.weight <= max(weights)
+    assert chosen.nearest.plane.shape == (10 * 9 + 7 * 8,)
