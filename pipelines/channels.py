@@ -14,8 +14,9 @@ from pipelines.elemental_set import LoadedSet, noise_of_phase
 from pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from pipelines.frames import Frame, read_frame
 from pipelines.large_arrays import Allocate
+from pipelines.tilted import Place, TiltedPlane
 from recon.errors import GeometryMismatch
-from recon.images import ElementalImages
+from recon.images import ElementalImages, binned
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
 from recon.scene import SceneOperator
@@ -239,41 +240,51 @@ def plane_grid(loaded: LoadedSet, depth_mm: float, pitch_mm: float | None = None
 
 
 class OperatorFactory:
-    """Makes the operators of one channel; what they share (rays, response, mask) is computed once."""
+    """Makes the operators of one channel; what they share (rays, response, mask) is computed once.
 
-    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages) -> None:
+    For images whose pixels were added up in bins (`ElementalImages.binned`) give as many `bins`.
+    """
+
+    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages, *, bins: int = 1) -> None:
         self._loaded = loaded
         self._images = images
         self._phases = len(layout.lattices)
         lattices = layout.lattices
-        self._rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
-        self._response = np.stack([_response(loaded, lattice) for lattice in lattices])
+        rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
+        self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
+        self._response = binned(np.stack([_response(loaded, lattice) for lattice in lattices]), bins)
         self._principal_shift = _principal_shift(loaded)
 
     def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
         """Return H of the plane across the reference camera's axis at a depth."""
-        return PlaneOperator(self._homographies(depth_mm), self._rays, grid, **self._shared())
+        return self.at(depth_mm, grid)
+
+    def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
+        """Return H of a plane at a depth, or of a pose."""
+        return PlaneOperator(self._homographies(place), self._rays, grid, **self._shared())
 
     def of_scene(
-        self, grids: Mapping[float, PlaneGrid], transmission: NDArray[np.float32] | None = None
+        self, grids: Mapping[Place, PlaneGrid], transmission: NDArray[np.float32] | None = None
     ) -> SceneOperator:
-        """Return H of all planes together, in the order of `grids` by depth.
+        """Return H of all planes together, in the order of `grids`.
 
         Parameters
         ----------
-        grids : mapping of float to PlaneGrid
-            The samples at each depth in mm.
+        grids : mapping of Place to PlaneGrid
+            The samples of each plane.
         transmission : float array (plane, view, row, column), optional
             How much of each plane's light reaches each pixel; all by default.
         """
-        homographies = np.stack([self._homographies(depth) for depth in grids])
+        homographies = np.stack([self._homographies(place) for place in grids])
         return SceneOperator(
             homographies, self._rays, list(grids.values()), transmission=transmission, **self._shared()
         )
 
-    def _homographies(self, depth_mm: float) -> NDArray[np.float64]:
-        """Return the way from the rays of each view, and each phase of its mosaic, to the plane at a depth."""
-        rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
+    def _homographies(self, place: Place) -> NDArray[np.float64]:
+        """Return the way from the rays of each view, and each phase of its mosaic, to a plane."""
+        rt_ref_plane = (
+            np.array(place.rt_ref_plane) if isinstance(place, TiltedPlane) else fronto_parallel_rt_ref_plane(place)
+        )
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
         return np.repeat(homographies, self._phases, axis=0)
 

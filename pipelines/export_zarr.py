@@ -12,7 +12,7 @@ from pipelines.errors import BadValue, MissingPackage
 from pipelines.files import building_folder
 from pipelines.frames import read_frame
 from pipelines.report import results_below
-from pipelines.stacks import Scale, planes_in_order, stack_scale
+from pipelines.stacks import Scale, at_depths, planes_in_order, stack_scale
 
 # Planes are halved until no side is longer; viewers load the rest only where they look closer.
 _COARSEST_PX = 512
@@ -76,10 +76,12 @@ def _planes_of(directory: Path) -> tuple[Path, list[dict[str, Any]], int]:
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
     ((folder, result),) = results.items()
     planes = planes_in_order(result["planes"])
+    if not planes:
+        raise BadValue(f"{directory}: holds planes given by a pose only; a stack is of depths: reconstruct some")
     shapes = sorted({tuple(record["shape"]) for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{directory}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
-    return folder, planes, len(result["planes"]) // len(planes)
+    return folder, planes, len(at_depths(result["planes"])) // len(planes)
 
 
 def _scale_of(directory: Path, planes: Sequence[dict[str, Any]]) -> Scale:

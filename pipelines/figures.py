@@ -144,7 +144,7 @@ def _reconstructed(elemental_set: Path, out: Path, method: Method) -> tuple[list
     """Reconstruct both planes of a set by a method, and return them with what `reconstruct` says."""
     from pipelines.figure_drawings import Shown
 
-    result = reconstruct(elemental_set, out=out, depth_mm=_DEPTHS_MM, method=[method])
+    result = reconstruct(elemental_set, out=out, depth_mm=[*_DEPTHS_MM], method=[method])
     planes = [
         Shown(
             read_frame(out / record["file"]).pixels_dn, *(record[key] for key in ("depth_mm", "pitch_mm", "origin_mm"))

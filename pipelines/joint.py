@@ -7,6 +7,7 @@ from typing import Any
 from pipelines.channels import OperatorFactory
 from pipelines.console import say
 from pipelines.planes import Method, Settings, Solution, certified, mean_e
+from pipelines.tilted import Place, depth_of
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages
 from recon.occlusion import opacity, transmission
@@ -18,24 +19,24 @@ from recon.scene import SceneOperator
 def solve_together(
     factory: OperatorFactory,
     images: ElementalImages,
-    grids: Mapping[float, PlaneGrid],
+    grids: Mapping[Place, PlaneGrid],
     methods: Collection[Method],
     settings: Settings,
-) -> dict[Method, dict[float, Solution]]:
+) -> dict[Method, dict[Place, Solution]]:
     """Reconstruct all planes of one channel together, so that none has to explain the light of the others.
 
     Parameters
     ----------
-    grids : mapping of float to PlaneGrid
-        The samples at each depth in mm.
+    grids : mapping of Place to PlaneGrid
+        The samples of each plane.
     methods : collection of Method
         "joint", "occlusion" or both: by the latter planes hide those behind them, where that explains the images
         better.
 
     Returns
     -------
-    dict of Method to dict of float to Solution
-        By method and depth. All records tell of one iteration: its penalty weight, passes, objective and certificate.
+    dict of Method to dict of Place to Solution
+        By method and plane. All records tell of one iteration: its penalty weight, passes, objective and certificate.
     """
     operator = factory.of_scene(grids)
     joint = certified(PosedScene(operator, images), settings)
@@ -49,7 +50,7 @@ def _with_occlusion(
     factory: OperatorFactory,
     operator: SceneOperator,
     images: ElementalImages,
-    grids: Mapping[float, PlaneGrid],
+    grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
     settings: Settings,
 ) -> list[Solution]:
@@ -60,7 +61,7 @@ def _with_occlusion(
     """
     chosen = {key: joint[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
     settings = replace(settings, penalty_weight=joint[0].record["penalty_weight"])
-    hidden = transmission(operator, [opacity(one.plane) for one in joint], list(grids))
+    hidden = transmission(operator, [opacity(one.plane) for one in joint], [depth_of(place) for place in grids])
     try:
         occluded = factory.of_scene(grids, hidden)
     except GeometryMismatch:

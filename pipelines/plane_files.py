@@ -15,6 +15,7 @@ from pipelines.files import sha256, write_json, writing
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.planes import Method
 from pipelines.provenance import first_difference
+from pipelines.tilted import Place, TiltedPlane
 
 # Holds the colours of planes that want others, until the planes are written.
 PARTS = ".parts"
@@ -23,9 +24,9 @@ PARTS = ".parts"
 _BESIDE = ("sigma", "opacity")
 
 
-def plane_name(depth_mm: float) -> str:
-    """Return the file name, without suffix, of the plane at a depth."""
-    return f"plane_{depth_mm:07.1f}"
+def plane_name(place: Place) -> str:
+    """Return the file name, without suffix, of a plane."""
+    return f"plane_{place.name}" if isinstance(place, TiltedPlane) else f"plane_{place:07.1f}"
 
 
 @dataclass(frozen=True)
@@ -38,8 +39,8 @@ class PlaneFiles:
         Of the method's planes.
     method : Method
         By which it is reconstructed.
-    depth_mm : float
-        Of the plane.
+    place : Place
+        The plane's depth in mm, or its pose.
     channels : tuple of str
         Its colours, in their order.
     origin : dict
@@ -48,29 +49,22 @@ class PlaneFiles:
 
     folder: Path
     method: Method
-    depth_mm: float
+    place: Place
     channels: tuple[str, ...]
     origin: dict[str, Any]
 
     @property
     def path(self) -> Path:
         """Where the plane itself is."""
-        return self.folder / f"{plane_name(self.depth_mm)}.tiff"
+        return self.folder / f"{plane_name(self.place)}.tiff"
 
     def path_beside(self, name: str) -> Path:
         """Return where the standard deviation or the opacity of each sample is."""
-        return self.folder / f"{plane_name(self.depth_mm)}_{name}.tiff"
+        return self.folder / f"{plane_name(self.place)}_{name}.tiff"
 
     def finished(self) -> dict[str, Any] | None:
         """Return the record of the plane, None unless it and its files are whole and made of what they have to be."""
-        try:
-            record: dict[str, Any] = json.loads(self.path.with_suffix(".json").read_bytes())
-            if first_difference(record, self.origin):
-                return None
-            whole = all(sha256(self.folder / name) == known for name, known in record["sha256"].items())
-        except (OSError, MissingFile, ValueError, KeyError, AttributeError):
-            return None  # there is none, or it is no use
-        return record if whole else None
+        return vouched_for(self.path.with_suffix(".json"), self.origin)
 
     def missing(self) -> list[str]:
         """Return the colours that are still to be reconstructed."""
@@ -117,7 +111,7 @@ class PlaneFiles:
         return record
 
     def _part(self, channel: str) -> Path:
-        return self.folder / PARTS / f"{plane_name(self.depth_mm)}_{channel}.npz"
+        return self.folder / PARTS / f"{plane_name(self.place)}_{channel}.npz"
 
     def _entry(self, channel: str) -> dict[str, Any] | None:
         """Return what is known of a colour that is there, None when it is not, or is made of something else."""
@@ -127,6 +121,18 @@ class PlaneFiles:
         except (OSError, ValueError, KeyError, zipfile.BadZipFile, msgspec.MsgspecError):
             return None
         return None if first_difference(content, self.origin) else content
+
+
+def vouched_for(path: Path, origin: dict[str, Any]) -> dict[str, Any] | None:
+    """Return a record whose files, beside it, are whole and made of what they have to be; None for any other."""
+    try:
+        record: dict[str, Any] = json.loads(path.read_bytes())
+        if first_difference(record, origin):
+            return None
+        whole = all(sha256(path.parent / name) == known for name, known in record["sha256"].items())
+    except (OSError, MissingFile, ValueError, KeyError, AttributeError):
+        return None  # there is none, or it is no use
+    return record if whole else None
 
 
 def _together(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:

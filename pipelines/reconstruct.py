@@ -1,6 +1,5 @@
 """`faintfield reconstruct`: planes of a session or an elemental set at chosen depths."""
 
-import re
 import shutil
 import time
 from contextlib import suppress
@@ -8,28 +7,32 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from cyclopts import Parameter
 
 from pipelines.arguments import Count, NotNegative, Positive
-from pipelines.channels import channel_layouts, default_pitch_px, plane_grid, require_in_front
+from pipelines.autofocus import BestFocus, best_focus
+from pipelines.channels import channel_layouts, default_pitch_px, plane_grid
 from pipelines.cluster import crew_of
 from pipelines.console import say
+from pipelines.depth_map import require_sweep, write_depth_map
+from pipelines.depths import depths_by_disparity, distinct_depths, swept_depths, swept_disparities
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
 from pipelines.files import remove_leftovers, require_room, write_json
 from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
-from pipelines.plane_files import PARTS, PlaneFiles, plane_name
+from pipelines.plane_files import PARTS, PlaneFiles
 from pipelines.planes import TOGETHER, Method, Settings
 from pipelines.provenance import provenance
 from pipelines.report import RECONSTRUCTION_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from pipelines.stacks import write_stack
 from pipelines.sweep import Crew, Sweep, one_by_one
+from pipelines.tilted import Place, TiltedPlane, read_plane_poses, tilted_grid
 from recon.images import LikelihoodName
 from recon.penalties import PenaltyName
+from recon.plane import PlaneGrid
 from rig.session.opening import has_session
 
 DEFAULT_METHOD: Method = "pmlem"
@@ -51,6 +54,14 @@ class Request:
         Distance of the planes' samples; one detector pixel of the reference view when None.
     with_focus : bool
         Whether a curve of focus against depth is wanted.
+    with_depth_map : bool
+        Whether depths and an all-in-focus picture are to be found from the planes.
+    disparities_px : dict of depth in mm to px
+        What was asked for instead of depths, if it was.
+    tilted : list of TiltedPlane
+        Planes given by a pose.
+    found : dict, optional
+        How the depths were found, if they were.
     """
 
     depths_mm: list[float]
@@ -58,6 +69,10 @@ class Request:
     settings: Settings = field(default_factory=Settings)
     pitch_mm: float | None = None
     with_focus: bool = False
+    with_depth_map: bool = False
+    disparities_px: dict[float, float] = field(default_factory=dict)
+    tilted: list[TiltedPlane] = field(default_factory=list)
+    found: dict[str, Any] | None = None
 
 
 def reconstruct(
@@ -65,9 +80,12 @@ def reconstruct(
     /,
     *,
     out: Path | None = None,
-    depth_mm: list[float] | None = None,
+    depth_mm: list[float | Literal["auto"]] | None = None,
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
+    sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
+    plane_pose: list[Path] | None = None,
+    depth_map: bool = False,
     method: list[Method] | None = None,
     joint: bool = False,
     occlusion: bool = False,
@@ -96,12 +114,20 @@ def reconstruct(
         Folder for the results; planes of the same depth are replaced. For a session, its folder reconstructions by
         default.
     depth_mm
-        Depth of a plane; give it once per plane.
+        Depth of a plane; give it once per plane. auto: the depths at which something stands, found by comparing the
+        views; --sweep-mm or --sweep-px then only say between which depths, otherwise all that the views share.
     sweep_mm
         FIRST:LAST:COUNT, that many planes in equal steps, with a curve of focus against depth.
     disparity_px
         Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
         negative for near points, unless the pictures are aligned on a nearer plane.
+    sweep_px
+        FIRST:LAST:COUNT, a sweep in equal steps of disparity instead of depth, such as -3.5:0.8:40.
+    plane_pose
+        TOML file of planes of any pose, each with a name and either rt_ref_plane, or point_mm and normal.
+    depth_map
+        From the sweep also how far away each pixel is, with the probability of that, and a picture that is sharp
+        everywhere.
     method
         pmlem (the default; to its optimum, certified), joint and occlusion (the same for all planes together),
         pmlem-osl and mlem (the paper's iterations), or backprojection; give it once per method.
@@ -135,9 +161,18 @@ def reconstruct(
         Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
     """
     crew = crew_of(workers, scheduler)
+    if not (depth_mm or sweep_mm or disparity_px or sweep_px or plane_pose):
+        raise WrongUsage(
+            "no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT, --disparity-px, --sweep-px or "
+            "--plane-pose"
+        )
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
+        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
+    if plane_pose and (occlusion or "occlusion" in (method or [])):
+        raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
     swept = swept_depths(sweep_mm) if sweep_mm else []
-    if not (depth_mm or swept or disparity_px):
-        raise WrongUsage("no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT or --disparity-px")
+    swept_px = swept_disparities(sweep_px) if sweep_px else []
+    tilted = [plane for path in plane_pose or [] for plane in read_plane_poses(path)]
     if has_session(elemental_set):
         loaded = load_session(elemental_set, scene, geometry)
         out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
@@ -146,14 +181,40 @@ def reconstruct(
     else:
         loaded = load_set(elemental_set)
         loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
-    depths = [*(depth_mm or []), *swept, *(loaded.depth_of_disparity(d) for d in disparity_px or [])]
-    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
-        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
+    swept_of_px = depths_by_disparity(loaded, swept_px)
+    of_disparity = depths_by_disparity(loaded, disparity_px or []) | swept_of_px
+    depths = [*(depth for depth in depth_mm or [] if depth != "auto"), *swept, *of_disparity]
+    found = None
+    if "auto" in (depth_mm or []):
+        found = _found(loaded, out, depth_mm or [], [*swept, *swept_of_px], disparity_px or [])
+        depths, of_disparity = found.depths_mm, {}
+    if depth_map:
+        require_sweep(depths)
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
     asked: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
     methods = [*(method or []), *(name for name, wanted in asked.items() if wanted)] or [DEFAULT_METHOD]
-    return reconstruct_set(loaded, out, Request(depths, methods, settings, pitch_mm, bool(swept)), crew)
+    request = Request(
+        depths,
+        methods,
+        settings,
+        pitch_mm,
+        with_focus=bool(swept or swept_px) and found is None,
+        with_depth_map=depth_map,
+        disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
+        tilted=tilted,
+        found=found.record if found else None,
+    )
+    return reconstruct_set(loaded, out, request, crew)
+
+
+def _found(
+    loaded: LoadedSet, out: Path, depth_mm: list[float | Literal["auto"]], swept: list[float], others: list[float]
+) -> BestFocus:
+    """Return the planes of best focus, within a sweep's range if there is one."""
+    if depth_mm != ["auto"] or others:
+        raise WrongUsage("--depth-mm auto finds all depths; give others in a call of their own, with the same --out")
+    return best_focus(loaded, out, (min(swept), max(swept)) if swept else None)
 
 
 def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew = one_by_one) -> dict[str, Any]:
@@ -177,6 +238,9 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
             with suppress(OSError):
                 (folder / PARTS).rmdir()  # stays as long as planes want colours
     write_overview(loaded, out)
+    mapped = None
+    if request.with_depth_map:
+        mapped = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins, out)
     metrics = assess(loaded, sweep.written)
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
@@ -186,6 +250,8 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
             "format": 1,
             "planes": [record for record in sweep.records if record["method"] == name],
             "focus": sweep.focus(),
+            "best_focus": request.found,
+            "depth_map": mapped,
             "wall_time_s": time.monotonic() - started,
             **sweep.origins[name],
         }
@@ -196,29 +262,50 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
     report = write_report(out)
     _say_what_oscillates(sweep.records)
     _say_what_is_not_reached(sweep.records)
-    say(f"{len(depths)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
-    return {"out": str(out), "report": str(report), "planes": sweep.records, "focus": sweep.focus(), "metrics": metrics}
+    say(f"{len(depths) + len(request.tilted)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    return {
+        "out": str(out),
+        "report": str(report),
+        "planes": sweep.records,
+        "focus": sweep.focus(),
+        "best_focus": request.found,
+        "depth_map": mapped,
+        "metrics": metrics,
+    }
 
 
 def _sweep(loaded: LoadedSet, folders: dict[Method, Path], request: Request) -> Sweep:
     """Return the planes of a request, none of them made yet."""
     layouts = channel_layouts(loaded)
     mm_per_depth = default_pitch_px(loaded, layouts) / loaded.settings.camera.fx_px
-    grids = {depth: plane_grid(loaded, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm}
+    grids: dict[Place, PlaneGrid] = {
+        depth: plane_grid(loaded, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm
+    }
+    for plane in request.tilted:
+        grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
     inputs = dict(loaded.input_hashes())
 
-    def origin(name: Method, depths: list[float]) -> dict[str, Any]:
-        options = options_of(name, replace(request, depths_mm=depths), loaded.poses)
-        return provenance("reconstruct", options, inputs)
+    def origin(name: Method, wanted: Request) -> dict[str, Any]:
+        return provenance("reconstruct", options_of(name, wanted, loaded.poses), inputs)
 
     channels = tuple(layout.name for layout in layouts)
     files = [
-        PlaneFiles(folder, name, depth, channels, origin(name, list(grids) if name in TOGETHER else [depth]))
-        for depth in grids
+        PlaneFiles(folder, name, place, channels, origin(name, _made_with(request, name, place)))
+        for place in grids
         for name, folder in folders.items()
     ]
-    origins = {name: origin(name, request.depths_mm) for name in folders}
+    origins = {name: origin(name, request) for name in folders}
     return Sweep(loaded, grids, files, origins, request.settings, with_focus=request.with_focus)
+
+
+def _made_with(request: Request, method: Method, place: Place) -> Request:
+    """Return the part of a request that one plane is made of: all planes by methods that find them together."""
+    if method in TOGETHER:
+        return replace(request, with_depth_map=False)
+    alone: dict[str, Any] = (
+        {"depths_mm": [], "tilted": [place]} if isinstance(place, TiltedPlane) else {"depths_mm": [place], "tilted": []}
+    )
+    return replace(request, with_depth_map=False, **alone)
 
 
 def folder_of_method(out: Path, method: Method, methods: list[Method]) -> Path:
@@ -238,32 +325,10 @@ def options_of(method: Method, request: Request, poses: str) -> dict[str, Any]:
         "passes": request.settings.passes,
         "pitch_mm": request.pitch_mm,
         "focus": request.with_focus,
+        "depth_map": ("px" if request.disparities_px else "mm") if request.with_depth_map else None,
+        "plane_pose": {plane.name: [*plane.rt_ref_plane, *(plane.size_mm or ())] for plane in request.tilted},
         "poses": poses,
     }
-
-
-def distinct_depths(depths: list[float]) -> list[float]:
-    """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
-    by_name: dict[str, float] = {}
-    for depth in depths:
-        require_in_front(depth)
-        other = by_name.setdefault(plane_name(depth), depth)
-        if other != depth:
-            raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
-    return list(by_name.values())
-
-
-def swept_depths(sweep_mm: str) -> list[float]:
-    """Return the depths of FIRST:LAST:COUNT."""
-    parts = re.fullmatch(r"(\d+(?:\.\d*)?):(\d+(?:\.\d*)?):(\d+)", sweep_mm)
-    if parts is None:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give FIRST:LAST:COUNT, such as 400:900:64")
-    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if min(first, last) <= 0 or first == last or count < 2:
-        raise WrongUsage(
-            f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths and at least 2 planes"
-        )
-    return [round(float(depth), 6) for depth in np.linspace(first, last, count)]
 
 
 def _say_what_oscillates(records: list[dict[str, Any]]) -> None:

@@ -18,6 +18,7 @@ from pipelines.report_calibration import (
     noise_section,
     records,
 )
+from pipelines.report_depth import depth_sections
 from pipelines.report_lead import facts
 from pipelines.report_planes import (
     METHOD_NAMES,
@@ -35,6 +36,7 @@ from pipelines.report_planes import (
 )
 from pipelines.report_sets import set_sections
 from pipelines.result_files import Errors, Result, read_result
+from pipelines.stacks import at_depths
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 REPORT_FILE = "report.html"
@@ -89,6 +91,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         facts=facts(sets[0] if sets else None, **calibrations, against_truth=errors["geometry_off"], errors=led_by),
         sets=sets,
         **planes,
+        depth_maps=depth_sections(directory, results),
         **calibrations,
         **errors,
         method_names=METHOD_NAMES,
@@ -120,7 +123,8 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
 def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return what the page says of the planes: the best, all side by side, on sliders, and where they are sharp."""
     planes = read_planes(directory, results)
-    depths = sorted({plane.depth_mm for plane in planes})
+    depths = sorted({plane.depth_mm for plane in planes if not plane.name})
+    places = len({plane.place for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
     titles, best = column_titles(planes), best_column(planes)
     columns = list(titles)
@@ -131,7 +135,7 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
     return {
         "best": (of_best[0].method, of_best[0].poses),
         "best_title": titles[best],
-        "best_planes": [(row["depth_mm"], row["cells"][place]) for row in rows if row["cells"][place]],
+        "best_planes": [(row["words"], row["cells"][place]) for row in rows if row["cells"][place]],
         "weight_curves": weight_curves(of_best),
         "certificates": [
             (plane.depth_mm, record["certificate"])
@@ -141,11 +145,11 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
         ],
         "columns": list(titles.values()),
         "rows": rows,
-        "slider": slider(planes, titles, white) if len(depths) > 1 or len(columns) > 1 else None,
+        "slider": slider(planes, titles, white) if places > 1 or len(columns) > 1 else None,
         "slider_column": place,
         "sigmas": sigmas(planes, titles, shown_depths(depths, focus)),
-        "slider_depth": first_depth(depths, focus),
-        "depths": len(depths),
+        "slider_depth": first_depth([depth for depth, _ in sorted({plane.place for plane in planes})], focus),
+        "depths": places,
         "white": white,
         "focus_curve": focus_curve(focus) if focus else None,
         "sharp_mm": focus["sharp_mm"] if focus else [],
@@ -201,7 +205,10 @@ def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
-    depths = sorted({plane["depth_mm"] for result in results.values() for plane in result["planes"]})
+    records = [plane for result in results.values() for plane in result["planes"]]
+    depths = sorted({record["depth_mm"] for record in at_depths(records)})
     few = " and ".join(f"{depth:g}" for depth in depths)
     planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
-    return f"{directory.resolve().name}: planes at {planes}"
+    parts = [f"planes at {planes}"] if depths else []
+    parts += list(dict.fromkeys(f"plane {record['name']}" for record in records if "rt_ref_plane" in record))
+    return f"{directory.resolve().name}: {', '.join(parts)}"

@@ -45,6 +45,16 @@ class Plane:
     path: Path
     records: list[dict[str, Any]]
 
+    @property
+    def name(self) -> str:
+        """What a plane that was given by a pose is called; nothing for others."""
+        return str(self.records[0].get("name", ""))
+
+    @property
+    def place(self) -> tuple[float, str]:
+        """What planes of several columns have in common when they are to stand beside each other."""
+        return (self.depth_mm, self.name)
+
     def pixels(self) -> NDArray[Any]:
         """Return the plane (row, column[, colour]) in electrons."""
         return read_frame(self.path).pixels_dn
@@ -136,13 +146,13 @@ def shown_depths(depths: list[float], focus: dict[str, Any] | None) -> list[floa
 
 
 def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], white: float) -> list[dict[str, Any]]:
-    """Return the pictures side by side, a row per depth and a cell per column."""
-    by_place = {(plane.depth_mm, plane.column): plane for plane in planes}
+    """Return the pictures side by side, a row per plane and a cell per column; planes of a pose always have one."""
+    by_place = {(plane.place, plane.column): plane for plane in planes}
     rows = []
-    for depth in depths:
-        found = [by_place.get((depth, column)) for column in columns]
+    for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
+        found = [by_place.get((place, column)) for column in columns]
         cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
-        rows.append({"depth_mm": depth, "cells": cells})
+        rows.append({"words": _words(*place), "cells": cells})
     return rows
 
 
@@ -172,7 +182,7 @@ def slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[di
             "title": title,
             "planes": [
                 _slide(plane, white)
-                for plane in sorted(planes, key=lambda plane: plane.depth_mm)
+                for plane in sorted(planes, key=lambda plane: plane.place)
                 if plane.column == column
             ],
         }
@@ -184,7 +194,12 @@ def _slide(plane: Plane, white: float) -> dict[str, Any]:
     """Return one picture of the sliders, and how many samples across the plane has."""
     pixels = plane.pixels()
     picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
-    return {"depth_mm": plane.depth_mm, "samples": pixels.shape[1], "src": picture}
+    return {"depth_mm": plane.depth_mm, "words": _words(*plane.place), "samples": pixels.shape[1], "src": picture}
+
+
+def _words(depth_mm: float, name: str) -> str:
+    """Return what a plane is called."""
+    return f"{name}, {depth_mm:.1f} mm on the axis" if name else f"{round(depth_mm, 1):g} mm"
 
 
 def first_depth(depths: list[float], focus: dict[str, Any] | None) -> int:

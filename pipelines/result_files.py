@@ -34,6 +34,18 @@ class Focus(msgspec.Struct):
     sharp_mm: list[float]
 
 
+class DepthMap(msgspec.Struct):
+    """What the page needs of a sweep's depth map."""
+
+    file: str
+    confidence: str
+    all_in_focus: str
+    unit: str
+    bins_px: int
+    sure_above: float
+    sure_share: float
+
+
 class Result(msgspec.Struct):
     """What the page needs of reconstruction.json."""
 
@@ -43,6 +55,7 @@ class Result(msgspec.Struct):
     inputs: dict[str, str]
     wall_time_s: float
     focus: Focus | None = None
+    depth_map: DepthMap | None = None
 
 
 class ErrorRow(msgspec.Struct):

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipelines.arguments import Count, NotNegative, Positive
 from pipelines.console import say
+from pipelines.depths import distinct_depths, swept_depths
 from pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS
 from pipelines.hashes import Hashes
@@ -17,11 +18,9 @@ from pipelines.provenance import first_difference, provenance
 from pipelines.reconstruct import (
     DEFAULT_METHOD,
     Request,
-    distinct_depths,
     folder_of_method,
     options_of,
     reconstruct_set,
-    swept_depths,
 )
 from pipelines.report import RECONSTRUCTION_FILE, REPORT_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, files_of_scene, load_session

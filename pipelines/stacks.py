@@ -57,9 +57,14 @@ def stack_scale(records: Sequence[dict[str, Any]]) -> Scale:
     return Scale(across, unit, (float(origin[0]), float(origin[1])), float(steps.mean()) if even else None)
 
 
+def at_depths(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the entries of planes across the camera's axis: those given by a pose have no one depth."""
+    return [record for record in records if "rt_ref_plane" not in record]
+
+
 def planes_in_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one entry per plane, the nearest first; a colour plane has several."""
-    by_file = {record["file"]: record for record in records}
+    """Return one entry per plane that has one depth, the nearest first; a colour plane has several."""
+    by_file = {record["file"]: record for record in at_depths(records)}
     return sorted(by_file.values(), key=lambda record: float(record["depth_mm"]))
 
 
@@ -80,7 +85,7 @@ def write_stack(folder: Path, records: Sequence[dict[str, Any]]) -> Path | None:
     if len({tuple(record["shape"]) for record in planes}) > 1:
         return None
     scale = stack_scale(planes)
-    colours = max(len(records) // len(planes), 1)
+    colours = max(len(at_depths(records)) // len(planes), 1)
     labels = [f"{record['depth_mm']:g} mm, {record['pitch_mm']:.4g} mm/px" for record in planes]
     metadata: dict[str, Any] = {
         "axes": "ZCYX",

@@ -16,6 +16,7 @@ from pipelines.joint import solve_together
 from pipelines.large_arrays import memory_or_file
 from pipelines.plane_files import PlaneFiles
 from pipelines.planes import TOGETHER, Method, Settings, Solution, solve
+from pipelines.tilted import Place, TiltedPlane, words_of
 from recon.errors import GeometryMismatch
 from recon.focus import Focus, focus_measure, sharp_depths_mm
 from recon.images import ElementalImages
@@ -25,18 +26,18 @@ from recon.plane import PlaneGrid
 
 @dataclass(frozen=True)
 class PlaneTask:
-    """One colour at one depth, by the methods by which it is not there yet: paths and options, no pixels.
+    """One colour of one plane, by the methods by which it is not there yet: paths and options, no pixels.
 
-    By methods that find all planes together, one colour at all depths.
+    By methods that find all planes together, one colour of all planes.
 
     Attributes
     ----------
     layout : ChannelLayout
         The colour.
-    grids : dict of float to PlaneGrid
-        The samples at each depth in mm.
+    grids : dict of Place to PlaneGrid
+        The samples of each plane.
     files : tuple of PlaneFiles
-        Where the result of each method and depth goes.
+        Where the result of each method and plane goes.
     settings : Settings
         Of the methods.
     with_focus : bool
@@ -44,7 +45,7 @@ class PlaneTask:
     """
 
     layout: ChannelLayout
-    grids: dict[float, PlaneGrid]
+    grids: dict[Place, PlaneGrid]
     files: tuple[PlaneFiles, ...]
     settings: Settings
     with_focus: bool
@@ -68,44 +69,50 @@ class Channel:
             Of the task's depth, or method.
         """
         words: list[str] = []
-        focus: dict[float, dict[str, Any] | None] = dict.fromkeys(task.grids)
-        for depth, grid in task.grids.items():
-            operator = self._operator(depth, grid)
-            words += self._blind_views(operator, depth)
+        focus: dict[Place, dict[str, Any] | None] = dict.fromkeys(task.grids)
+        for place, grid in task.grids.items():
+            operator = self._operator(place, grid)
+            words += self._blind_views(operator, place)
             if task.with_focus:
-                focus[depth] = focus_measure(operator, self._images, self._halves())._asdict()
+                focus[place] = focus_measure(operator, self._images, self._halves())._asdict()
             for files in task.files:
-                if files.method not in TOGETHER and files.depth_mm == depth:
-                    self._save(task, files, solve(operator, self._images, files.method, task.settings), focus[depth])
+                if files.method not in TOGETHER and files.place == place:
+                    self._save(task, files, solve(operator, self._images, files.method, task.settings), focus[place])
         together = [method for method in TOGETHER if any(files.method == method for files in task.files)]
         solved = solve_together(self._factory, self._images, task.grids, together, task.settings) if together else {}
         for files in task.files:
             if files.method in together:
-                self._save(task, files, solved[files.method][files.depth_mm], focus[files.depth_mm])
+                self._save(task, files, solved[files.method][files.place], focus[files.place])
         return words
 
-    def _operator(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
+    def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         try:
-            return self._factory.at_depth(depth_mm, grid)
+            return self._factory.at(place, grid)
         except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
+            raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
 
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: dict[str, Any] | None) -> None:
         """Save one plane of this colour with its entry."""
-        grid = task.grids[files.depth_mm]
-        samples_per_px = (grid.pitch_mm * self._loaded.settings.camera.fx_px / files.depth_mm) ** 2
+        grid = task.grids[files.place]
         record = {
-            "depth_mm": files.depth_mm,
+            **_where(files.place),
             "method": files.method,
             "channel": task.layout.name,
             "file": files.path.name,
             **asdict(grid),
             **solution.record,
-            "flux_e": float(solution.plane.sum(dtype=np.float64)) * samples_per_px,
+            "flux_e": float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(files.place, grid),
             **{f"{name}_file": files.path_beside(name).name for name in solution.beside},
         }
         arrays = {"plane": solution.plane, **solution.beside}
         files.save_part(task.layout.name, arrays, {"record": record, "focus": focus})
+
+    def _samples_per_px(self, place: Place, grid: PlaneGrid) -> float:
+        """Return how many pixels of the reference view a sample takes, on the axis."""
+        depth_mm, foreshortened = (
+            (place.depth_mm, abs(place.normal[2])) if isinstance(place, TiltedPlane) else (place, 1.0)
+        )
+        return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_mm) ** 2 * foreshortened)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
@@ -114,7 +121,7 @@ class Channel:
         odd = np.repeat(odd, self._phases)
         return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
 
-    def _blind_views(self, operator: PlaneOperator, depth_mm: float) -> list[str]:
+    def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
         """Return words on views that see nothing of a plane: a pose may be wrong."""
         blind = {
             int(view) // self._phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()
@@ -123,7 +130,7 @@ class Channel:
             return []
         first = self._loaded.settings.view[min(blind)].image
         return [
-            f"{depth_mm:g} mm: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
+            f"{words_of(place)}: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
         ]
 
 
@@ -150,10 +157,10 @@ class Sweep:
     ----------
     loaded : LoadedSet
         The set.
-    grids : dict of float to PlaneGrid
-        The samples of the plane at each depth in mm.
+    grids : dict of Place to PlaneGrid
+        The samples of each plane.
     files : sequence of PlaneFiles
-        Of each method and depth.
+        Of each method and plane.
     origins : dict of Method to dict
         The provenance of all planes of a method together.
     settings : Settings
@@ -165,7 +172,7 @@ class Sweep:
     def __init__(
         self,
         loaded: LoadedSet,
-        grids: dict[float, PlaneGrid],
+        grids: dict[Place, PlaneGrid],
         files: Sequence[PlaneFiles],
         origins: dict[Method, dict[str, Any]],
         settings: Settings,
@@ -179,7 +186,7 @@ class Sweep:
         self.origins = origins
         self._settings = settings
         self._with_focus = with_focus
-        self._finished: dict[tuple[Method, float], dict[str, Any]] = {}
+        self._finished: dict[tuple[Method, Place], dict[str, Any]] = {}
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
@@ -191,7 +198,7 @@ class Sweep:
         """Have the tasks done that are not, and finish each plane at once."""
         for files in self._files:
             if record := files.finished():
-                self._finished[files.method, files.depth_mm] = record
+                self._finished[files.method, files.place] = record
         if self._finished:
             say(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
         tasks = self._tasks()
@@ -204,15 +211,15 @@ class Sweep:
 
     def _tasks(self) -> list[PlaneTask]:
         """Return what is to be done, one channel after the other."""
-        wanted = [files for files in self._files if (files.method, files.depth_mm) not in self._finished]
+        wanted = [files for files in self._files if (files.method, files.place) not in self._finished]
         missing = [files.missing() for files in wanted]
         tasks = []
         for layout in self._layouts:
             left = [files for files, channels in zip(wanted, missing, strict=True) if layout.name in channels]
             alone = [files for files in left if files.method not in TOGETHER]
-            for depth, grid in self._grids.items():
-                at_depth = tuple(files for files in alone if files.depth_mm == depth)
-                tasks.append(PlaneTask(layout, {depth: grid}, at_depth, self._settings, self._with_focus))
+            for place, grid in self._grids.items():
+                of_plane = tuple(files for files in alone if files.place == place)
+                tasks.append(PlaneTask(layout, {place: grid}, of_plane, self._settings, self._with_focus))
             together = tuple(files for files in left if files.method in TOGETHER)
             tasks.append(PlaneTask(layout, self._grids, together, self._settings, self._with_focus))
         return [task for task in tasks if task.files]
@@ -220,32 +227,34 @@ class Sweep:
     def _finish_whole(self, candidates: Sequence[PlaneFiles]) -> None:
         """Write the planes whose colours are complete."""
         for files in candidates:
-            key = (files.method, files.depth_mm)
+            key = (files.method, files.place)
             if key not in self._finished and not files.missing():
-                self._finished[key] = files.finish(self._grids[files.depth_mm].pitch_mm)
+                self._finished[key] = files.finish(self._grids[files.place].pitch_mm)
 
     @property
     def records(self) -> list[dict[str, Any]]:
-        """The entries of reconstruction.json: by channel, depth, method."""
+        """The entries of reconstruction.json: by channel, plane, method."""
         methods = list(dict.fromkeys(files.method for files in self._files))
         return [
-            self._finished[method, depth]["planes"][index]
+            self._finished[method, place]["planes"][index]
             for index in range(len(self._layouts))
-            for depth in self._grids
+            for place in self._grids
             for method in methods
         ]
 
     @property
     def written(self) -> dict[tuple[Method, float], Path]:
-        """The files of the planes."""
-        return {(files.method, files.depth_mm): files.path for files in self._files}
+        """The files of the planes that have a depth."""
+        return {
+            (files.method, files.place): files.path for files in self._files if not isinstance(files.place, TiltedPlane)
+        }
 
     def focus(self) -> dict[str, Any] | None:
         """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
         if not self._with_focus:
             return None
         method = self._files[0].method
-        depths = list(self._grids)
+        depths = [place for place in self._grids if not isinstance(place, TiltedPlane)]
         curve = [_sum(self._finished[method, depth]["focus"]) for depth in depths]
         return {
             "depth_mm": depths,
@@ -253,6 +262,13 @@ class Sweep:
             "sigma_e2": [point.sigma_e2 for point in curve],
             "sharp_mm": sharp_depths_mm(depths, curve),
         }
+
+
+def _where(place: Place) -> dict[str, Any]:
+    """Return what reconstruction.json says of where a plane is."""
+    if isinstance(place, TiltedPlane):
+        return {"name": place.name, "depth_mm": place.depth_mm, "rt_ref_plane": list(place.rt_ref_plane)}
+    return {"depth_mm": place}
 
 
 def _sum(of_channels: Sequence[dict[str, float]]) -> Focus:

@@ -50,18 +50,22 @@ def view(directory: Path, /) -> dict[str, Any]:
 def _layers(directory: Path, folder: Path, result: dict[str, Any]) -> list[dict[str, Any]]:
     """Return what napari is told of the planes in one folder."""
     planes = planes_in_order(result["planes"])
-    method = planes[0]["method"]
+    tilted = {record["file"]: record for record in result["planes"] if "rt_ref_plane" in record}.values()
+    method = result["planes"][0]["method"]
     where = folder.relative_to(directory).as_posix()
     name = METHOD_NAMES.get(method, method) + (f", {where}" if where not in (".", method) else "")
+    alone = [_layer(folder, [plane], f"{name}, {plane['name']}") for plane in tilted]
+    if not planes:
+        return alone
     scale = stack_scale(planes)
     one_shape = len({tuple(record["shape"]) for record in planes}) == 1
     if len(planes) < _LEAST_DEPTHS_OF_A_STACK or scale.step_mm is None or not one_shape:
-        return [_layer(folder, [plane], f"{name}, {plane['depth_mm']:g} mm") for plane in planes]
+        return [*(_layer(folder, [plane], f"{name}, {plane['depth_mm']:g} mm") for plane in planes), *alone]
     layer = _layer(folder, planes, name)
     layer["scale"] = (scale.step_mm, scale.across, scale.across)
     layer["translate"] = (planes[0]["depth_mm"], scale.origin[1], scale.origin[0])
     layer |= {"units": ("mm", scale.unit, scale.unit), "axis_labels": ("depth", "y", "x")}
-    return [layer]
+    return [layer, *alone]
 
 
 def _layer(folder: Path, planes: Sequence[dict[str, Any]], name: str) -> dict[str, Any]:

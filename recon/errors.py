@@ -2,7 +2,8 @@
 
 ReconstructionError
 ├── GeometryMismatch
-└── NotConverged
+├── NotConverged
+└── NothingInFocus
 """
 
 
@@ -16,3 +17,7 @@ class GeometryMismatch(ReconstructionError):
 
 class NotConverged(ReconstructionError):
     """An iteration left the numbers it is defined on."""
+
+
+class NothingInFocus(ReconstructionError):
+    """At no depth do the views agree on anything that stands out of the noise."""

@@ -66,11 +66,11 @@ def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[Focus]) -> list[
     detail = np.array([point.detail_e2 for point in curve])[order]
     noise_e2 = float(np.median([point.sigma_e2 for point in curve]))
     least = max(_LEAST_PROMINENCE * float(np.ptp(detail)), _LEAST_SIGMAS * noise_e2)
-    peaks = [index for index in range(len(detail)) if _prominence(detail, index) > least]
+    peaks = [index for index in range(len(detail)) if prominence(detail, index) > least]
     return [_vertex(depth, detail, peak) for peak in peaks]
 
 
-def _prominence(curve: NDArray[np.floating], peak: int) -> float:
+def prominence(curve: NDArray[np.floating], peak: int) -> float:
     """Return how far one must come down from a peak before going up higher; zero beside a higher neighbour."""
     height = curve[peak]
     lowest = []

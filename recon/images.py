@@ -1,7 +1,7 @@
 """The data of a reconstruction: the elemental images of one scene in electrons, and what is known of their noise."""
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +92,30 @@ class ElementalImages:
             if not finite.all():
                 raise ValueError(f"view {view} has {np.count_nonzero(~finite)} pixels that are not finite numbers")
 
+    def binned(self, bins: int) -> "ElementalImages":
+        """Return the images with `bins` by `bins` pixels added up, as one pixel of a coarser detector would count them.
+
+        A sum of Poisson counts is one, and so is a sum of read noises: all that is said of images holds for these. A
+        bin counts where all its pixels do.
+        """
+        if bins == 1:
+            return self
+        background_e, variance_e2 = (
+            float(value) * bins**2 if np.ndim(value) == 0 else binned(np.asarray(value), bins) * bins**2
+            for value in (self.background_e, self.read_variance_e2)
+        )
+        electrons = np.stack([binned(image, bins) for image in self.electrons]) * self.electrons.dtype.type(bins**2)
+        valid = None if self.valid is None else np.stack([binned(image, bins) == 1 for image in self.valid])
+        return replace(self, electrons=electrons, background_e=background_e, read_variance_e2=variance_e2, valid=valid)
+
     def known_variance_e2(self) -> float | Image:
         """Return b + σ², the variance of a pixel beside that of the light, as far as the likelihood counts it."""
         share = self.likelihood.read_noise_share if self.likelihood.knows_read_noise else 0.0
         return self.background_e + share * self.read_variance_e2
+
+
+def binned(maps: NDArray[Any], bins: int) -> NDArray[Any]:
+    """Return the means of bins of maps (…, row, column), without what is left at the far edges."""
+    rows, columns = (size // bins for size in maps.shape[-2:])
+    whole = maps[..., : rows * bins, : columns * bins]
+    return np.asarray(whole.reshape(*maps.shape[:-2], rows, bins, columns, bins).mean(axis=(-3, -1)))

@@ -74,6 +74,8 @@ class PlaneOperator:
         self.dtype = self._scene.dtype
         self.images_shape = self._scene.images_shape
         self.all_views = self._scene.all_views
+        self.maps_shape = self._scene.maps_shape
+        self.lattice_of_view = self.all_views * 0 if lattice_of_view is None else lattice_of_view
 
     def forward(self, plane: Image, views: Views = None) -> Image:
         """Return H f: the plane (row, column) as each view sees it, (view, row, column)."""

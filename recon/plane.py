@@ -44,6 +44,11 @@ class PlaneGrid:
         rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
         return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
 
+    def binned(self, bins: int) -> "PlaneGrid":
+        """Return the grid whose samples each cover `bins` by `bins` of these, without what is left at the far edges."""
+        first = tuple(origin + self.pitch_mm * (bins - 1) / 2 for origin in self.origin_mm)
+        return PlaneGrid((self.shape[0] // bins, self.shape[1] // bins), self.pitch_mm * bins, (first[0], first[1]))
+
     def index_from_plane(self) -> NDArray[np.float64]:
         """Return the 3 x 3 matrix from plane coordinates (x, y, 1) in mm to sample indices (column, row, 1)."""
         x_mm, y_mm = self.origin_mm

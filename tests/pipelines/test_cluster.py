@@ -16,6 +16,7 @@ from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.files import UNFINISHED
 from pipelines.reconstruct import Request, reconstruct_set
 from pipelines.sweep import PlaneTask
+from pipelines.tilted import Place
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -56,7 +57,7 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
     request = Request(DEPTHS_MM, ["pmlem"], with_focus=True)
     reconstruct_set(loaded, tmp_path / "local", request)
     crew = crew_of(None, cluster.scheduler_address)
-    done: list[float] = []
+    done: list[Place] = []
 
     def killing(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         for task, words in crew(loaded, out, tasks):
@@ -71,7 +72,8 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
     assert ("processing", "released") in changes  # what it was at is taken from it
     # Nothing that is finished is done again, but for a plane nobody had been told of
     assert changes.count(("processing", "memory")) <= len(DEPTHS_MM) + 1
-    assert sorted(done) == DEPTHS_MM
+    assert {*done} == {*DEPTHS_MM}
+    assert len(done) == len(DEPTHS_MM)
     assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")
     assert not list((tmp_path / "spread").glob(f".*{UNFINISHED}"))
 

@@ -215,6 +215,7 @@ def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done:
     assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
     stated = {"method": "pmlem", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
     others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "uncertainty": False, "focus": False}
+    others |= {"depth_map": None, "plane_pose": {}}
     assert record["options"] == stated | others
 
 
@@ -376,7 +377,7 @@ def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> 
             "least squares has ratios below zero",
         ),
         (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
-        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different positive depths"),
+        (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different ends"),
         (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),
         (("--sweep-mm", "400:900:1"), 2, "at least 2 planes"),
         (("--sweep-mm", "500:500.3:7"), 2, "would share a file name; keep them 0.1 mm apart"),

@@ -1,0 +1,132 @@
+"""Depth maps and planes of best focus, on views that are evaluated from waves in closed form."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recon.best_focus import SURE, likeliest_depth_mm, places_of_focus
+from recon.depth import Agreement, agreement, bins_for, depth_map
+from recon.images import ElementalImages
+from recon.operator import PlaneOperator
+from recon.plane import PlaneGrid
+
+type Scene = Callable[[NDArray[np.floating], NDArray[np.floating], float], NDArray[np.floating]]
+
+SHAPE = (48, 96)
+OFFSETS = np.array([(row, column) for row in (-1, 0, 1) for column in (-2, -1, 0, 1, 2)], float)
+DISPARITIES = np.linspace(-3, 3, 25)
+DEPTHS_MM = 1 / np.linspace(1 / 400, 1 / 900, 25)
+NEAR, FAR = 17, 6  # what these planes' disparities are, the two halves of the scene move by
+
+
+def _waves(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
+    waves = 6 * np.cos(x * 0.9 + y * 0.4) + 6 * np.cos(x * 0.35 - y * 0.8 + 1) + 5 * np.sin(0.6 * x + 0.2 * y)
+    return np.asarray(20 + waves)
+
+
+def _two_halves(x: NDArray[np.floating], y: NDArray[np.floating], level: float) -> NDArray[np.floating]:
+    del level
+    return _waves(x, y)
+
+
+def _problem(texture: Scene, seed: int = 3, scale: float = 1.0) -> tuple[list[Agreement], ElementalImages]:
+    """The left half is near, the right half far; each pixel's place on either is known without any operator."""
+    rows, columns = np.indices(SHAPE, float)
+    middle = SHAPE[1] / 2
+    views = []
+    for down, right in OFFSETS:
+        near, far = (DISPARITIES[index] for index in (NEAR, FAR))
+        on_near = (columns + near * right, rows + near * down)
+        on_far = (columns + far * right, rows + far * down)
+        views.append(np.where(on_near[0] < middle, texture(*on_near, 0.0), texture(*on_far, 1.0)))
+    electrons = np.random.default_rng(seed).poisson(scale * np.array(views)).astype(np.float32)
+    images = ElementalImages(electrons, background_e=0.0, read_variance_e2=0.5)
+    rays = np.stack([columns, rows], axis=-1)
+    planes = []
+    for disparity in DISPARITIES:
+        homographies = np.stack([np.eye(3)] * len(OFFSETS))
+        homographies[:, :2, 2] = disparity * OFFSETS[:, ::-1]
+        planes.append(agreement(PlaneOperator(homographies, rays, PlaneGrid(SHAPE, 1.0, (0.0, 0.0))), images))
+    return planes, images
+
+
+@pytest.fixture(scope="module")
+def halves() -> list[Agreement]:
+    return _problem(_two_halves)[0]
+
+
+def test_each_half_is_where_it_is(halves: list[Agreement]) -> None:
+    found = depth_map(halves, DEPTHS_MM)
+    for part, truth in ((np.s_[6:-6, 8:40], NEAR), (np.s_[6:-6, 58:86], FAR)):
+        sure = found.confidence[part] >= SURE
+        assert sure.mean() > 0.8
+        assert np.median(np.abs(found.index[part][sure] - truth)) < 0.3
+        assert np.quantile(np.abs(found.index[part][sure] - truth), 0.95) < 1
+
+
+def test_the_squares_of_views_that_agree_are_as_many_as_their_degrees_of_freedom(halves: list[Agreement]) -> None:
+    plane, inner = halves[NEAR], np.s_[8:-8, 12:36]
+    per_freedom = plane.squares[inner].sum() / (plane.sensitivity[inner] - 1).sum()
+    assert 0.75 < per_freedom < 1.1  # interpolation takes some of the noise, and the model's own error is allowed for
+    assert halves[FAR].squares[inner].sum() > 1.5 * plane.squares[inner].sum()
+
+
+@pytest.mark.parametrize("level_e", [0.0, 20.0])
+def test_what_is_dark_or_alike_everywhere_is_not_sure(level_e: float) -> None:
+    def flat_right(x: NDArray[np.floating], y: NDArray[np.floating], far: float) -> NDArray[np.floating]:
+        return np.where(far, level_e, _waves(x, y))
+
+    found = depth_map(_problem(flat_right)[0], DEPTHS_MM)
+    assert (found.confidence[6:-6, 8:36] >= SURE).mean() > 0.8
+    assert (found.confidence[6:-6, 62:86] >= SURE).mean() < 0.02
+
+
+def test_the_ends_of_a_sweep_are_not_sure(halves: list[Agreement]) -> None:
+    found = depth_map(halves[: NEAR + 1], DEPTHS_MM[: NEAR + 1])
+    at_end = np.rint(found.index) >= NEAR - 0.25
+    assert at_end[6:-6, 8:40].mean() > 0.5
+    assert (found.confidence[at_end] < SURE).all()
+
+
+def test_both_planes_of_best_focus_are_found_and_refined(halves: list[Agreement]) -> None:
+    places = places_of_focus(depth_map(halves, DEPTHS_MM), len(DEPTHS_MM))
+    depths = [likeliest_depth_mm(halves, DEPTHS_MM.tolist(), place) for place in places]
+    # A sixth of a step of 1/depth
+    np.testing.assert_allclose(depths, DEPTHS_MM[[FAR, NEAR]], rtol=0.004)
+
+
+def test_noise_alone_has_no_plane_of_best_focus() -> None:
+    planes, _ = _problem(lambda x, y, far: np.full_like(x, 0.2) + 0 * y + 0 * far)
+    assert places_of_focus(depth_map(planes, DEPTHS_MM), len(DEPTHS_MM)) == []
+
+
+def test_less_light_takes_larger_bins() -> None:
+    rows, columns = np.indices(SHAPE, float)
+    operator = PlaneOperator(
+        np.stack([np.eye(3)] * len(OFFSETS)), np.stack([columns, rows], axis=-1), PlaneGrid(SHAPE, 1.0, (0.0, 0.0))
+    )
+    # A pixel of λ electrons and 0.5 e⁻² of read noise has the power ratio λ²/(λ + 0.5); k² of it must reach 2
+    for light_e, bins in ((30.0, 2), (1.0, 2), (0.4, 4), (0.2, 8)):
+        images = ElementalImages(
+            np.random.default_rng(1).poisson(np.full((len(OFFSETS), *SHAPE), light_e)).astype(np.float32),
+            background_e=0.0,
+            read_variance_e2=0.5,
+        )
+        assert bins_for(operator, images) == bins
+
+
+def test_bins_of_images_are_sums_and_count_where_all_their_pixels_do() -> None:
+    generator = np.random.default_rng(4)
+    electrons = generator.poisson(5, (2, 7, 9)).astype(np.float32)
+    valid = np.ones(electrons.shape, bool)
+    valid[1, 3, 4] = False
+    background_e = generator.uniform(1, 2, (1, 7, 9))
+    found = ElementalImages(electrons, background_e, 3.0, valid).binned(2)
+    assert found.electrons.shape == (2, 3, 4)
+    assert found.electrons[1, 2, 3] == electrons[1, 4:6, 6:8].sum()
+    np.testing.assert_allclose(np.asarray(found.background_e)[0, 1, 1], background_e[0, 2:4, 2:4].sum(), rtol=1e-6)
+    assert found.read_variance_e2 == 12.0
+    assert found.valid is not None
+    assert np.argwhere(~found.valid).tolist() == [[1, 1, 2]]
