@@ -110,7 +110,7 @@ def _plane(path: Path, pose: _Pose) -> TiltedPlane:
         raise BadValue(f"{where}: is no name for files; take a letter and then letters, digits or hyphens, 40 at most")
     given = (pose.rt_ref_plane is not None, pose.point_mm is not None, pose.normal is not None)
     if given not in ((True, False, False), (False, True, True)):
-        raise BadValue(f"{where}: give rt_ref_plane, or point_mm and normal, and not both")
+        raise BadValue(f"{where}: has no pose, or two; give either rt_ref_plane, or point_mm and normal")
     if pose.size_mm is not None and not min(pose.size_mm) > 0:
         raise BadValue(f"{where}: size_mm = {list(pose.size_mm)} is no size; give a width and a height above zero")
     if pose.rt_ref_plane is not None:

@@ -14,7 +14,7 @@ from recon.posed import Posed
 _HELD_OUT = 7
 
 # So many numbers are predicted at least, by several folds if need be: the score of a few is mostly chance.
-_LEAST_PREDICTED = 2e6
+_LEAST_PREDICTED = 6e5
 
 # With fewer views than this there is too little to predict, and too little to predict it from.
 LEAST_VIEWS = 4

@@ -1,8 +1,6 @@
 """The nearest plane of little penalty: `min ½ Σ w (x − v)² + β Σ φ(|∇x|)` over x ≥ 0, by its dual, to a proven gap."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -14,6 +12,7 @@ from numpy.typing import NDArray
 from recon import proximal_kernels
 from recon.images import Image
 from recon.penalties import Penalty
+from recon.threads import at_once
 
 # Steps that a strip makes before it exchanges its edges with its neighbours, and the least rows of a strip.
 _STEPS_AT_ONCE = 10
@@ -69,15 +68,16 @@ class DualField:
     def plane(self, centre: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (row, column), not clipped at zero."""
         plane = np.empty_like(centre)
-        with self._strips(centre.shape[0]) as each:
-            each(lambda a, b: proximal_kernels.plane_of_dual(a, b, self.vectors, centre, reach, plane))
+        rows = centre.shape[0]
+        self._each_strip(rows, lambda a, b: proximal_kernels.plane_of_dual(a, b, self.vectors, centre, reach, plane))
         return plane
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
         """Return `Σ φ(|∇x|)` of a plane, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x."""
         shape = (penalty.smoothing_e, penalty.bounded)
-        with self._strips(plane.shape[0]) as each:
-            sums = each(lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, self.vectors, *shape))
+        sums = self._each_strip(
+            plane.shape[0], lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, self.vectors, *shape)
+        )
         return sum(part[0] for part in sums), sum(part[1] for part in sums)
 
     def nearest(
@@ -106,37 +106,33 @@ class DualField:
         ahead, made, momentum = self.vectors.copy(), 0, 1.0
         spare = np.empty_like(self.vectors), np.empty_like(self.vectors)
         shape = (penalty.smoothing_e, penalty.bounded)
-        with self._strips(centre.shape[0]) as each:
-            while True:
-                for _ in range(_EXCHANGES_PER_CHECK):
-                    momenta, momentum = _momenta(momentum)
-                    arrays = (self.vectors, ahead, *spare, centre, reach, steps)
-                    uphill = each(
-                        lambda a, b, arrays=arrays, momenta=momenta: proximal_kernels.step_strip(
-                            a, b, *arrays, *shape, momenta
-                        )
-                    )
-                    old, (self.vectors, ahead) = (self.vectors, ahead), spare
-                    spare = old
-                    made += momenta.size
-                    if sum(uphill) > 0:
-                        ahead[:], momentum = self.vectors, 1.0
-                plane = np.maximum(self.plane(centre, reach), 0)
-                gap = weight * self.penalty_and_slack(plane, penalty)[1]
-                if made >= most or gap <= enough(plane):
-                    return Nearest(plane, gap, made)
+        while True:
+            for _ in range(_EXCHANGES_PER_CHECK):
+                momenta, momentum = _momenta(momentum)
+                arrays = (self.vectors, ahead, *spare, centre, reach, steps)
+                uphill = self._steps(arrays, (*shape, momenta))
+                old, (self.vectors, ahead) = (self.vectors, ahead), spare
+                spare = old
+                made += momenta.size
+                if uphill > 0:
+                    ahead[:], momentum = self.vectors, 1.0
+            plane = np.maximum(self.plane(centre, reach), 0)
+            gap = weight * self.penalty_and_slack(plane, penalty)[1]
+            if made >= most or gap <= enough(plane):
+                return Nearest(plane, gap, made)
 
-    @contextmanager
-    def _strips(self, rows: int) -> Iterator[Callable[..., list[Any]]]:
-        """Yield a way to call a function for every strip of rows, in threads when there are several."""
+    def _steps(self, arrays: tuple[Image, ...], options: tuple[Any, ...]) -> float:
+        """Make some steps on all strips; return how far they and the acceleration disagree, above 0 for uphill."""
+        sums = self._each_strip(
+            self.vectors.shape[1], lambda a, b: proximal_kernels.step_strip(a, b, *arrays, *options)
+        )
+        return float(sum(sums))
+
+    def _each_strip[Result](self, rows: int, work: Callable[[int, int], Result]) -> list[Result]:
+        """Call a function for the first and last row of every strip, in threads when there are several."""
         count = max(1, min(self.workers, rows // _STRIP_ROWS))
         edges = np.linspace(0, rows, count + 1).astype(int).tolist()
-        pairs = list(pairwise(edges))
-        if count == 1:
-            yield lambda work: [work(*pairs[0])]
-            return
-        with ThreadPoolExecutor(self.workers) as pool:
-            yield lambda work: list(pool.map(lambda pair: work(*pair), pairs))
+        return at_once(lambda strip: work(*strip), list(pairwise(edges)))
 
 
 def compile_kernels() -> None:

@@ -1,7 +1,6 @@
 """H of several planes at once: what each detector pixel of each view sees of a scene, and the exact adjoint."""
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -13,6 +12,7 @@ from recon.errors import GeometryMismatch
 from recon.geometry import checked_geometry
 from recon.images import ElementalImages, Image
 from recon.plane import PlaneGrid
+from recon.threads import at_once
 
 type Views = Sequence[int] | NDArray[np.integer] | None
 
@@ -165,7 +165,7 @@ class SceneOperator:
                 self._workers,
             )
 
-        _on_all(work, self._workers)
+        at_once(work, range(self._workers))
         for other in sums[1:]:
             sums[0] += other
         return sum(values), self.planes_of(sums[0]) if scatters else []
@@ -228,15 +228,3 @@ def _read_only[Number: np.generic](array: NDArray[Number]) -> NDArray[Number]:
     flat = array.reshape(-1)
     flat.flags.writeable = False
     return flat
-
-
-def _on_all(work: Callable[[int], None], workers: int) -> None:
-    """Call `work` for each worker at the same time, the first of them in the caller's own thread."""
-    if workers == 1:
-        work(0)
-        return
-    with ThreadPoolExecutor(workers - 1) as pool:
-        others = [pool.submit(work, worker) for worker in range(1, workers)]
-        work(0)
-    for other in others:
-        other.result()

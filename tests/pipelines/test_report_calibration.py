@@ -94,7 +94,7 @@ def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_pa
         shutil.copytree(drawn, session / "reconstructions" / where)
         done("report", session)
         title = "bright set: back-projection" if "bright" in where else "back-projection"
-        assert f'alt="{title} at 500.0 mm"' in (session / "report.html").read_text()
+        assert f'alt="{title} at 500 mm"' in (session / "report.html").read_text()
 
 
 def test_a_page_says_whether_its_planes_were_made_with_the_calibration(session: Path, done: Command) -> None:
