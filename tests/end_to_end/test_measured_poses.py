@@ -4,6 +4,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pytest
 
 from calib.board import Board
 from pipelines.elemental_set import ElementalSet, load_set, write_set
@@ -17,6 +18,7 @@ from rig.simulation.experiment import paper_experiment
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(3)]
 
 
+@pytest.mark.slow
 def test_measured_poses_are_as_good_as_true_ones_and_nominal_ones_are_not(tmp_path: Path) -> None:
     scene, boards = tmp_path / "scene", tmp_path / "boards"
     simulate(scene, size_px=(320, 240), poses="nominal", seed=2)  # 7 x 7 nodes, SNR 0.16

@@ -97,7 +97,7 @@ def test_ctrl_c_in_the_middle_of_a_simulation_leaves_nothing(tmp_path: Path) -> 
 
 def test_ctrl_c_in_the_middle_of_a_reconstruction_keeps_what_was_finished(small_set: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with _started(["reconstruct", small_set, "--out", out, "--sweep-mm", "400:900:2000"]) as process:
+    with _started(["reconstruct", small_set, "--out", out, "--sweep-mm", "400:900:500"]) as process:
         _wait_until(process, lambda: (out / "plane_00401.0.tiff").exists())
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=_DEADLINE_S)

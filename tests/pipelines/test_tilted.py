@@ -157,8 +157,8 @@ def test_any_normal_becomes_a_pose_whose_plane_holds_the_point(
     ("plane", "failure", "said"),
     [
         ({"name": "00600.0", "rt_ref_plane": [0.0] * 5 + [600.0]}, BadValue, "is no name for files"),
-        ({"name": "a"}, BadValue, "give rt_ref_plane, or point_mm and normal"),
-        ({"name": "a", "point_mm": [0, 0, 1.0]}, BadValue, "give rt_ref_plane, or point_mm and normal"),
+        ({"name": "a"}, BadValue, "give either rt_ref_plane, or point_mm and normal"),
+        ({"name": "a", "point_mm": [0, 0, 1.0]}, BadValue, "give either rt_ref_plane, or point_mm and normal"),
         ({"name": "a", "point_mm": [0, 0, 1.0], "normal": [0, 0, 0]}, BadValue, "has no direction"),
         ({"name": "a", "rt_ref_plane": [0.0] * 6, "size_mm": [0, 1]}, BadValue, "is no size"),
         ({"name": "a", "rt": [0.0] * 6}, UnknownKey, "'plane[0].rt' is not a key"),

@@ -96,6 +96,7 @@ def take(seed: int, **changes: object) -> list[Series]:
     return [measure_series(frames, Conditions("dark", t)) for t, frames in taken.items()]
 
 
+@pytest.mark.slow
 def test_below_an_electron_of_read_noise_the_exact_mass_function_reaches_the_bound() -> None:
     repeats, shape = 60, (48, 48)
     truth = {"gain_dn_per_e": 2.0, "read_noise_e": 0.3, "dark_current_e_per_s": 0.2}
@@ -123,6 +124,7 @@ def bound_of_exact(read_noise_e: float, pixels: float) -> NDArray[np.float64]:
     return np.sqrt(np.diag(np.linalg.inv(scores[np.ix_(free, free)] * pixels / sampled)))[:3]
 
 
+@pytest.mark.slow
 def test_values_cut_off_at_black_leave_no_bias() -> None:
     """A third of the short darks' values are; moments would have the gain half as large again."""
     truth = {"gain_dn_per_e": 2.0, "read_noise_e": 12.0**0.5, "dark_current_e_per_s": 0.2}

@@ -90,7 +90,13 @@ def test_bound_falls_with_the_root_of_the_pixels() -> None:
     assert many["gain_dn_per_e"] / 2.0 == pytest.approx(0.0038, rel=0.05)
 
 
-@pytest.mark.parametrize("rough", [False, True], ids=["plain", "jitter, banding, hot pixels, DCNU"])
+@pytest.mark.parametrize(
+    "rough",
+    [
+        pytest.param(False, id="plain"),
+        pytest.param(True, id="jitter, banding, hot pixels, DCNU", marks=pytest.mark.slow),
+    ],
+)
 def test_errors_reach_the_bound_and_intervals_cover(rough: bool) -> None:
     repeats, first_seed = 200, 1000
     faults = {"jitter_dn": 1.0, "banding_dn": 1.0, "hot_fraction": 0.005, "dcnu": 0.1} if rough else {}
