@@ -25,6 +25,7 @@ _MEANING = {
     "scipy_csr_over_ours_computing": "scipy CSR over ours, in computing seconds of all threads together",
     "cv2_warp_pair_over_ours_computing": "a pair of OpenCV warps over ours, likewise",
     "ours_over_reading_the_images": "ours over the floor: reading the images once with all threads",
+    "with_likelihood_over_pass": "a pass that also returns the likelihood, as PMLEM's do, over one that does not",
     "bandwidth_gb_per_s": "memory bandwidth of that reading (GB/s)",
     "one_thread_over_all_threads": "one thread over all threads",
     "four_times_the_views_over_proportion": "time for four times the views, over four times the time",

@@ -23,9 +23,11 @@ type Run = Callable[[], object]
 def compare_passes(problem: Problem, rounds: int) -> dict[str, float]:
     """Return how many times longer than ours each peer takes, and how many times ours the reading of the data."""
     few = np.arange(0, len(problem.poses), 4)  # all matrices are 3 GB, and take a minute to build
-    contenders = {
+    operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
+    contenders: dict[str, Run] = {
         "ours": fused_pass(problem),
         "ours_of_few": fused_pass(problem, few),
+        "with_value": lambda: operator.value_and_ratio(plane, problem.images),
         "csr_of_few": sparse_pass(problem, few),
         "warp": warp_pass(problem),
         "floor": reading(problem.images.electrons),
@@ -38,6 +40,7 @@ def compare_passes(problem: Problem, rounds: int) -> dict[str, float]:
         "scipy_csr_over_ours_computing": computed["csr_of_few"] / computed["ours_of_few"],
         "cv2_warp_pair_over_ours_computing": computed["warp"] / computed["ours"],
         "ours_over_reading_the_images": seconds["ours"] / seconds["floor"],
+        "with_likelihood_over_pass": seconds["with_value"] / seconds["ours"],
         "bandwidth_gb_per_s": problem.images.electrons.nbytes / seconds["floor"] / 1e9,
     }
 
@@ -93,7 +96,7 @@ def _scene_pass(problem: Problem, depths_mm: tuple[float, ...]) -> Run:
         valid=problem.images.valid,
     )
     planes = [np.ones(grid.shape, np.float32) for grid in scene.grids]
-    return lambda: scene.value_and_ratio(planes, problem.images)
+    return lambda: scene.adjoint_of_ratio(planes, problem.images)
 
 
 def sparse_pass(problem: Problem, views: NDArray[np.intp]) -> Run:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from recon.elementary import compiled, inlined
 from recon.pixel_models import WORK_ROWS, form_ratio_of_block
-from recon.pointers import advanced, index, pointer
+from recon.pointers import advanced, index, pointer, wanted_soon
 
 BLOCK_PX = 64
 TILE_ROWS = 8
@@ -38,12 +38,13 @@ COLUMN_TAPS, ROW_TAPS = 4, 3
 # of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
 EDGE_TOLERANCE = 1e-3
 
-FORWARD, ADJOINT, RATIO, VALUE, REACH = 0, 1, 2, 3, 4
+FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH = 0, 1, 2, 3, 4, 5
 # How a block lies on a plane; in step with it, by how many rows and columns of taps it needs.
 _OUTSIDE, _SCATTERED, _IN_STEP_2_2, _IN_STEP_2_3, _IN_STEP_3_3, _IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
 
 # Vectors are fastest where they do not straddle the processor's cache lines.
 _LINE_BYTES = 64
+_LINE_PX = 16  # of float32
 
 # Where the rows of the scratch begin. Rows of shifted products have a margin on either side that stays zero.
 _EXPECTED, _COUNTED = 0, BLOCK_PX
@@ -360,17 +361,24 @@ def _weigh(factors, pixel, to_next_plane, planes, count, scratch):
 
 @compiled
 def _gather(samples, layout, planes, scratch, blocks):
-    """Set `_EXPECTED` to what a block's pixels see of all planes, and `_COUNTED` to their greatest weight."""
+    """Set `_EXPECTED` to what a block's pixels see of all planes, and `_COUNTED` to their greatest weight.
+
+    Of one plane alone, the weights themselves say which pixels count.
+    """
     zero = type(scratch[0])(0)
-    for k in range(index(2 * BLOCK_PX)):
+    for k in range(index(BLOCK_PX)):
         scratch[index(_EXPECTED) + k] = zero
+    if planes > 1:
+        for k in range(index(BLOCK_PX)):
+            scratch[index(_COUNTED) + k] = zero
     for plane in range(index(planes)):
         block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
         if blocks[block] == _OUTSIDE:
             continue
-        for k in range(index(BLOCK_PX)):
-            at = index(_COUNTED) + k
-            scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
+        if planes > 1:
+            for k in range(index(BLOCK_PX)):
+                at = index(_COUNTED) + k
+                scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
         if blocks[block] > _SCATTERED:
             start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
             _gather_in_step(blocks[block], samples, start, width, row, column, scratch, place)
@@ -425,7 +433,8 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     operation : int
         `FORWARD`: seen ← H planes, where not zero. `ADJOINT`: accumulator += Hᵀ images.
         `RATIO`: accumulator += Hᵀ r, with the ratio r that the model of the pixels makes of images and H planes.
-        `VALUE`: only what is returned, which is zero unless the operation is this or `RATIO`.
+        `VALUE`: only what is returned, which has no meaning unless the operation is this or the next.
+        `VALUE_AND_RATIO`: both; the logarithms of the value are a tenth of the time.
         `REACH`: geometry.reach ← where rows meet the planes; it must go over all views, and come first.
         What an operation does not name, it leaves alone.
     planes, accumulator : array (sample,)
@@ -441,7 +450,8 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     count_of_planes, count_of_views = geometry.layout.shape[0], index(geometry.lattice_of_view.size)
     samples = accumulator.size if operation == ADJOINT else planes.size
     scratch, blocks, layout = pointer(space.scratch), pointer(space.blocks), pointer(geometry.layout)
-    expected, counted, models = scratch, advanced(scratch, index(_COUNTED)), pointer(space.models)
+    expected, models = scratch, pointer(space.models)
+    counted = advanced(scratch, index(_COUNTED) if count_of_planes > 1 else _place(index(0)) + index(_WEIGHT))
     homographies, maps, layer = (
         pointer(geometry.homographies),
         pointer(geometry.maps),
@@ -477,6 +487,9 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     if occluded:
                         _weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
                     pixel = index((image * rows + row) * columns + first)
+                    # Processors look ahead within a page of memory, and the next row begins another
+                    for k in range(index(0), index(BLOCK_PX), index(_LINE_PX)):
+                        wanted_soon(images_at, pixel + index(columns) + k)
                     if operation == ADJOINT:
                         _copy(images_at, pixel, scratch, index(_EXPECTED), count)
                     else:
@@ -488,7 +501,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                         at = index((lattice * rows + row) * columns + first)
                         value += form_ratio_of_block(
                             model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
-                            advanced(variance_at, at), counted, level, models,
+                            advanced(variance_at, at), counted, level, models, operation != RATIO,
                         )  # fmt: skip
                     if operation != VALUE:
                         _scatter(added_at, layout, count_of_planes, scratch, blocks)

@@ -108,7 +108,7 @@ class PlaneOperator:
 
     def adjoint_of_ratio(self, plane: Image, images: ElementalImages, views: Views = None) -> Image:
         """Return Hᵀ r (row, column) alone: for shifted Poisson data Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ], as in eq. (2)."""
-        return self.value_and_ratio(plane, images, views)[1]
+        return self._scene.adjoint_of_ratio([plane], images, views)[0]
 
     def negative_log_likelihood(self, plane: Image, images: ElementalImages, views: Views = None) -> float:
         """Return the negative log-likelihood alone, in a sweep that only reads."""

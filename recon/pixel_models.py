@@ -60,17 +60,30 @@ def form_ratio(model, expected, observed, background, variance, response, level,
         pointer(response),
         level,
         pointer(work),
+        True,
     )
 
 
 @compiled
-def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work):
-    """Do as `form_ratio` does, with pointers to `count` numbers each."""
+def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work, with_value):
+    """Do as `form_ratio` does, with pointers to `count` numbers each; the value may be left out where it costs."""
     if model == POISSON_GAUSSIAN:
         return _poisson_gaussian(count, expected, observed, background, variance, response, work)
     if model == LEAST_SQUARES:
         return _least_squares(count, expected, observed, background, variance, response, level)
-    return _shifted_poisson(count, expected, observed, background, variance, response)
+    if with_value:
+        return _shifted_poisson(count, expected, observed, background, variance, response)
+    return _shifted_poisson_ratio(count, expected, observed, background, variance)
+
+
+@compiled
+def _shifted_poisson_ratio(count, expected, observed, background, variance):
+    zero = type(expected[0])(0)
+    for k in range(count):
+        shifted = max(observed[k] + variance[k], zero)
+        mean = expected[k] + background[k] + variance[k]
+        expected[k] = shifted / mean if mean > zero else zero
+    return 0.0
 
 
 @compiled

@@ -6,7 +6,9 @@ is indexed like an array, `pointer[k]`, and costs nothing; whoever makes one kee
 """
 
 import numpy as np
+from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 # Unsigned: numba would test signed indices for being negative, which keeps loops from becoming vectors
@@ -31,3 +33,18 @@ def advanced(_context, begin, count):
         return builder.gep(arguments[0], [arguments[1]])
 
     return begin(begin, count), build
+
+
+@intrinsic
+def wanted_soon(_context, begin, count):
+    """Ask for the numbers of a cache line, `count` numbers behind a pointer, to be read from memory meanwhile."""
+
+    def build(context, builder, _, arguments):
+        place = builder.bitcast(builder.gep(arguments[0], [arguments[1]]), cgutils.voidptr_t)
+        read, nearest, data = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
+        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, read.type, nearest.type, data.type])
+        prefetch = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(prefetch, [place, read, nearest, data])
+        return context.get_dummy_value()
+
+    return types.void(begin, count), build

@@ -109,7 +109,11 @@ class SceneOperator:
         r is the ratio of `recon.pixel_models`: the negative log-likelihood has the derivatives s_z − H_zᵀ r. Terms that
         depend on no plane are left out.
         """
-        return self._likelihood(kernels.RATIO, planes, images, views)
+        return self._likelihood(kernels.VALUE_AND_RATIO, planes, images, views)
+
+    def adjoint_of_ratio(self, planes: Sequence[Image], images: ElementalImages, views: Views = None) -> list[Image]:
+        """Return H_zᵀ r (row, column) of each plane alone: a pass of an EM iteration."""
+        return self._likelihood(kernels.RATIO, planes, images, views)[1]
 
     def negative_log_likelihood(self, planes: Sequence[Image], images: ElementalImages, views: Views = None) -> float:
         """Return the negative log-likelihood alone, in a sweep that only reads."""
@@ -144,7 +148,7 @@ class SceneOperator:
     ) -> tuple[float, list[Image]]:
         """Run one kernel on all workers and return the sums of their values and of their accumulators."""
         nothing = _read_only(np.zeros(1, self.dtype))
-        scatters = operation in (kernels.ADJOINT, kernels.RATIO)
+        scatters = operation in (kernels.ADJOINT, kernels.RATIO, kernels.VALUE_AND_RATIO)
         size = sum(grid.shape[0] * grid.shape[1] for grid in self.grids) if scatters else 1
         sums = [np.zeros(size, self.dtype) for _ in range(self._workers)]
         values = [0.0] * self._workers
