@@ -4,6 +4,7 @@ The machine may be busy: times are taken in turns, and reported are medians over
 """
 
 import argparse
+import importlib.util
 import json
 import os
 import platform
@@ -75,9 +76,16 @@ def table(figures: dict[str, Any]) -> str:
     """Return the figures as a table in Markdown."""
     lines = ["| figure | value |", "|---|---|"]
     for name, value in figures.items():
-        shown = "not reached, or not installed" if value is None else f"{value:.4g}"
-        lines.append(f"| {_MEANING[name]} | {shown} |")
+        lines.append(f"| {_MEANING[name]} | {_shown(name, value)} |")
     return "\n".join(lines) + "\n"
+
+
+def _shown(name: str, value: float | None) -> str:
+    """Return a figure as text, and why there is none."""
+    if value is not None:
+        return f"{value:.4g}"
+    missing = "pyproximal" in name and importlib.util.find_spec("pyproximal") is None
+    return "pyproximal is not installed" if missing else "not reached within the limit"
 
 
 def main() -> None:
