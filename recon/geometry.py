@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.blocks import BLOCK_PX
 from recon.errors import GeometryMismatch
-from recon.kernels import BLOCK_PX, Geometry
+from recon.kernels import Geometry
 from recon.plane import PlaneGrid
 
 

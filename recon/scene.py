@@ -7,7 +7,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from recon import kernels
+from recon import blocks, kernels
 from recon.errors import GeometryMismatch
 from recon.geometry import checked_geometry
 from recon.images import ElementalImages, Image
@@ -163,7 +163,7 @@ class SceneOperator:
                 _read_only(image_of_view),
                 pixels or kernels.PixelModel(0, nothing, nothing, 0.0),
                 self._geometry,
-                kernels.workspace(len(self.grids), self.dtype),
+                blocks.workspace(len(self.grids), self.dtype),
                 _read_only(views),
                 worker,
                 self._workers,

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from calib.lens import Lens
+from recon.blocks import EDGE_TOLERANCE
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages, Image
-from recon.kernels import EDGE_TOLERANCE
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
 from rig.simulation.optics import SimulatedOptics

@@ -13,6 +13,7 @@ from scipy.ndimage import map_coordinates
 from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from calib.lens import Lens
 from recon import kernels
+from recon.blocks import BLOCK_PX
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages, Image
 from recon.operator import PlaneOperator
@@ -20,7 +21,7 @@ from recon.plane import PlaneGrid
 from recon.scene import SceneOperator
 
 # Four blocks of pixels and a rest; poses in step with the planes, turned so that they are not, and far aside
-LENS = Lens((4 * kernels.BLOCK_PX + 9, 13), 300.0, 300.0, 130.2, 6.1, (-0.08, 0.02))
+LENS = Lens((4 * BLOCK_PX + 9, 13), 300.0, 300.0, 130.2, 6.1, (-0.08, 0.02))
 POSES = np.array([[0.0] * 6, [2e-3, -3e-3, 4e-3, 30, -4, 3], [0, 0, 0.2, -20, 5, 0], [0, 0, 0, -190, 0, 0]])
 DEPTHS_MM = (400.0, 500.0, 900.0)
 GRIDS = tuple(
