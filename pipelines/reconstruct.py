@@ -173,14 +173,7 @@ def reconstruct(
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
     tilted = [plane for path in plane_pose or [] for plane in read_plane_poses(path)]
-    if has_session(elemental_set):
-        loaded = load_session(elemental_set, scene, geometry)
-        out = out or elemental_set / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
-    elif out is None:
-        raise WrongUsage("no folder for the results is named; give --out")
-    else:
-        loaded = load_set(elemental_set)
-        loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
+    loaded, out = _opened(elemental_set, out, scene, geometry)
     swept_of_px = depths_by_disparity(loaded, swept_px)
     of_disparity = depths_by_disparity(loaded, disparity_px or []) | swept_of_px
     depths = [*(depth for depth in depth_mm or [] if depth != "auto"), *swept, *of_disparity]
@@ -206,6 +199,17 @@ def reconstruct(
         found=found.record if found else None,
     )
     return reconstruct_set(loaded, out, request, crew)
+
+
+def _opened(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> tuple[LoadedSet, Path]:
+    """Return a set, or that of a session, and where its results go."""
+    if has_session(folder):
+        loaded = load_session(folder, scene, geometry)
+        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    if out is None:
+        raise WrongUsage("no folder for the results is named; give --out")
+    loaded = load_set(folder)
+    return loaded if geometry is None else with_measured_geometry(loaded, geometry), out
 
 
 def _found(

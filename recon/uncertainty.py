@@ -1,3 +1,4 @@
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """How sure a penalised plane is: the spread of the planes that data and penalty allow, sample by sample."""
 
 from concurrent.futures import ThreadPoolExecutor
@@ -109,7 +110,7 @@ def _draw(w: Image, curvature: Image, white: Image, of_edges: Image, start: Imag
 
 
 @numba.njit(cache=True, nogil=True)
-def _precision(w, curvature, x, out):  # type: ignore[no-untyped-def]
+def _precision(w, curvature, x, out):
     """Set `out` to `(W + ∇ᵀ D ∇) x`."""
     rows, columns = x.shape
     for i in range(rows):
