@@ -41,6 +41,12 @@ class Tab:
         """Go to an address."""
         self.call("Page.navigate", url=url)
 
+    def reload(self) -> None:
+        """Load the page again and wait for it: what is asked of a page that is about to go is never answered."""
+        self.call("Page.reload")
+        while self._next().get("method") != "Page.loadEventFired":
+            pass
+
     def evaluate(self, expression: str) -> Any:
         """Return the value of a JavaScript expression, waiting for it if it is a promise."""
         answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
@@ -75,7 +81,7 @@ class Tab:
         self.evaluate(f"{button}.click()")
 
     def _call(self, method: str, parameters: dict[str, Any], session: str | None) -> dict[str, Any]:
-        """Send a request and return its result; what else comes is noted if it is a complaint."""
+        """Send a request and return its result."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if session is not None:
@@ -86,19 +92,20 @@ class Tab:
             if answer.get("id") == self._number:
                 assert "error" not in answer, answer
                 return dict(answer["result"])
-            if answer.get("method") == "Runtime.exceptionThrown" or (
-                answer.get("method") == "Log.entryAdded" and answer["params"]["entry"]["level"] == "error"
-            ):
-                self.complaints.append(json.dumps(answer["params"]))
 
     def _next(self) -> dict[str, Any]:
-        """Return the next message."""
+        """Return the next message, noting it if it is a complaint."""
         while b"\0" not in self._buffer:
             data = os.read(self._receive, 1 << 16)
             assert data, "the browser has ended"
             self._buffer += data
         message, _, self._buffer = self._buffer.partition(b"\0")
-        return dict(json.loads(message))
+        said = json.loads(message)
+        if said.get("method") == "Runtime.exceptionThrown" or (
+            said.get("method") == "Log.entryAdded" and said["params"]["entry"]["level"] == "error"
+        ):
+            self.complaints.append(json.dumps(said["params"]))
+        return dict(said)
 
 
 @contextmanager

@@ -129,6 +129,7 @@ def test_the_report_shows_what_was_measured_and_what_it_is_compared_with(metrics
     assert "The noise reference" in shown
 
 
+@pytest.mark.slow
 def test_memory_of_a_reconstruction_is_bounded_by_its_images(tmp_path: Path) -> None:
     """At most 1.5 times the images as float32 and 200 MB, with the kernels compiled already."""
     simulated = _run(["simulate", str(tmp_path / "scene")])

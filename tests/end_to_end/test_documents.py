@@ -31,7 +31,7 @@ def test_there_are_examples_for_the_shell_and_for_python(document: str) -> None:
 
 @pytest.mark.timeout(240)
 @pytest.mark.parametrize(
-    "document", [pytest.param(it, marks=pytest.mark.slow if it == "docs/guide.md" else ()) for it in DOCUMENTS]
+    "document", [pytest.param(it, marks=() if it == "docs/api.md" else pytest.mark.slow) for it in DOCUMENTS]
 )
 def test_its_examples_run_one_after_the_other(document: str, tmp_path: Path) -> None:
     environment = os.environ | {

@@ -179,7 +179,7 @@ def test_in_the_dark_room_it_is_red_and_dim_all_over(page: Tab) -> None:
         blue, green, red = cv2.split(_screen(page))
         assert max(int(blue.max()), int(green.max())) <= 5
         assert 60 < red.max() <= 210
-    page.evaluate("location.reload()")
+    page.reload()
     page.wait_until("document.documentElement.className === 'red'")  # it is remembered
     page.evaluate("localStorage.clear()")
 

@@ -28,13 +28,10 @@ def test_every_example_is_a_call_of_its_command(command: Command) -> None:
 
 
 @pytest.mark.parametrize("command", EXAMPLES, ids=lambda command: command.example)
-def test_every_help_ends_with_its_example(
-    command: Command, faintfield: Callable[..., CompletedProcess[str]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "200")
+def test_every_help_ends_with_its_example(command: Command, faintfield: Callable[..., CompletedProcess[str]]) -> None:
     words = shlex.split(command.example)
     said = faintfield(*words[: words.index(command.name) + 1], "--help").stdout
-    assert said.rstrip().splitlines()[-1].rstrip() == f"Example: faintfield {command.example}"
+    assert " ".join(said.split()).endswith(f" Example: faintfield {command.example}")  # wrapped at the console's width
 
 
 def test_groups_stand_in_the_order_of_an_experiment(faintfield: Callable[..., CompletedProcess[str]]) -> None:

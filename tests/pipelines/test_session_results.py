@@ -90,7 +90,11 @@ class TestRun:
 
     @pytest.mark.parametrize(
         ("kind", "steps"),
-        [("dark_scene", ["reconstruct"]), ("charuco", ["geometry", "reconstruct"]), ("flat", ["noise", "reconstruct"])],
+        [
+            ("dark_scene", ["reconstruct"]),
+            pytest.param("charuco", ["geometry", "reconstruct"], marks=pytest.mark.slow),
+            ("flat", ["noise", "reconstruct"]),
+        ],
     )
     def test_a_frame_that_is_not_what_was_captured_is_named(
         self, kind: str, steps: list[str], session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
