@@ -5,6 +5,7 @@ A descriptor is a text file of one-letter lines: `v` release, `n` bits width hei
 are relative, often with backslashes; decimals may be commas; `#` begins a comment.
 """
 
+import math
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
@@ -53,7 +54,9 @@ def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, Any]:
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)
         write_noise_set(folder, NoiseSet(1, frames, saturation_dn))
-        write_json(folder / "provenance.json", provenance("import emva1288", {}, {descriptor.name: sha256(descriptor)}))
+        inputs = {frame.file: sha256(source) for frame, source in zip(read.frames, sources, strict=True)}
+        inputs |= {descriptor.name: sha256(descriptor)}
+        write_json(folder / "provenance.json", provenance("import emva1288", {}, inputs))
     say(f"{out / FILE_NAME}: {len(frames)} frames of EMVA 1288 release {read.release or 'unstated'} data")
     return {"out": str(out), "frames": len(frames), "release": read.release, "saturation_dn": saturation_dn}
 
@@ -79,7 +82,7 @@ def parse_descriptor(path: Path) -> Descriptor:
                 if current is None:
                     raise ValueError("an image before any 'b' or 'd' line")
                 read.frames.append(_with_file(current, rest.strip()))
-            elif keyword in "bd":
+            elif keyword in ("b", "d"):
                 current = _measurement(keyword, rest, levels)
             elif keyword == "v":
                 read.release = rest.strip()
@@ -104,6 +107,8 @@ def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFram
     numbers = [float(word.replace(",", ".")) for word in rest.split()]
     if len(numbers) != (2 if keyword == "b" else 1):
         raise ValueError("give 'b exposure photons' or 'd exposure'")
+    if not all(0 <= number < math.inf for number in numbers):
+        raise ValueError("exposures and photons are finite and not negative")
     exposure_s = numbers[0] / _NS_PER_S
     if keyword == "d" or numbers[1] == 0:
         return NoiseFrame("", "dark", exposure_s)

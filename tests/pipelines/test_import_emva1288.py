@@ -1,5 +1,6 @@
 """EMVA 1288 descriptor files become noise sets that `faintfield noise` reads."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -7,6 +8,7 @@ import pytest
 
 from pipelines.cli import run
 from pipelines.errors import BadValue, MissingFile
+from pipelines.files import sha256
 from pipelines.import_emva1288 import import_emva1288, parse_descriptor
 from pipelines.noise import noise
 from pipelines.noise_set import load_noise_set
@@ -68,6 +70,10 @@ def test_reference_data_become_a_noise_set(tmp_path: Path) -> None:
         ("b 100000.0", "line 1: .*give 'b exposure photons'"),
         ("x 1", "line 1: .*none of v, n, b, d, i"),
         ("d soon", "line 1: "),
+        ("bd 1000", "line 1: .*none of v, n, b, d, i"),
+        ("d nan", "line 1: .*finite and not negative"),
+        ("b 1000 inf", "line 1: .*finite and not negative"),
+        ("d -1", "line 1: .*finite and not negative"),
         ("v 4.0", "names 0 images"),
     ],
 )
@@ -76,6 +82,18 @@ def test_what_is_no_descriptor_is_refused_with_its_line(tmp_path: Path, line: st
     path.write_text(line + "\n")
     with pytest.raises(BadValue, match=words):
         parse_descriptor(path)
+
+
+def test_all_that_was_read_is_recorded(tmp_path: Path) -> None:
+    """By the paths that the descriptor states: names may repeat from folder to folder."""
+    descriptor = write_data(tmp_path / "data")
+    (tmp_path / "data" / "images" / "d_0.png").rename(tmp_path / "data" / "d_1.png")
+    descriptor.write_text(DESCRIPTOR.replace("images\\d_0.png", "d_1.png"))
+    import_emva1288(descriptor, tmp_path / "set")
+    inputs = json.loads((tmp_path / "set" / "provenance.json").read_text())["inputs"]
+    for name, digest in inputs.items():
+        assert digest == sha256(tmp_path / "data" / name.replace("\\", "/"))
+    assert len(inputs) == 9
 
 
 def test_a_missing_image_leaves_nothing_behind(tmp_path: Path) -> None:
