@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -29,6 +28,9 @@ _MODELS = {
 }
 _NUMBERS = {name: number for number, (name, _) in _MODELS.items()}
 _HALF_PX = 0.5
+
+# All that a model is written to.
+MODEL_FILES = [f"{part}{suffix}" for part in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")]
 
 
 @dataclass(frozen=True)
@@ -56,20 +58,31 @@ def read_model(folder: Path) -> ColmapModel:
     MissingFile
         The folder holds neither cameras.bin nor cameras.txt, or no images beside them.
     BadValue
-        A file is damaged, or a camera's model has no counterpart here.
+        A file is damaged, an image's camera is missing, or a camera's model has no counterpart here.
     """
-    for suffix, cameras, images in ((".bin", _cameras_binary, _images_binary), (".txt", _cameras_text, _images_text)):
-        path = folder / f"cameras{suffix}"
-        if not path.is_file():
-            continue
-        if not path.with_name(f"images{suffix}").is_file():
-            raise MissingFile(f"{path.with_name(f'images{suffix}')}: no such file; export the whole model")
-        try:
-            return ColmapModel(cameras(path), images(path.with_name(f"images{suffix}")))
-        except (struct.error, ValueError, IndexError, KeyError) as failure:
+    cameras, images = model_files(folder)
+    read_cameras, read_images = _READERS[cameras.suffix]
+    try:
+        model = ColmapModel(read_cameras(cameras), read_images(images))
+    except (struct.error, ValueError, LookupError, OverflowError, OSError) as failure:
+        raise BadValue(f"{folder}: is not a COLMAP model that can be read ({failure}); export it again") from failure
+    for image in model.images:
+        if image.camera not in model.lenses:
             raise BadValue(
-                f"{folder}: is not a COLMAP model that can be read ({failure}); export it again"
-            ) from failure
+                f"{images}: {image.name} was taken with camera {image.camera}, and {cameras.name} has "
+                f"{', '.join(map(str, model.lenses)) or 'none'}; export the whole model"
+            )
+    return model
+
+
+def model_files(folder: Path) -> tuple[Path, Path]:
+    """Return the files of a model that are read, its cameras and its images: binary where there are both."""
+    for suffix in (".bin", ".txt"):
+        cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
+        if cameras.is_file():
+            if not images.is_file():
+                raise MissingFile(f"{images}: no such file; export the whole model")
+            return cameras, images
     raise MissingFile(f"{folder}: holds no cameras.bin or cameras.txt; name the folder of a COLMAP sparse model")
 
 
@@ -124,8 +137,7 @@ def _camera(numbered: tuple[int, Lens]) -> tuple[int, str, int, int, list[float]
 
 def _pose(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> NDArray[np.float64]:
     w, x, y, z = quaternion
-    rotation = Rotation.from_quat([x, y, z, w]).as_matrix()
-    return np.append(cv2.Rodrigues(rotation)[0].ravel(), translation)
+    return np.append(Rotation.from_quat([x, y, z, w]).as_rotvec(), translation)
 
 
 def _quaternion(image: ColmapImage) -> list[float]:
@@ -194,3 +206,6 @@ def _images_binary(path: Path) -> list[ColmapImage]:
 
 def _take(file: BinaryIO, layout: str) -> tuple[float, ...]:
     return struct.unpack(f"<{layout}", file.read(struct.calcsize(f"<{layout}")))
+
+
+_READERS = {".bin": (_cameras_binary, _images_binary), ".txt": (_cameras_text, _images_text)}

@@ -82,7 +82,7 @@ def darken(
     dark_e = dark_current_e_per_s * exposure_s
     region, scale = _region_and_scale(elemental_set, reference_light, snr, dark_e, read_noise_e)
     generator = np.random.default_rng(seed)
-    with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=loaded.folder) as folder:
+    with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=[loaded.folder]) as folder:
         _write_dark_views(loaded, layouts, folder, sensor, exposure_s, scale, generator)
         write_png(folder / OBJECT_REGION, mask_picture(region))
         photons = float(reference_light[region].mean()) * scale / quantum_efficiency

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from calib.noise_model import NoiseModel
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.fitted_noise import NOISE_FILE
+from pipelines.imported_set import relative
 from pipelines.measured_poses import read_geometry
 from pipelines.metrics import assess
 from pipelines.plane_files import plane_name
 from pipelines.planes import Method
-from pipelines.posed_images import relative
 from pipelines.reconstruct import folder_of_method
 from pipelines.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from pipelines.simulate import NOISE_FREE, write_ground_truth

@@ -1,5 +1,6 @@
 """`faintfield export zarr`: the planes of a sweep as OME-Zarr, chunked and at several resolutions, for large stacks."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,11 @@ _COARSEST_PX = 512
 _CHUNK_PX = 512
 
 
-def export_zarr(directory: Path, out: Path, /) -> dict[str, Any]:
+# What the folder of an export holds: its metadata, and one array for each resolution.
+_HELD = ("zarr.json", "[0-9]", "[0-9][0-9]")
+
+
+def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> dict[str, Any]:
     """Write the planes of a folder as OME-Zarr 0.5, which napari, Fiji and others open at the right scale.
 
     Axes are colour, depth, row, column; float32 in expected electrons per detector pixel. Planes at equal steps of
@@ -33,13 +38,16 @@ def export_zarr(directory: Path, out: Path, /) -> dict[str, Any]:
         Folder with reconstruction.json: what `reconstruct` wrote by one method.
     out
         Folder to write, by custom with a name that ends with .ome.zarr.
+    overwrite
+        Replace an earlier export in OUT.
     """
     zarr = _zarr()
     folder, planes, colours = _planes_of(directory)
     scale = _scale_of(directory, planes)
     shape = (colours, len(planes), *planes[0]["shape"])
     levels = _levels(planes[0]["shape"])
-    with building_folder(out, replace_if="zarr.json", reads=directory) as building:
+    earlier = _HELD if overwrite and _is_export(out) else ()
+    with building_folder(out, replace_only=earlier, reads=[directory]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _metadata(group, directory.resolve().name, scale, planes, shape, levels)
         for index, record in enumerate(progress(planes, "writing planes")):
@@ -48,6 +56,14 @@ def export_zarr(directory: Path, out: Path, /) -> dict[str, Any]:
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halved(plane)
     return {"out": str(out), "shape": list(shape), "levels": levels, "unit": scale.unit}
+
+
+def _is_export(folder: Path) -> bool:
+    """Return whether a folder is an earlier export; every Zarr group has a zarr.json, ours says who wrote it."""
+    try:
+        return "faintfield" in json.loads((folder / "zarr.json").read_bytes())["attributes"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
 
 
 def _zarr() -> Any:

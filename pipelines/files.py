@@ -6,8 +6,9 @@ import os
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -62,7 +63,9 @@ def write_json(path: Path, value: Any) -> None:
 
 
 @contextmanager
-def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | None = None) -> Iterator[Path]:
+def building_folder(
+    out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = (), reads: Iterable[Path] = ()
+) -> Iterator[Path]:
     """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
 
     Parameters
@@ -72,7 +75,9 @@ def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | N
     replace_if : str, optional
         A file name by which a folder made earlier by the same command is known: such a folder is replaced, any other
         is left alone.
-    reads : Path, optional
+    replace_only : collection of str
+        Patterns of all the names that an earlier folder may hold to be replaced, where no one file is in each of them.
+    reads : paths
         What the block reads: it must not be replaced.
 
     Raises
@@ -81,9 +86,11 @@ def building_folder(out: Path, *, replace_if: str | None = None, reads: Path | N
         `out` holds something that would be lost.
     """
     out = out.resolve()
-    check_free(out, replace_if=replace_if)
-    if reads is not None and reads.resolve().is_relative_to(out):
-        raise OutputExists(f"{out}: holds {reads}, which is read; name another folder")
+    check_free(out, replace_if=replace_if, replace_only=replace_only)
+    for path in reads:
+        # A link counts both where it leads and where it lies
+        if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
+            raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
     with reported_as_cannot_write(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         # The name is known before the folder is there: an interrupt at any moment finds what to remove
@@ -114,14 +121,17 @@ def _put_in_place(building: Path, out: Path) -> None:
     shutil.rmtree(replaced, ignore_errors=True)
 
 
-def check_free(out: Path, *, replace_if: str | None = None) -> None:
-    """Refuse `out` when it holds something, unless it is a folder that holds the file `replace_if`."""
+def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = ()) -> None:
+    """Refuse `out` when it holds something, unless it holds the file `replace_if`, or only names of `replace_only`."""
     if not out.exists() or (replace_if is not None and (out / replace_if).is_file()):
         return
     if not out.is_dir():
         raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
-    if any(out.iterdir()):
-        raise OutputExists(f"{out}: holds files already, and none are overwritten; name a new or empty folder")
+    held = sorted(path.name for path in out.iterdir())
+    kept = [name for name in held if not any(fnmatchcase(name, pattern) for pattern in replace_only)]
+    if kept:
+        named = ", ".join(kept[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
+        raise OutputExists(f"{out}: holds files already ({named}) that are not overwritten; name a new or empty folder")
 
 
 def remove_leftovers(folder: Path) -> None:

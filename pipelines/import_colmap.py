@@ -3,15 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 from pipelines.arguments import Positive
-from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from pipelines.colmap_files import MODEL_FILES, ColmapImage, ColmapModel, model_files, read_model, write_model
 from pipelines.elemental_set import load_set
-from pipelines.errors import BadValue
 from pipelines.files import building_folder
-from pipelines.posed_images import PosedImage, write_posed_set
+from pipelines.imported_set import PosedImage
+from pipelines.posed_images import import_posed, lens_of_each_view
 
 
 def import_colmap(
@@ -45,26 +44,19 @@ def import_colmap(
         Replace an earlier set in OUT.
     """
     model = read_model(src)
-    used = sorted({image.camera for image in model.images})
-    if len(used) != 1:
-        raise BadValue(
-            f"{src}: its images were taken with {len(used)} cameras; one camera on a gantry is one lens; "
-            "let COLMAP share one camera (ImageReader.single_camera)"
-        )
-    scale = np.repeat([1.0, mm_per_unit], 3)
-    folder = images or src
-    posed = [PosedImage(folder / image.name, image.rt_cam_world * scale) for image in model.images]
-    name = write_posed_set(
+    return import_posed(
         out,
-        model.lenses[used[0]],
-        posed,
+        model_files(src),
+        [
+            PosedImage((images or src) / image.name, model.lenses[image.camera], image.rt_cam_world)
+            for image in model.images
+        ],
+        mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,
         command="import colmap",
-        options={"mm_per_unit": mm_per_unit, "reference": reference},
         overwrite=overwrite,
     )
-    return {"out": str(out), "views": len(posed), "reference": name}
 
 
 def export_colmap(
@@ -77,6 +69,8 @@ def export_colmap(
 ) -> dict[str, Any]:
     """Write the lens and poses of an elemental set as a COLMAP model without points; its unit is the mm.
 
+    Views with principal points of their own get cameras of their own.
+
     Parameters
     ----------
     elemental_set
@@ -86,12 +80,18 @@ def export_colmap(
     binary
         .bin instead of .txt files.
     overwrite
-        Replace an earlier model in OUT.
+        Replace an earlier model in OUT, a folder that holds nothing else.
     """
     loaded = load_set(elemental_set)
-    poses = zip(loaded.settings.view, loaded.poses_rt_cam_ref, strict=True)
-    model = ColmapModel({1: loaded.lens}, [ColmapImage(view.image, 1, pose) for view, pose in poses])
-    known_by = f"cameras.{'bin' if binary else 'txt'}"
-    with building_folder(out, replace_if=known_by if overwrite else None) as folder:
+    lenses = lens_of_each_view(loaded)
+    cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}
+    model = ColmapModel(
+        {number: lens for lens, number in cameras.items()},
+        [
+            ColmapImage(view.image, cameras[lens], pose)
+            for view, lens, pose in zip(loaded.settings.view, lenses, loaded.poses_rt_cam_ref, strict=True)
+        ],
+    )
+    with building_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
         write_model(folder, model, binary=binary)
     return {"out": str(out), "views": len(model.images)}

@@ -1,35 +1,28 @@
 """`faintfield import grid`: an elemental set from a folder of pictures taken on a regular grid."""
 
 import re
-import shutil
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
-import numpy as np
-
+from calib.lens import Lens
 from pipelines.arguments import Count, Fraction, NotNegative, Positive
-from pipelines.console import progress, say
-from pipelines.elemental_set import Camera, ElementalSet, Noise, View, write_set
-from pipelines.errors import BadValue, MissingFile, WrongSize
-from pipelines.files import building_folder, sha256, write_json
-from pipelines.frames import IMAGE_SUFFIXES, RAW_SUFFIXES, Frame, read_frame
-from pipelines.image_files import write_frame
-from pipelines.provenance import provenance
-from rig.grid import centre_node, nominal_poses_rt_cam_ref
+from pipelines.console import say
+from pipelines.elemental_set import Noise
+from pipelines.errors import BadValue, MissingFile
+from pipelines.frames import IMAGE_SUFFIXES
+from pipelines.imported_set import PosedImage, read_picture, write_imported_set
+from rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 
 # Without a pitch the unit of length is free: the plane on which the pictures are aligned is put here.
 _FREE_REFERENCE_DEPTH_MM = 1000.0
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """The pictures by node."""
+# Names that lack more than so many pictures for each one there is are not those of a grid.
+_MOST_MISSING = 10
 
-    paths: dict[tuple[int, int], Path]
-    rows: int
-    columns: int
+# The pictures by node, row by row: every node of the grid has one.
+type _Grid = dict[tuple[int, int], Path]
 
 
 def import_grid(
@@ -90,28 +83,43 @@ def import_grid(
         Replace an earlier set in OUT.
     """
     options = {name: value for name, value in locals().items() if name not in ("src", "out", "overwrite")}
-    grid = _find_grid(src, rows, columns)
-    first = _read_picture(next(iter(grid.paths.values())))
-    noise = Noise(
-        gain_dn_per_e=gain_dn_per_e,
-        read_noise_e=read_noise_e,
-        offset_dn=offset_dn if offset_dn is not None or first.black_dn is not None else 0.0,
-        dark_current_e_per_s=dark_current_e_per_s,
-        quantum_efficiency=quantum_efficiency,
-        saturation_dn=_saturation_dn(first),
+    paths = _find_grid(src, rows, columns)
+    height, width = read_picture(next(iter(paths.values()))).pixels_dn.shape[:2]
+    focal_px = fx_px or float(width)
+    if pitch_mm is None:
+        pitch_mm = _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px if disparity_px else 1.0
+    lens = Lens((width, height), focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
+    rows, columns = _size(paths)
+    write_imported_set(
+        out,
+        _posed(paths, lens, pitch_mm, disparity_px),
+        reference=list(paths).index(centre_node(rows, columns)),
+        noise=Noise(gain_dn_per_e, read_noise_e, offset_dn, dark_current_e_per_s, quantum_efficiency),
+        exposure_s=exposure_s,
+        command="import grid",
+        options=options,
+        overwrite=overwrite,
     )
-    exposure_s = exposure_s or first.exposure_s
-    if exposure_s is None:
-        say("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
-        exposure_s = 1.0
-    with building_folder(out, replace_if="elemental.toml" if overwrite else None, reads=src) as folder:
-        camera, views = _copy_views(grid, folder, first, pitch_mm, fx_px, disparity_px)
-        row, column = centre_node(grid.rows, grid.columns)
-        write_set(folder, ElementalSet(1, exposure_s, row * grid.columns + column, camera, noise, views))
-        inputs = {path.name: sha256(path) for path in grid.paths.values()}
-        write_json(folder / "provenance.json", provenance("import grid", options, inputs))
-    say(f"{out}: {grid.rows} x {grid.columns} views of {camera.size_px[0]} x {camera.size_px[1]} px")
-    return {"out": str(out), "rows": grid.rows, "columns": grid.columns, "size_px": camera.size_px}
+    say(f"{out}: {rows} x {columns} views of {width} x {height} px")
+    return {"out": str(out), "rows": rows, "columns": columns, "size_px": lens.size_px}
+
+
+def _posed(paths: _Grid, lens: Lens, pitch_mm: float, disparity_px: float) -> list[PosedImage]:
+    """Return the pictures at nominal poses; aligning them on a plane has moved their principal points."""
+    row_0, column_0 = centre_node(*_size(paths))
+    poses = nominal_poses_rt_cam_ref(*_size(paths), pitch_mm)
+    images = []
+    for ((row, column), path), pose in zip(paths.items(), poses, strict=True):
+        cx_px = lens.cx_px + disparity_px * (column - column_0)
+        cy_px = lens.cy_px + disparity_px * (row - row_0)
+        images.append(PosedImage(path, replace(lens, cx_px=cx_px, cy_px=cy_px), pose, (row, column)))
+    return images
+
+
+def _size(paths: _Grid) -> tuple[int, int]:
+    """Return how many rows and columns a grid has."""
+    last_row, last_column = map(max, zip(*paths, strict=True))
+    return last_row + 1, last_column + 1
 
 
 def _find_grid(src: Path, rows: int | None, columns: int | None) -> _Grid:
@@ -124,7 +132,7 @@ def _find_grid(src: Path, rows: int | None, columns: int | None) -> _Grid:
     if rows is not None or columns is not None:
         return _grid_in_order(src, paths, rows or 1, columns or 1)
     if len(paths) == 1:
-        return _Grid({(0, 0): paths[0]}, 1, 1)
+        return {(0, 0): paths[0]}
     named: dict[tuple[int, int], Path] = {}
     for path in paths:
         numbers = re.findall(r"\d+", path.stem)
@@ -144,75 +152,24 @@ def _grid_in_order(src: Path, paths: list[Path], rows: int, columns: int) -> _Gr
             f"{src}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
             "correct --rows and --columns, or add the missing ones"
         )
-    nodes = [(row, column) for row in range(rows) for column in range(columns)]
-    return _Grid(dict(zip(nodes, paths, strict=True)), rows, columns)
+    return dict(zip(grid_nodes(rows, columns), paths, strict=True))
 
 
 def _complete_grid(src: Path, named: dict[tuple[int, int], Path]) -> _Grid:
     """Return the pictures with nodes counted from zero, refusing a grid with a gap."""
     row_0, column_0 = (min(node[axis] for node in named) for axis in (0, 1))
     paths = {(row - row_0, column - column_0): path for (row, column), path in sorted(named.items())}
-    rows, columns = (max(node[axis] for node in paths) + 1 for axis in (0, 1))
-    missing = [node for node in np.ndindex(rows, columns) if node not in paths]
-    if missing:
-        raise MissingFile(
-            f"{src}: the view of node {(missing[0][0] + row_0, missing[0][1] + column_0)} is missing, "
-            f"{len(missing)} of {rows * columns} in all; add it, or give --rows and --columns for a smaller grid"
-        )
-    return _Grid(paths, rows, columns)
-
-
-def _read_picture(path: Path) -> Frame:
-    """Read a picture whose pixels are what a camera's are."""
-    frame = read_frame(path)
-    if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
+    rows, columns = _size(paths)
+    missing = rows * columns - len(paths)
+    if missing > _MOST_MISSING * len(paths):
         raise BadValue(
-            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted; convert it"
+            f"{src}: numbers in names like {next(iter(paths.values())).name} would make a grid of {rows} x {columns} "
+            f"of {len(paths)} pictures: they are no row and column; give --rows and --columns to take files in order"
         )
-    return frame
-
-
-def _saturation_dn(frame: Frame) -> float:
-    """Return the value at which a picture's pixels are full."""
-    return frame.saturation_dn or float(np.iinfo(frame.pixels_dn.dtype).max)
-
-
-def _copy_views(
-    grid: _Grid, folder: Path, first: Frame, pitch_mm: float | None, fx_px: float | None, disparity_px: float
-) -> tuple[Camera, list[View]]:
-    """Copy every picture into the set, and return the camera and the views at nominal poses."""
-    height, width = first.pixels_dn.shape[:2]
-    focal_px = fx_px or float(width)
-    if pitch_mm is None:
-        pitch_mm = _FREE_REFERENCE_DEPTH_MM * disparity_px / focal_px if disparity_px else 1.0
-    camera = Camera((width, height), focal_px, focal_px, (width - 1) / 2, (height - 1) / 2)
-    poses = nominal_poses_rt_cam_ref(grid.rows, grid.columns, pitch_mm)
-    row_0, column_0 = centre_node(grid.rows, grid.columns)
-    views = []
-    for index, (node, path) in enumerate(progress(grid.paths.items(), "copying pictures", len(grid.paths))):
-        view = View(_copy_picture(path, folder, first), tuple(poses[index].tolist()), node)
-        if disparity_px != 0:
-            cx_px = camera.cx_px + disparity_px * (node[1] - column_0)
-            cy_px = camera.cy_px + disparity_px * (node[0] - row_0)
-            view = msgspec.structs.replace(view, cx_px=cx_px, cy_px=cy_px)
-        views.append(view)
-    return camera, views
-
-
-def _copy_picture(path: Path, folder: Path, first: Frame) -> str:
-    """Copy a picture as it is, or as 16-bit TIFF when it has 8 bits; return its name in the set."""
-    frame = _read_picture(path)
-    if frame.pixels_dn.shape != first.pixels_dn.shape:
-        raise WrongSize(
-            f"{path}: is {frame.pixels_dn.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "
-            "all must be alike; take it again or leave it out"
+    if missing:
+        row, column = next(node for node in grid_nodes(rows, columns) if node not in paths)
+        raise MissingFile(
+            f"{src}: the view of node {(row + row_0, column + column_0)} is missing, "
+            f"{missing} of {rows * columns} in all; add it, or give --rows and --columns for a smaller grid"
         )
-    as_it_is = path.suffix.lower() in RAW_SUFFIXES or frame.pixels_dn.dtype == np.uint16
-    name = path.name if as_it_is else f"{path.stem}.tiff"
-    if (folder / name).exists():
-        raise BadValue(f"{path}: would become {name} like another picture; give it another name")
-    if as_it_is:
-        shutil.copyfile(path, folder / name)
-    else:
-        write_frame(folder / name, frame.pixels_dn.astype(np.uint16))
-    return name
+    return paths

@@ -1,9 +1,9 @@
 """`faintfield import mrcal` and `faintfield export mrcal`: lens and poses from and to .cameramodel files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 from calib.lens import Lens
@@ -13,7 +13,8 @@ from pipelines.errors import BadValue, MissingFile
 from pipelines.files import building_folder, write_whole
 from pipelines.frames import IMAGE_SUFFIXES
 from pipelines.geometry_files import camera_model_text
-from pipelines.posed_images import PosedImage, write_posed_set
+from pipelines.imported_set import PosedImage
+from pipelines.posed_images import import_posed, lens_of_each_view
 
 _SUFFIX = ".cameramodel"
 _MODELS = {"LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8"}
@@ -36,7 +37,7 @@ def import_mrcal(
     Parameters
     ----------
     src
-        Folder of .cameramodel files, one per image, all with the same lens.
+        Folder of .cameramodel files, one per image, all with the same lens but for its principal point.
     out
         Folder to write.
     images
@@ -53,28 +54,16 @@ def import_mrcal(
     paths = sorted(src.glob(f"*{_SUFFIX}"))
     if not paths:
         raise MissingFile(f"{src}: holds no {_SUFFIX} files; name the folder that holds one per image")
-    scale = np.repeat([1.0, mm_per_unit], 3)
-    lenses, posed = [], []
-    for path in paths:
-        lens, rt_cam_world = _read(path)
-        lenses.append(lens)
-        posed.append(PosedImage(_image_of(path, images or src), rt_cam_world * scale))
-    if len(set(lenses)) > 1:
-        raise BadValue(
-            f"{src}: its models have {len(set(lenses))} different lenses; one camera on a gantry is one lens; "
-            "name the folder of one calibration"
-        )
-    name = write_posed_set(
+    return import_posed(
         out,
-        lenses[0],
-        posed,
+        paths,
+        [_read(path, images or src) for path in paths],
+        mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,
         command="import mrcal",
-        options={"mm_per_unit": mm_per_unit, "reference": reference},
         overwrite=overwrite,
     )
-    return {"out": str(out), "views": len(posed), "reference": name}
 
 
 def export_mrcal(
@@ -89,38 +78,45 @@ def export_mrcal(
     out
         Folder to write.
     overwrite
-        Replace earlier models in OUT.
+        Replace earlier models in OUT, a folder that holds nothing else.
     """
     loaded = load_set(elemental_set)
     count = next(count for count in _LENS_MODEL if count >= len(loaded.lens.distortion))
-    lens = loaded.lens
-    padded = (*lens.distortion, *[0.0] * (count - len(lens.distortion)))
-    lens = Lens(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, padded)
-    names = [Path(view.image).with_suffix(_SUFFIX).name for view in loaded.settings.view]
-    with building_folder(out, replace_if=names[0] if overwrite else None) as folder:
-        for name, pose in zip(names, loaded.poses_rt_cam_ref, strict=True):
-            write_whole(folder / name, camera_model_text(lens, _LENS_MODEL[count], pose))
-    return {"out": str(out), "views": len(names)}
+    padded = (*loaded.lens.distortion, *[0.0] * (count - len(loaded.lens.distortion)))
+    models: dict[str, str] = {}
+    for view, lens, pose in zip(loaded.settings.view, lens_of_each_view(loaded), loaded.poses_rt_cam_ref, strict=True):
+        name = Path(view.image).with_suffix(_SUFFIX).name
+        if name in models:
+            raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
+        models[name] = camera_model_text(replace(lens, distortion=padded), _LENS_MODEL[count], pose)
+    with building_folder(out, replace_only=[f"*{_SUFFIX}"] if overwrite else ()) as folder:
+        for name, text in models.items():
+            write_whole(folder / name, text)
+    return {"out": str(out), "views": len(models)}
 
 
-def _read(path: Path) -> tuple[Lens, Any]:
-    """Return the lens and the pose of a camera model."""
+def _read(path: Path, images: Path) -> PosedImage:
+    """Return the image of a camera model with its lens and pose."""
     import mrcal  # loading it takes a while
 
     try:
         model = mrcal.cameramodel(str(path))
-        name, numbers = model.intrinsics()
-        width, height = (int(side) for side in model.imagersize())
     except Exception as failure:  # mrcal raises what it likes
         raise BadValue(
             f"{path}: is not a camera model that can be read ({failure}); write it with mrcal again".replace("\n", " ")
         ) from failure
+    name, numbers = model.intrinsics()
     if name not in _MODELS:
         raise BadValue(
             f"{path}: its lens is {name}; convert it with mrcal-convert-lensmodel to one of {sorted(_MODELS)}"
         )
-    fx_px, fy_px, cx_px, cy_px, *distortion = (float(number) for number in numbers)
-    return Lens((width, height), fx_px, fy_px, cx_px, cy_px, tuple(distortion)), np.array(model.rt_cam_ref())
+    fx_px, fy_px, cx_px, cy_px, *distortion = numbers.tolist()
+    width, height = model.imagersize().tolist()
+    try:
+        lens = Lens((width, height), fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+    except ValueError as failure:
+        raise BadValue(f"{path}: {failure}; calibrate again") from failure
+    return PosedImage(_image_of(path, images), lens, model.rt_cam_ref())
 
 
 def _image_of(path: Path, folder: Path) -> Path:

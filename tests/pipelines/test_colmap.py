@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_m
 from pipelines.elemental_set import load_set
 from pipelines.errors import BadValue
 from pipelines.import_colmap import export_colmap, import_colmap
-from pipelines.posed_images import relative
+from pipelines.imported_set import relative
 
 STORED = Path(__file__).parent / "colmap"
 
@@ -120,6 +121,15 @@ def test_a_model_becomes_an_elemental_set(tmp_path: Path) -> None:
     np.testing.assert_allclose([image.rt_cam_world for image in back.images], [np.zeros(6), expected], atol=1e-9)
 
 
+@pytest.mark.parametrize("points", [2**58, 2**62])
+def test_a_file_that_promises_more_points_than_any_is_refused(points: int, tmp_path: Path) -> None:
+    write_model(tmp_path, read_model(STORED / "binary"), binary=True)
+    path = tmp_path / "images.bin"
+    path.write_bytes(path.read_bytes()[:-8] + struct.pack("<Q", points))
+    with pytest.raises(BadValue, match="is not a COLMAP model that can be read"):
+        read_model(tmp_path)
+
+
 def test_images_of_one_name_in_two_folders_are_refused(tmp_path: Path) -> None:
     """They would be copied over one another."""
     lens = read_model(STORED / "text").lenses[1]
@@ -129,5 +139,5 @@ def test_images_of_one_name_in_two_folders_are_refused(tmp_path: Path) -> None:
     for image in images:
         (tmp_path / image.name).parent.mkdir()
         cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
-    with pytest.raises(BadValue, match="two images are named 0"):
+    with pytest.raises(BadValue, match=r"right/0\.png: would become 0\.png"):
         import_colmap(tmp_path / "model", tmp_path / "set", images=tmp_path, exposure_s=1)

@@ -110,11 +110,27 @@ def test_an_older_export_is_replaced_and_nothing_else(
 ) -> None:
     out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
     done("reconstruct", scene, "--out", out, *SWEEP)
-    for _ in range(2):
-        done("export", "zarr", out, stack)
-    refused = faintfield("export", "zarr", out, scene)
+    done("export", "zarr", out, stack)
+    refused = faintfield("export", "zarr", out, stack)
     assert refused.returncode == 1
     assert "OutputExists" in refused.stderr
+    done("export", "zarr", out, stack, "--overwrite")
+    (stack / "notes.txt").touch()
+    refused = faintfield("export", "zarr", out, stack, "--overwrite")
+    assert refused.returncode == 1
+    assert "holds files already (notes.txt)" in refused.stderr
+
+
+def test_arrays_of_others_are_left_alone(scene: Path, tmp_path: Path, done: Command, faintfield: Command) -> None:
+    """They have a zarr.json as well."""
+    out, theirs = tmp_path / "out", tmp_path / "theirs.zarr"
+    done("reconstruct", scene, "--out", out, *SWEEP)
+    zarr.open_group(theirs, mode="w", zarr_format=3).create_array("0", shape=(3,), dtype="float32")[:] = [1, 2, 3]
+    for words in ((), ("--overwrite",)):
+        refused = faintfield("export", "zarr", out, theirs, *words)
+        assert refused.returncode == 1
+        assert "OutputExists" in refused.stderr
+        np.testing.assert_array_equal(zarr.open_group(theirs, mode="r")["0"][:], [1, 2, 3])
 
 
 @pytest.mark.parametrize(

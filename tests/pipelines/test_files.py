@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -117,22 +118,44 @@ def _with_a_file(out: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("prepare", "replace_if", "words"),
+    ("prepare", "earlier", "words"),
     [
-        (_with_a_file, None, "holds files already"),
-        (_with_a_file, "elemental.toml", "holds files already"),
-        (Path.touch, None, "is a file"),
-        (Path.touch, "elemental.toml", "is a file"),
+        (_with_a_file, {}, r"holds files already \(theirs\)"),
+        (_with_a_file, {"replace_if": "elemental.toml"}, "holds files already"),
+        (_with_a_file, {"replace_only": ["ours*", "t"]}, "holds files already"),
+        (Path.touch, {}, "is a file"),
+        (Path.touch, {"replace_if": "elemental.toml"}, "is a file"),
     ],
 )
 def test_what_others_put_there_is_left_alone(
-    prepare: Callable[[Path], object], replace_if: str | None, words: str, tmp_path: Path
+    prepare: Callable[[Path], object], earlier: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     prepare(tmp_path / "out")
     before = _everything_below(tmp_path)
-    with pytest.raises(OutputExists, match=words), building_folder(tmp_path / "out", replace_if=replace_if):
+    with pytest.raises(OutputExists, match=words), building_folder(tmp_path / "out", **earlier):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == before
+
+
+def test_a_folder_of_nothing_but_such_names_is_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("cameras.txt", "a.model", "b.model"):
+        (out / name).touch()
+    with building_folder(out, replace_only=["*.model", "cameras.txt"]) as folder:
+        (folder / "c.model").touch()
+    assert _everything_below(tmp_path) == {"out", "out/c.model"}
+
+
+def test_a_link_to_what_is_read_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mark").touch()
+    (tmp_path / "out" / "link").symlink_to(tmp_path / "elsewhere")
+    with (
+        pytest.raises(OutputExists, match="link, which is read"),
+        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
+    ):
+        pytest.fail("nothing must be built")
 
 
 @pytest.mark.parametrize("reads", ["out", "out/deep", "out/deep/../../out"])
@@ -141,7 +164,7 @@ def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path
     (tmp_path / "out" / "mark").touch()
     with (
         pytest.raises(OutputExists, match="which is read"),
-        building_folder(tmp_path / "out", replace_if="mark", reads=tmp_path / reads),
+        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
     ):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == {"out", "out/deep", "out/mark"}

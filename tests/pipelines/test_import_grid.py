@@ -87,7 +87,14 @@ def test_one_picture_is_a_grid_of_one(tmp_path: Path, done: Command) -> None:
         (["one.tiff", "two.tiff"], (), "BadValue", "has no row and column; give --rows and --columns"),
         (["a1_1.tiff", "b1_1.tiff"], (), "BadValue", "is at node (1, 1) like a1_1.tiff"),
         (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "holds 2 pictures, a grid of 3 x 1 needs 3"),
-        (["a.tiff", "a.png"], ("--rows", 2), "BadValue", "would become a.tiff like another picture"),
+        (["a.jpg", "a.png"], ("--rows", 2), "BadValue", "would become a.tiff like another picture"),
+        (
+            [f"PXL_20240101_1200{second:02}123.png" for second in range(4)],
+            (),
+            "BadValue",
+            "PXL_20240101_120000123.png would make a grid of 1 x 3001 of 4 pictures: they are no row and column",
+        ),
+        (["DSC_1_0.png", "DSC_800000000_900000000.png"], (), "BadValue", "they are no row and column; give --rows"),
     ],
 )
 def test_grids_with_gaps_and_doubles_are_refused(
@@ -106,6 +113,7 @@ def test_grids_with_gaps_and_doubles_are_refused(
         (_picture(shape=(8, 6)), "WrongSize", "is (8, 6), the first picture (6, 8)"),
         (_picture(shape=(6, 8, 3)), "WrongSize", "is (6, 8, 3), the first picture (6, 8)"),
         (_picture().astype(np.float32), "BadValue", "holds float32 pixels"),
+        (_picture().astype(np.uint8), "WrongBitDepth", "has 8 bits per pixel, the first picture 16"),
     ],
 )
 def test_pictures_that_are_not_alike_are_refused(
