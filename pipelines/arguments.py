@@ -1,6 +1,6 @@
 """Types of command-line arguments whose limits are checked before a command runs."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
@@ -25,4 +25,5 @@ type Seed = Annotated[int, _within(0)]
 type Positive = Annotated[float, _within(1e-9)]
 type NotNegative = Annotated[float, _within(0)]
 type Fraction = Annotated[float, _within(1e-9, 1)]
+type LensName = Literal["opencv5", "opencv8", "opencv4", "pinhole"]
 type SizePx = Annotated[tuple[int, int], _within(2)]

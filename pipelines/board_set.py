@@ -101,6 +101,8 @@ class BoardSet:
         The node whose camera is the reference: the centre of the grid.
     pitch_mm : float, optional
         Distance of neighbouring nodes as the stage was told.
+    one_sided : bool
+        The stage approached every node from the same side, whatever the order.
     """
 
     source: Path
@@ -108,6 +110,7 @@ class BoardSet:
     views: list[BoardView]
     reference: Node
     pitch_mm: float | None
+    one_sided: bool = False
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that was read."""
@@ -157,8 +160,9 @@ def _of_session(folder: Path) -> BoardSet:
     if not files:
         raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
     boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
-    centre = frozen.plan.centre.node
-    return BoardSet(folder / PLAN, boards, _views(files, frozen.rig.mosaic), centre, frozen.rig.grid.pitch_mm)
+    views = _views(files, frozen.rig.mosaic)
+    one_sided = frozen.plan.approach_mm > 0
+    return BoardSet(folder / PLAN, boards, views, frozen.plan.centre.node, frozen.rig.grid.pitch_mm, one_sided)
 
 
 def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:

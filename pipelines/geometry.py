@@ -2,19 +2,18 @@
 
 import os
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from calib.detection import BoardCorners, detect_all
 from calib.errors import TooFewViews
 from calib.geometry import BoardObservation, GeometrySettings, RigGeometry, Target, calibrate_geometry
 from calib.geometry.stage import StageReport, approach_directions, stage_report
-from pipelines.arguments import Positive
+from pipelines.arguments import LensName, Positive
 from pipelines.board_set import BoardSet, BoardView, load_board_set
 from pipelines.console import progress, say
 from pipelines.errors import WrongSize
-from pipelines.geometry_files import write_geometry
+from pipelines.geometry_files import geometry_content, write_geometry
 from pipelines.provenance import provenance
-from pipelines.stage_page import write_stage_page
 
 # Above this the nodes of one sweep no longer stand for those of another.
 _MOST_REPEATABILITY_MM = 0.020
@@ -27,7 +26,7 @@ def geometry(
     /,
     *,
     out: Path | None = None,
-    lens: Literal["opencv5", "opencv8", "opencv4", "pinhole"] = "opencv5",
+    lens: LensName = "opencv5",
     depth_mm: list[Positive] | None = None,
     limit_px: Positive = 0.5,
 ) -> dict[str, Any]:
@@ -54,13 +53,13 @@ def geometry(
     settings = GeometrySettings(lens, tuple(depth_mm or (500.0, 700.0)), limit_px)
     observations, size_px = _observe(board_set)
     measured = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
-    visits = [(view.node, view.sweep) for view in board_set.views]
+    visits = [] if board_set.one_sided else [(view.node, view.sweep) for view in board_set.views]
     stage = stage_report(measured, approach_directions(visits), board_set.pitch_mm)
     options = {"lens": lens, "depth_mm": settings.depths_mm, "limit_px": limit_px}
     record = provenance("geometry", options, dict(board_set.input_hashes()))
     boards = list(board_set.boards.values())
-    content = write_geometry(out, measured, settings, boards, observations, stage, record)
-    page = write_stage_page(out, measured, content)
+    content = geometry_content(measured, settings, boards, stage, record)
+    page = write_geometry(out, measured, observations, content)
     _say_result(board_set, measured, stage, content)
     return {"out": str(out), "report": str(page), **{name: content[name] for name in _RETURNED}}
 

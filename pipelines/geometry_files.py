@@ -21,38 +21,43 @@ from calib.geometry import (
 from calib.geometry.stage import StageReport
 from calib.lens import Lens
 from pipelines.files import write_json, write_whole
-from pipelines.measured_poses import GEOMETRY_FILE
-
-COVARIANCE_FILE = "geometry_covariance.npz"
-CORNERS_FILE = "geometry_corners.npz"
-CAMERAS = "cameras"
+from pipelines.measured_poses import CAMERA_FILE, CORNERS_FILE, COVARIANCE_FILE, GEOMETRY_FILE
+from pipelines.stage_page import write_stage_page
 
 
-def write_geometry(
-    out: Path,
+def geometry_content(
     geometry: RigGeometry,
     settings: GeometrySettings,
     boards: Sequence[Board],
-    observations: Sequence[BoardObservation],
     stage: StageReport,
     record: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write the files of a geometry into `out`, geometry.json last, and return its contents."""
-    (out / GEOMETRY_FILE).unlink(missing_ok=True)  # it would vouch for files that replace its own
-    write_whole(out / COVARIANCE_FILE, _covariance_npz(geometry))
-    write_whole(out / CORNERS_FILE, _corners_npz(observations))
-    for node, rt_cam_ref in zip(geometry.nodes, geometry.rt_cam_ref, strict=True):
-        text = camera_model_text(geometry.lens, geometry.lens_model, rt_cam_ref)
-        write_whole(out / CAMERAS / f"node_r{node[0]}_c{node[1]}.cameramodel", text)
-    content = {
+    """Return what geometry.json says."""
+    return {
         "format": 1,
         **_summary(geometry, settings),
         "boards": _board_entries(geometry, boards),
         "stage": asdict(stage),
         **record,
     }
+
+
+def write_geometry(
+    out: Path, geometry: RigGeometry, observations: Sequence[BoardObservation], content: dict[str, Any]
+) -> Path:
+    """Write the files of a geometry into `out`, geometry.json last, and return the path of its page."""
+    (out / GEOMETRY_FILE).unlink(missing_ok=True)  # it would vouch for files that replace its own
+    for earlier in out.glob(CAMERA_FILE.format("*", "*")):
+        earlier.unlink()  # it may be of a node that is none any more
+    solved = {board.target for board in geometry.boards}
+    write_whole(out / COVARIANCE_FILE, _covariance_npz(geometry))
+    write_whole(out / CORNERS_FILE, _corners_npz([seen for seen in observations if seen.target in solved]))
+    for node, rt_cam_ref in zip(geometry.nodes, geometry.rt_cam_ref, strict=True):
+        text = camera_model_text(geometry.lens, geometry.lens_model, rt_cam_ref)
+        write_whole(out / CAMERA_FILE.format(*node), text)
+    page = write_stage_page(out, geometry, content)
     write_json(out / GEOMETRY_FILE, content)
-    return content
+    return page
 
 
 def _summary(geometry: RigGeometry, settings: GeometrySettings) -> dict[str, Any]:

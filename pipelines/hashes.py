@@ -47,16 +47,15 @@ class Hashes:
         known = self._known.get(name)
         if known is not None and (known.size, known.mtime_ns) == (state.st_size, state.st_mtime_ns):
             return known.sha256
+        begun_ns = time.time_ns()
         digest = sha256(path)
-        self._known[name] = _Known(state.st_size, state.st_mtime_ns, digest)
+        self._known.pop(name, None)
+        if state.st_mtime_ns < begun_ns - _AT_REST_NS:
+            self._known[name] = _Known(state.st_size, state.st_mtime_ns, digest)
         self._changed = True
         return digest
 
     def save(self) -> None:
-        """Keep what was computed for the next time, but for files that have changed only just now."""
-        before_ns = time.time_ns() - _AT_REST_NS
+        """Keep what was computed for the next time, but for files that had changed only just before."""
         if self._changed:
-            write_json(
-                self._folder / CACHE_FILE,
-                {name: known for name, known in self._known.items() if known.mtime_ns < before_ns},
-            )
+            write_json(self._folder / CACHE_FILE, self._known)

@@ -5,6 +5,7 @@ Reading what was measured needs none of the calibration, which is heavy to load.
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -13,6 +14,16 @@ from pipelines.elemental_set import LoadedSet
 from pipelines.errors import BadValue, MissingFile
 
 GEOMETRY_FILE = "geometry.json"
+COVARIANCE_FILE = "geometry_covariance.npz"
+CORNERS_FILE = "geometry_corners.npz"
+GEOMETRY_PAGE = "geometry.html"
+CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
+
+
+def files_beside(content: dict[str, Any]) -> list[str]:
+    """Return the names of the files that lie beside a geometry.json, from what it says."""
+    cameras = [CAMERA_FILE.format(*entry["node"]) for entry in content["nodes"]]
+    return [COVARIANCE_FILE, CORNERS_FILE, GEOMETRY_PAGE, *cameras]
 
 
 class LensEntry(msgspec.Struct, frozen=True):

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-_PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless")
+_PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "mrcal", "casadi")
 
 
 def provenance(command: str, options: dict[str, Any], inputs: dict[str, str]) -> dict[str, Any]:

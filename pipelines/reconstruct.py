@@ -25,7 +25,7 @@ from pipelines.overview import write_overview
 from pipelines.plane_files import PARTS, PlaneFiles
 from pipelines.planes import TOGETHER, Method, Settings
 from pipelines.provenance import provenance
-from pipelines.report import RECONSTRUCTION_FILE, write_report
+from pipelines.report import RECONSTRUCTION_FILE, REPORT_FILE, write_report
 from pipelines.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from pipelines.stacks import write_stack
 from pipelines.sweep import Crew, Sweep, one_by_one
@@ -249,6 +249,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
     (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
     if metrics:
         write_json(out / METRICS_FILE, metrics)
+    (out / REPORT_FILE).unlink(missing_ok=True)  # likewise
     for name, folder in folders.items():
         result = {
             "format": 1,

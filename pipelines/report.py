@@ -7,11 +7,11 @@ from typing import Any
 from pipelines.console import say
 from pipelines.errors import MissingFile
 from pipelines.files import write_whole
+from pipelines.measured_poses import GEOMETRY_FILE
 from pipelines.metrics import METRICS_FILE
 from pipelines.overview import OVERVIEW_FILE
 from pipelines.pages import template
 from pipelines.report_calibration import (
-    GEOMETRY_FILE,
     NOISE_FILE,
     find_beside,
     geometry_section,

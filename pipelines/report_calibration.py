@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.measured_poses import GEOMETRY_PAGE
 from pipelines.pages import data_uri
 from pipelines.result_files import Geometry, Noise, read_result
 from recon.metrics import noise_variance_e2
 
-NOISE_FILE, GEOMETRY_FILE = "noise.json", "geometry.json"
+NOISE_FILE = "noise.json"
 
 _NOISE_ROWS = (
     ("offset_dn", "offset", "DN"),
@@ -72,10 +73,10 @@ def _digits(error: float | None) -> int:
 def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> dict[str, Any]:
     """Return what the page says of where the camera was; parameters as for `noise_section`."""
     from pipelines.node_drawings import node_drawing, sigma_maps  # draws: most reports are of sets without this
-    from pipelines.stage_page import PAGE_FILE, stage_rows
+    from pipelines.stage_page import stage_rows
 
     content = read_result(path, Geometry)
-    page = path.with_name(PAGE_FILE)
+    page = path.with_name(GEOMETRY_PAGE)
     return {
         **_origin(directory, path, inputs),
         "rows": stage_rows(content["stage"]),

@@ -1,18 +1,19 @@
 """`faintfield run`: everything after the capture of a session, only what is out of date."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipelines.arguments import Count, NotNegative, Positive
+import msgspec
+
+from pipelines.arguments import Count, LensName, NotNegative, Positive
 from pipelines.console import say
 from pipelines.depths import distinct_depths, swept_depths
 from pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS
 from pipelines.hashes import Hashes
-from pipelines.measured_poses import GEOMETRY_FILE
+from pipelines.measured_poses import GEOMETRY_FILE, files_beside
 from pipelines.planes import Method, Settings
 from pipelines.provenance import first_difference, provenance
 from pipelines.reconstruct import (
@@ -41,9 +42,9 @@ class Step:
     inputs : callable
         Returns the names of all files that it reads.
     origins : dict of str to dict
-        By result file: the options that it was made with, if it is up to date.
-    outputs : tuple of str
-        What else must be there.
+        By result file: the options that it was made with, if it is up to date; None where its being there is enough.
+    beside : callable
+        Returns the names of the files that lie beside a result file, from its contents.
     make : callable
         Does it.
     """
@@ -51,8 +52,8 @@ class Step:
     name: str
     needs: tuple[str, ...]
     inputs: Callable[[], Sequence[str]]
-    origins: dict[str, dict[str, Any]]
-    outputs: tuple[str, ...]
+    origins: dict[str, dict[str, Any] | None]
+    beside: Callable[[dict[str, Any]], Sequence[str]]
     make: Callable[[], object]
 
 
@@ -66,6 +67,8 @@ def run(
     penalty_weight: NotNegative | None = None,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
+    lens: LensName = "opencv5",
+    limit_px: Positive = 0.5,
 ) -> dict[str, Any]:
     """Do everything after the capture: noise, geometry, reconstruction, report; only what is out of date.
 
@@ -88,6 +91,10 @@ def run(
         At most this many passes over the data.
     pitch_mm
         Distance of the plane's samples; by default one detector pixel of the reference view.
+    lens
+        Distortion model, as for `geometry`.
+    limit_px
+        How well the transfer between views must be known, as for `geometry`.
     """
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
@@ -99,16 +106,17 @@ def run(
             "depth_mm in the rig.toml before a capture"
         )
     request = Request(depths, method or [DEFAULT_METHOD], Settings(penalty_weight, passes), pitch_mm, bool(swept))
-    return run_steps(session, session_steps(session, request))
+    return run_steps(session, session_steps(session, request, lens, limit_px))
 
 
-def session_steps(session: Path, request: Request) -> list[Step]:
+def session_steps(session: Path, request: Request, lens: LensName = "opencv5", limit_px: float = 0.5) -> list[Step]:
     """Return the steps from a captured session to the planes of a request, in order."""
     out = session / RECONSTRUCTIONS
     # Not those of the request: other planes need no other geometry
     gated_mm = list(read_plan(session).rig.scene.depth_mm) or [500.0, 700.0]
+    of_geometry = {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}
     folders = [(name, folder_of_method(out, name, request.methods)) for name in request.methods]
-    records = {
+    records: dict[str, dict[str, Any] | None] = {
         str((folder / RECONSTRUCTION_FILE).relative_to(session)): options_of(name, request, "measured")
         for name, folder in folders
     }
@@ -121,16 +129,23 @@ def session_steps(session: Path, request: Request) -> list[Step]:
     def measure_geometry() -> None:
         from pipelines.geometry import geometry  # likewise
 
-        geometry(session, depth_mm=gated_mm)
+        geometry(session, lens=lens, depth_mm=gated_mm, limit_px=limit_px)
 
     return [
-        Step("noise", (), lambda: _frames(session, "dark", "flat"), {NOISE_FILE: {}}, (NOISE_MAPS,), measure_noise),
+        Step(
+            "noise",
+            (),
+            lambda: _frames(session, "dark", "flat"),
+            {NOISE_FILE: {}},
+            lambda _: [NOISE_MAPS],
+            measure_noise,
+        ),
         Step(
             "geometry",
             (),
             lambda: _frames(session, "charuco"),
-            {GEOMETRY_FILE: {"lens": "opencv5", "depth_mm": gated_mm, "limit_px": 0.5}},
-            (),
+            {GEOMETRY_FILE: of_geometry},
+            files_beside,
             measure_geometry,
         ),
         Step(
@@ -138,11 +153,16 @@ def session_steps(session: Path, request: Request) -> list[Step]:
             ("noise", "geometry"),
             lambda: files_of_scene(session, "dark_scene"),
             records,
-            (),
+            lambda content: [plane["file"] for plane in content["planes"]],
             lambda: reconstruct_set(load_session(session), out, request),
         ),
         Step(
-            "report", ("reconstruct",), lambda: [], {}, (f"{RECONSTRUCTIONS}/{REPORT_FILE}",), lambda: write_report(out)
+            "report",
+            ("reconstruct",),
+            lambda: [],
+            {f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
+            lambda _: [],
+            lambda: write_report(out),
         ),
     ]
 
@@ -216,10 +236,15 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
     for file, options in step.origins.items():
         if not (session / file).is_file():
             return f"{file} is not there yet"
-        content = json.loads((session / file).read_bytes())
-        origin = content.get("provenance", content)
-        now = provenance(step.name, options, inputs)
-        if why := first_difference(origin, now):
-            return f"{file} was made with another {why}"
-    missing = [name for name in step.outputs if not (session / name).is_file()]
-    return f"{missing[0]} is missing" if missing else None
+        if options is None:
+            continue
+        try:
+            content = msgspec.json.decode((session / file).read_bytes(), type=dict[str, Any])
+            if why := first_difference(content.get("provenance", content), provenance(step.name, options, inputs)):
+                return f"{file} was made with another {why}"
+            beside = [(session / file).parent / name for name in step.beside(content)]
+        except (msgspec.MsgspecError, UnicodeDecodeError, AttributeError, LookupError, TypeError):
+            return f"{file} is damaged"
+        if missing := [path for path in beside if not path.is_file()]:
+            return f"{missing[0].relative_to(session)} is missing"
+    return None

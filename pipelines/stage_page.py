@@ -7,10 +7,9 @@ import numpy as np
 
 from calib.geometry import RigGeometry
 from pipelines.files import write_whole
+from pipelines.measured_poses import GEOMETRY_PAGE
 from pipelines.node_drawings import node_drawing, sigma_maps
 from pipelines.pages import template
-
-PAGE_FILE = "geometry.html"
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -42,7 +41,7 @@ def write_stage_page(out: Path, geometry: RigGeometry, content: dict[str, Any]) 
             for node, centre in zip(content["nodes"], geometry.centres_mm().tolist(), strict=True)
         ],
     )
-    path = out / PAGE_FILE
+    path = out / GEOMETRY_PAGE
     write_whole(path, page)
     return path
 

@@ -27,9 +27,7 @@ def view(directory: Path, /) -> dict[str, Any]:
     directory
         Folder with reconstruction.json, or whose folders have one: what `reconstruct` wrote, or a session.
     """
-    layers = [
-        layer for folder, result in results_below(directory).items() for layer in _layers(directory, folder, result)
-    ]
+    results = [_layers(directory, folder, result) for folder, result in results_below(directory).items()]
     try:
         import napari
     except ImportError as failure:
@@ -37,8 +35,9 @@ def view(directory: Path, /) -> dict[str, Any]:
             "napari is not installed; it is an extra: pip install 'faintfield[view]', or pip install 'napari[pyqt6]'"
         ) from failure
     # The least noisy method sets the scale, as in the report: noise may clip, planes not.
-    white = min(white_level(layer["data"]) for layer in layers)
+    white = min(max(white_level(layer["data"]) for layer in layers) for layers in results)
     viewer = napari.Viewer(title=f"faintfield: {directory.resolve().name}")
+    layers = [layer for of_one_method in results for layer in of_one_method]
     for index, layer in enumerate(layers):
         viewer.add_image(
             layer.pop("data"), **layer, contrast_limits=(0.0, max(white, 1e-6)), colormap="gray", visible=index == 0

@@ -19,6 +19,8 @@ from calib.lens import Lens
 
 # Larger residuals are of no board.
 _MOST_RESIDUAL_PX = 5.0
+# What a grid of 2 x 2 has; less says nothing of a stage, and a plane seen from fewer places is no better than one view.
+_FEWEST_NODES = 4
 _REMEDY = "check columns, rows and first_marker_id of every [[board]] against the print, and the node of every image"
 
 
@@ -97,6 +99,11 @@ def calibrate_geometry(
     if not named:
         raise TooFewViews("no board was found in any image; check [[board]] against the print, and the exposure")
     gathered = gather(observations, {board.name: board.corner_shape for board in named}, reference)
+    if len(gathered.nodes) < _FEWEST_NODES:
+        raise TooFewViews(
+            f"{len(gathered.nodes)} node(s) show the boards that the reference node {reference} shows, limit "
+            f"{_FEWEST_NODES}; take more nodes, better 9 and more, and leave the boards where they are meanwhile"
+        )
     one_shape = len({board.corner_shape for board in named}) == 1
     problem = Problem(gathered, size_px, _square_mm(named), settings.lens_model, with_warp=one_shape)
     bundle = _solved(problem)
@@ -124,7 +131,10 @@ def _solved(problem: Problem) -> Bundle:
     except RuntimeError as failure:
         raise PoorFit(f"the bundle adjustment does not converge ({failure}); {_REMEDY}") from failure
     if not (np.isfinite(bundle.intrinsics).all() and bundle.intrinsics[:2].min() > 0):
-        raise PoorFit(f"the corners fit no lens (focal length {bundle.intrinsics[:2].min():.3g} px); {_REMEDY}")
+        raise PoorFit(
+            f"the corners fit no lens (focal length {bundle.intrinsics[:2].min():.3g} px); {_REMEDY}; "
+            "show at least 3 tilted boards at 9 nodes"
+        )
     return bundle
 
 

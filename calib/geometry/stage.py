@@ -13,6 +13,7 @@ from calib.geometry.rig_geometry import RigGeometry
 type Numbers = NDArray[np.float64]
 
 _AXES = ("x", "y")
+_LINES = ("rows", "columns")
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def stage_report(
     geometry : RigGeometry
         Measured.
     directions : dict of node to (float, float)
-        From `approach_directions`.
+        From `approach_directions`; empty when the stage approaches from one side, so that its play cannot show.
     pitch_mm : float, optional
         What the stage was told.
     """
@@ -199,7 +200,10 @@ def _backlash(estimate: _Propagated, axis: int, told: list[int | None]) -> Estim
     term = told[axis]
     if term is None:
         return Estimate(
-            None, None, f"all nodes were approached from one side along {_AXES[axis]}; capture rows in alternation"
+            None,
+            None,
+            f"nothing tells it along {_AXES[axis]}: nodes were approached from one side, or the side goes with the "
+            f"place; capture three {_LINES[axis]} or more in alternation, with approach_mm = 0",
         )
     return estimate(lambda s: float(s[term] @ s[1 + axis] / np.linalg.norm(s[1 + axis])))
 
@@ -217,7 +221,7 @@ def _squareness_rad(solution: Numbers) -> float:
 
 def _tilt_rad(solution: Numbers) -> float:
     x, y, z = _grid_axes(solution)[2]
-    return float(np.arctan2(np.hypot(x, y), z))
+    return float(np.arctan2(np.hypot(x, y), abs(z)))  # rows counted upwards turn the normal round
 
 
 def _grid_axes(solution: Numbers) -> Numbers:

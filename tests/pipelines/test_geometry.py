@@ -18,10 +18,10 @@ from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_m
 from pipelines.elemental_set import load_set
 from pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from pipelines.geometry import geometry
-from pipelines.geometry_files import CORNERS_FILE, COVARIANCE_FILE, read_corners
+from pipelines.geometry_files import read_corners
 from pipelines.import_colmap import export_colmap, import_colmap
 from pipelines.import_mrcal import export_mrcal, import_mrcal
-from pipelines.measured_poses import read_geometry, with_measured_geometry
+from pipelines.measured_poses import CORNERS_FILE, COVARIANCE_FILE, read_geometry, with_measured_geometry
 from pipelines.simulate import simulate
 from pipelines.simulate_boards import simulate_board_set
 from pipelines.truth import read_truth
@@ -70,8 +70,10 @@ def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, dict[s
     folder, _ = measured
     content = read_geometry(folder)
     corners = read_corners(folder / CORNERS_FILE)
-    boards = {one.name: one for one in BOARDS}
-    again = calibrate_geometry(boards, corners, content.size_px, (1, 1), GeometrySettings())
+    stored = json.loads((folder / "geometry.json").read_text())
+    names = Board.__dataclass_fields__
+    boards = {entry["name"]: Board(**{name: entry[name] for name in names}) for entry in stored["boards"]}
+    again = calibrate_geometry(boards, corners, content.size_px, content.reference_node, GeometrySettings())
     pixels, here = np.array([[20.0, 30.0], [160.0, 100.0], [300.0, 200.0]]), content.camera_lens()
     points = np.column_stack([here.rays_at(pixels), np.ones(3)]) * 600.0
     for rt, node in zip(again.rt_cam_ref, content.nodes, strict=True):

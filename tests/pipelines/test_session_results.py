@@ -47,6 +47,9 @@ def test_the_geometry_of_a_session_is_where_its_camera_was(session: Path) -> Non
         np.testing.assert_allclose(entry["rt_cam_ref"][3:5], told_mm, atol=0.15)
     assert {(board["name"], board["sweep"]) for board in content["boards"]} == {("large", sweep) for sweep in range(4)}
     assert content["stage"]["scale_x"]["value"] == pytest.approx(1, abs=1e-3)
+    for axis in "xy":  # the gantry comes from below, whatever the order: its play cannot show
+        assert content["stage"][f"backlash_{axis}_mm"]["value"] is None
+        assert "approach_mm = 0" in content["stage"][f"backlash_{axis}_mm"]["why"]
 
 
 def test_a_session_without_boards_is_told_from_one_whose_frames_are_gone(recorded: Path, tmp_path: Path) -> None:
@@ -107,6 +110,41 @@ class TestRun:
         write_frame(frame, pixels)
         assert self.ran(copy, 700.0) == steps
         assert f"warning: frames/{frame.name} and 0 other frames are not what was captured" in capsys.readouterr().err
+
+    def test_what_is_missing_or_damaged_is_made_again(self, session: Path, tmp_path: Path) -> None:
+        self.ran(session, 700.0)
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+        (copy / "reconstructions" / "plane_00700.0.tiff").unlink()
+        assert self.ran(copy, 700.0) == ["reconstruct"]
+        (copy / "reconstructions" / "report.html").unlink()
+        assert self.ran(copy, 700.0) == ["report"]
+        (copy / "cameras" / "node_r0_c1.cameramodel").unlink()
+        assert self.ran(copy, 700.0)[0] == "geometry"
+        for damaged in ('{"format": 1,', "[]", '{"inputs": 3}'):
+            (copy / "reconstructions" / "reconstruction.json").write_text(damaged)
+            assert self.ran(copy, 700.0) == ["reconstruct"]
+        assert verify(copy).problems == ()
+
+    def test_a_report_of_other_planes_does_not_stay(
+        self, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        self.ran(session, 700.0)
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+
+        def interrupted(*_: object, **__: object) -> None:
+            raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch:
+            patch.setattr("pipelines.reconstruct.write_report", interrupted)
+            with pytest.raises(KeyboardInterrupt):
+                run(copy, depth_mm=[700.0], passes=4)
+        assert [step["step"] for step in run(copy, depth_mm=[700.0], passes=4)["steps"] if step["ran"]] == ["report"]
+
+    def test_another_lens_is_another_geometry(self, session: Path, tmp_path: Path) -> None:
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+        assert run(copy, depth_mm=[700.0], passes=5, lens="opencv4")["steps"][1]["ran"]
+        assert json.loads((copy / "geometry.json").read_text())["lens"]["model"] == "opencv4"
+        assert not run(copy, depth_mm=[700.0], passes=5, lens="opencv4")["steps"][1]["ran"]
 
     def test_what_fails_leaves_the_rest_and_says_how_to_go_on(
         self, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -12,6 +12,7 @@ from calib.errors import NotIdentifiable, PoorFit, TooFewViews
 from calib.geometry import (
     BoardObservation,
     GeometrySettings,
+    Node,
     RigGeometry,
     calibrate_geometry,
     rms_over_views,
@@ -175,11 +176,17 @@ def test_boards_too_far_are_refused() -> None:
         calibrated(simulated(8, standing=far))
 
 
-def test_too_few_nodes_are_refused() -> None:
-    given = simulated(9, standing=six_boards(6, 8, 40.0)[:2])
-    two = [one for one in given.observations if one.node in ((1, 1), (1, 2))]
-    with pytest.raises(NotIdentifiable, match=r"2 node\(s\) only"):
-        calibrate_geometry(BOARDS, two, OPTICS.size_px, (1, 1), GeometrySettings(most_transfer_sigma_px=0.1))
+@pytest.mark.parametrize("nodes", [((1, 1),), ((1, 1), (1, 2)), ((1, 1), (1, 2), (2, 2))])
+def test_too_few_nodes_are_refused(nodes: tuple[Node, ...]) -> None:
+    few = [one for one in simulated(9).observations if one.node in nodes]
+    with pytest.raises(TooFewViews, match=rf"^{len(nodes)} node\(s\) show the boards .*, limit 4; take more nodes"):
+        calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1))
+
+
+def test_few_nodes_are_named_where_the_transfer_is_not_known() -> None:
+    few = [one for one in simulated(9, standing=six_boards(6, 8, 40.0)[:2]).observations if one.node[0] <= 1]
+    with pytest.raises(NotIdentifiable, match=r"6 node\(s\) only: take at least 9"):
+        calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1), GeometrySettings(most_transfer_sigma_px=0.1))
 
 
 def test_without_the_reference_node_nothing_is_solved() -> None:
