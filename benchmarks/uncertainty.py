@@ -11,11 +11,10 @@ import sys
 
 import numpy as np
 
-from pipelines.planes import Settings, certified
+from pipelines.planes import Settings, solve
 from recon.images import ElementalImages, Image
 from recon.operator import PlaneOperator
 from recon.plane import PlaneGrid
-from recon.posed import PosedPlane
 from rig.simulation.experiment import paper_experiment
 from rig.simulation.scene import render
 
@@ -43,7 +42,7 @@ def covered(truth: Image, seed: int) -> tuple[float, float, float]:
     light = operator.forward(truth)
     electrons = generator.poisson(light) + generator.normal(0, _READ_NOISE_E, light.shape)
     images = ElementalImages(electrons.astype(np.float32), 0.0, _READ_NOISE_E**2)
-    (found,) = certified(PosedPlane(operator, images), Settings(uncertainty=True))
+    found = solve(operator, images, "pmlem", Settings(uncertainty=True))
     held = np.abs(found.plane - truth) <= _WITHIN * found.beside["sigma"]
     on = truth > 0
     return float(held[on].mean()), float(held[~on].mean()), float(held.mean())

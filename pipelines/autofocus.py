@@ -151,7 +151,7 @@ def _refined(loaded: LoadedSet, out: Path, compared: Compared, place: NDArray[np
         np.arange(len(compared.depths_mm)),
         1 / np.asarray(compared.depths_mm),
     )
-    around = compared_depths(loaded, (1 / inverse).tolist(), out, compared.bins_px)
+    around = compared_depths(loaded, (1 / inverse).tolist(), out, bins_px=compared.bins_px)
     return likeliest_depth_mm(around.planes, around.depths_mm, place)
 
 

@@ -252,7 +252,9 @@ class OperatorFactory:
         lattices = layout.lattices
         rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
-        self._response = binned(np.stack([_response(loaded, lattice) for lattice in lattices]), bins)
+        response = np.stack([_response(loaded, lattice) for lattice in lattices])
+        whole = binned(response > 0, bins) == 1  # a bin with a pixel that never counts has its electrons, too
+        self._response = np.where(whole, binned(response, bins), 0)
         self._principal_shift = _principal_shift(loaded)
 
     def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:

@@ -119,6 +119,10 @@ def _as_done(
             yield pending.pop(future), words
     except distributed.KilledWorker as failure:
         raise ClusterFailed(f"{failure.allowed_failures + 1} workers died of the same plane; {_LOST}") from failure
+    except FileNotFoundError as failure:
+        raise ClusterFailed(
+            f"a worker does not find {failure.filename}; give --out a folder that all workers see under the same path"
+        ) from failure
     except CancelledError as failure:
         raise ClusterFailed(f"the scheduler went away with {len(pending)} tasks to be done; {_LOST}") from failure
     finally:

@@ -66,17 +66,22 @@ class Compared:
         return depth_map(self.planes, np.asarray(self.depths_mm))
 
 
-def compared_depths(loaded: LoadedSet, depths_mm: Sequence[float], out: Path, least_bins_px: int = 1) -> Compared:
+def compared_depths(
+    loaded: LoadedSet, depths_mm: Sequence[float], out: Path, *, least_bins_px: int = 1, bins_px: int | None = None
+) -> Compared:
     """Compare the views at each depth; one colour's images are in memory at a time, or in a file in `out`.
 
-    Pixels are added up in bins of at least `least_bins_px`: more where the light asks for it.
+    Pixels are added up in bins of `bins_px`; without, in bins of at least `least_bins_px`, more where the light asks
+    for it.
     """
     planes: list[Agreement] = []
     bins = 0
     for layout in channel_layouts(loaded):
         images = load_channel(loaded, layout, memory_or_file(out))
         step = max(layout.lattices[0].step)
-        if not bins:
+        if bins_px is not None:
+            bins = bins_px // step
+        elif not bins:
             middle_mm = sorted(depths_mm)[len(depths_mm) // 2]
             needed = bins_for(
                 OperatorFactory(loaded, layout, images).at_depth(middle_mm, plane_grid(loaded, middle_mm)), images
@@ -202,12 +207,18 @@ def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> 
 
 
 def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return of each sample what the two planes around its depth say, (row, column[, colour]), one plane in memory."""
+    """Return of each sample what the two planes around its depth say, (row, column[, colour]), one plane in memory.
+
+    Samples are those of the farthest plane, which has the most where all planes have one pitch.
+    """
     sharp: NDArray[np.float32] | None = None
-    for number, path in enumerate(paths):
+    for number, path in reversed(list(enumerate(paths))):
         plane = np.asarray(read_frame(path).pixels_dn, np.float32)
-        rows, columns = plane.shape[:2]
-        at = cv2.resize(index.astype(np.float32), (columns, rows), interpolation=cv2.INTER_NEAREST)
+        if sharp is None:
+            rows, columns = plane.shape[:2]
+            at = cv2.resize(index.astype(np.float32), (columns, rows), interpolation=cv2.INTER_NEAREST)
+        elif plane.shape != sharp.shape:
+            plane = cv2.resize(plane, (columns, rows), interpolation=cv2.INTER_LINEAR)
         share = np.maximum(1 - np.abs(at - number), 0)
         part = plane * (share if plane.ndim == 2 else share[:, :, np.newaxis])
         sharp = part if sharp is None else sharp + part

@@ -9,6 +9,9 @@ from pipelines.elemental_set import LoadedSet
 from pipelines.errors import WrongUsage
 from pipelines.plane_files import plane_name
 
+# More are a slip of the hand: files of so many planes would fill any disk.
+_MOST_PLANES = 10_000
+
 
 def distinct_depths(depths: list[float]) -> list[float]:
     """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
@@ -45,6 +48,6 @@ def _swept(option: str, given: str, example: str) -> list[float]:
     if parts is None:
         raise WrongUsage(f"{option} {given}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
     first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if first == last or count < 2:
-        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and at least 2 planes")
+    if first == last or not 2 <= count <= _MOST_PLANES:
+        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and 2 to {_MOST_PLANES} planes")
     return [round(float(value), 6) for value in np.linspace(first, last, count)]

@@ -63,6 +63,10 @@ class ClusterFailed(InputError):
     """The workers that were to do the tasks cannot be reached, or died; what they finished is kept."""
 
 
+class MemoryShort(InputError):
+    """What was asked for needs more memory than is free."""
+
+
 class CannotWrite(InputError):
     """A result could not be written; nothing half-written is left behind."""
 

@@ -79,6 +79,7 @@ def figures(
     made = {}
     for number in wanted:
         started = time.monotonic()
+        (out / f"figure{number}_provenance.json").unlink(missing_ok=True)
         made[f"figure{number}"] = makers[number]()
         record = provenance("figures", options, {}) | {"wall_time_s": time.monotonic() - started}
         write_json(out / f"figure{number}_provenance.json", record)
@@ -170,8 +171,8 @@ def _figure4(out: Path, size_px: tuple[int, int], seeds: int) -> dict[str, Any]:
 
 def _written(out: Path, number: int, picture: bytes, rows: list[dict[str, Any]], numbers: Any) -> dict[str, Any]:
     """Write a figure and its numbers, and return those."""
-    write_whole(out / f"figure{number}.png", picture)
     write_whole(out / f"figure{number}.csv", as_csv(rows))
+    write_whole(out / f"figure{number}.png", picture)
     write_json(out / f"figure{number}.json", numbers)
     return {"planes": rows} if not isinstance(numbers, dict) else numbers
 
@@ -180,7 +181,7 @@ def _write_page(out: Path) -> Path:
     """Write figures.html of the figures that are in a folder, and return its path."""
     found: dict[int, dict[str, Any]] = {}
     for number in (2, 3, 4):
-        if not (out / f"figure{number}.png").is_file():
+        if not (out / f"figure{number}_provenance.json").is_file():  # it is written last
             continue
         found[number] = {
             "src": data_uri((out / f"figure{number}.png").read_bytes(), ".png"),

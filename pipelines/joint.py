@@ -6,14 +6,18 @@ from typing import Any
 
 from pipelines.channels import OperatorFactory
 from pipelines.console import say
-from pipelines.planes import Method, Settings, Solution, certified, mean_e
+from pipelines.errors import MemoryShort
+from pipelines.large_arrays import available_bytes
+from pipelines.planes import Method, Objective, Settings, Solution, certified, mean_e
 from pipelines.tilted import Place, depth_of
 from recon.errors import GeometryMismatch
 from recon.images import ElementalImages
 from recon.occlusion import opacity, transmission
 from recon.plane import PlaneGrid
 from recon.posed import PosedScene
-from recon.scene import SceneOperator
+
+# What is computed of each pixel of each view for all planes together: what it sees, of ones and of light, and ratios.
+_ARRAYS_OF_IMAGES = 5
 
 
 def solve_together(
@@ -38,35 +42,48 @@ def solve_together(
     dict of Method to dict of Place to Solution
         By method and plane. All records tell of one iteration: its penalty weight, passes, objective and certificate.
     """
+    _require_memory(images, len(grids) if "occlusion" in methods else 0)
     operator = factory.of_scene(grids)
-    joint = certified(PosedScene(operator, images), settings)
+    objective = Objective.of(PosedScene(operator, images), settings)
+    joint = certified(objective, settings)
     found: dict[Method, list[Solution]] = {"joint": joint}
     if "occlusion" in methods:
-        found["occlusion"] = _with_occlusion(factory, operator, images, grids, joint, settings)
+        found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings)
     return {method: dict(zip(grids, found[method], strict=True)) for method in methods}
+
+
+def _require_memory(images: ElementalImages, masks: int) -> None:
+    """Refuse what memory has no room for: arrays as large as the images, and with occlusion one per plane."""
+    needed, free = (_ARRAYS_OF_IMAGES + masks) * images.electrons.nbytes, available_bytes()
+    if needed > free:
+        raise MemoryShort(
+            f"planes found together need {needed / 1e9:.3g} GB beside the images, and {free / 1e9:.3g} GB of "
+            "memory are free; ask for fewer planes with --occlusion, for --joint alone, or --method pmlem"
+        )
 
 
 def _with_occlusion(
     factory: OperatorFactory,
-    operator: SceneOperator,
-    images: ElementalImages,
+    objective: Objective[PosedScene],
     grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
     settings: Settings,
 ) -> list[Solution]:
     """Find opacity from the planes, and the light once more behind it, with the penalty weight found without.
 
+    Likelihood and penalty stay, too, so that the least of either objective tells which explains the images better.
     What is written of each plane is `α f`: where a plane lets through what is behind it, it is not there, and has no
     light of its own. The certificate is that of f.
     """
     chosen = {key: joint[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
     settings = replace(settings, penalty_weight=joint[0].record["penalty_weight"])
-    hidden = transmission(operator, [opacity(one.plane) for one in joint], [depth_of(place) for place in grids])
+    opacities = [opacity(one.plane) for one in joint]
+    hidden = transmission(objective.posed.operator, opacities, [depth_of(place) for place in grids])
     try:
         occluded = factory.of_scene(grids, hidden)
     except GeometryMismatch:
         return _without_occlusion(joint, "a plane would be hidden from all views")
-    better = certified(PosedScene(occluded, images), settings)
+    better = certified(replace(objective, posed=replace(objective.posed, operator=occluded)), settings)
     if better[0].record["objective"] >= joint[0].record["objective"]:
         return _without_occlusion(joint, "it explains the images no better")
     return [_of_what_is_there(one, chosen) for one in better]

@@ -91,16 +91,18 @@ class PlaneFiles:
         preview = self.path.with_suffix(".png")
         write_png(preview, grey_levels(plane, white_level(plane)))
         written = [self.path, preview]
+        beside = {}
         for name in _BESIDE:
             path = self.path_beside(name)
             if all(name in part for part in parts):
                 write_plane(path, _together(parts, name), pitch_mm)
                 written.append(path)
+                beside[f"{name}_file"] = path.name
             else:
                 path.unlink(missing_ok=True)  # of the plane that was here before
         record = {
             "format": 1,
-            "planes": [entry["record"] for entry in entries],
+            "planes": [entry["record"] | beside for entry in entries],
             "focus": [entry["focus"] for entry in entries],
             "sha256": {path.name: sha256(path) for path in written},
             **self.origin,

@@ -94,24 +94,55 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
     if method == "pmlem":
-        return certified(PosedPlane(operator, images), settings)[0]
+        return certified(Objective.of(PosedPlane(operator, images), settings), settings)[0]
     start = smooth_start(operator, images)
     images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
     return _one_step_late(operator, images, start, method, settings)
 
 
-def certified(posed: PosedPlane | PosedScene, settings: Settings) -> list[Solution]:
+@dataclass(frozen=True)
+class Objective[Posed: (PosedPlane, PosedScene)]:
+    """What PMLEM minimises, but for the penalty's weight.
+
+    Attributes
+    ----------
+    posed : PosedPlane or PosedScene
+        The operator, and the images with the likelihood they are judged by.
+    penalty : Penalty
+        What is held against planes.
+    start : float array
+        Where to begin.
+    level_e : float
+        Mean light of what the views see.
+    """
+
+    posed: Posed
+    penalty: Penalty
+    start: Image
+    level_e: float
+
+    @classmethod
+    def of(cls, posed: Posed, settings: Settings) -> "Objective[Posed]":
+        """Choose likelihood and penalty as asked for, by the level of light and noise."""
+        start = posed.start()
+        level_e = posed.level_e(start)
+        likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
+        posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
+        noise_e = float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
+        return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
+
+
+def certified(objective: Objective[PosedPlane] | Objective[PosedScene], settings: Settings) -> list[Solution]:
     """Run PMLEM to its certificate, and return the planes; the record of each is that of the one iteration."""
-    start = posed.start()
-    level_e = posed.level_e(start)
-    likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
-    posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
-    fit = posed.fit(level_e)
-    noise_e = float(1 / np.sqrt(np.median(fit.metric(start)[posed.well_seen()])))
-    penalty = Penalty.for_noise(settings.penalty, noise_e)
-    choice = _chosen(posed, start, penalty, settings)
+    posed, penalty, level_e = objective.posed, objective.penalty, objective.level_e
+    choice = _chosen(posed, objective.start, penalty, settings)
     iterates = pmlem(
-        fit, choice.start, penalty_weight=choice.weight, penalty=penalty, tolerance=_TOLERANCE, dual=choice.dual
+        posed.fit(level_e),
+        choice.start,
+        penalty_weight=choice.weight,
+        penalty=penalty,
+        tolerance=_TOLERANCE,
+        dual=choice.dual,
     )
     limit = settings.passes or _PASSES["pmlem"]
     for done, iterate in enumerate(iterates, 1):
@@ -122,7 +153,7 @@ def certified(posed: PosedPlane | PosedScene, settings: Settings) -> list[Soluti
         "passes_before": 1 + choice.passes,
         "penalty_weight_curve": choice.curve,
         "penalty": asdict(penalty),
-        "likelihood": likelihood.name,
+        "likelihood": posed.images.likelihood.name,
         "certificate": _certificate(iterate),
     }
     planes = posed.planes_of(iterate.plane)

@@ -37,6 +37,9 @@ from rig.session.opening import has_session
 
 DEFAULT_METHOD: Method = "pmlem"
 
+# A plane of less light than this, in electrons per pixel, has none.
+_BLACK_E = 1e-5
+
 
 @dataclass(frozen=True)
 class Request:
@@ -172,7 +175,7 @@ def reconstruct(
         raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
-    tilted = [plane for path in plane_pose or [] for plane in read_plane_poses(path)]
+    tilted = read_plane_poses(plane_pose or [])
     loaded, out = _opened(elemental_set, out, scene, geometry)
     swept_of_px = depths_by_disparity(loaded, swept_px)
     of_disparity = depths_by_disparity(loaded, disparity_px or []) | swept_of_px
@@ -182,7 +185,7 @@ def reconstruct(
         found = _found(loaded, out, depth_mm or [], [*swept, *swept_of_px], disparity_px or [])
         depths, of_disparity = found.depths_mm, {}
     if depth_map:
-        require_sweep(depths)
+        require_sweep(distinct_depths(depths))
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
     asked: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
@@ -232,8 +235,9 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     sweep = _sweep(loaded, folders, request)
     require_room(out, sweep.needed_bytes())
-    for folder in folders.values():
+    for folder in {out, *folders.values()}:
         remove_leftovers(folder)
+    for folder in folders.values():
         (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
     try:
         sweep.run(crew, out)
@@ -267,6 +271,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
     report = write_report(out)
     _say_what_oscillates(sweep.records)
     _say_what_is_not_reached(sweep.records)
+    _say_what_is_black(sweep.records)
     say(f"{len(depths) + len(request.tilted)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {
         "out": str(out),
@@ -357,4 +362,15 @@ def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
         say(
             f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
             f"{max(missed):.1%} from the optimum instead of {certificates[0]['tolerance']:.0%}; allow more --passes"
+        )
+
+
+def _say_what_is_black(records: list[dict[str, Any]]) -> None:
+    """Tell of planes without light, which are right only if there is none."""
+    black = [record for record in records if record["mean_e"] <= _BLACK_E]
+    if black:
+        say(
+            f"{len(black)} of {len(records)} planes are black ({black[0]['method']}, {black[0]['depth_mm']:g} mm for "
+            "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
+            "with dark frames of the same exposure"
         )

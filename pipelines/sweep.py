@@ -102,7 +102,6 @@ class Channel:
             **asdict(grid),
             **solution.record,
             "flux_e": float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(files.place, grid),
-            **{f"{name}_file": files.path_beside(name).name for name in solution.beside},
         }
         arrays = {"plane": solution.plane, **solution.beside}
         files.save_part(task.layout.name, arrays, {"record": record, "focus": focus})
@@ -123,9 +122,7 @@ class Channel:
 
     def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
         """Return words on views that see nothing of a plane: a pose may be wrong."""
-        blind = {
-            int(view) // self._phases for view in operator.all_views if not operator.sensitivity([int(view)]).any()
-        }
+        blind = {int(view) // self._phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
         if not blind:
             return []
         first = self._loaded.settings.view[min(blind)].image

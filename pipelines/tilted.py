@@ -1,6 +1,7 @@
 """Planes given by a pose (`--plane-pose`): read from a file, and where their samples lie."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -83,8 +84,8 @@ class _Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     plane: list[_Pose]
 
 
-def read_plane_poses(path: Path) -> list[TiltedPlane]:
-    """Read the planes of a file.
+def read_plane_poses(paths: Sequence[Path]) -> list[TiltedPlane]:
+    """Read the planes of files.
 
     Its `[[plane]]` have a `name` and either `rt_ref_plane` (Rodrigues rad and mm, from plane to reference) or
     `point_mm` and `normal` in the reference frame, and may have `size_mm`.
@@ -92,15 +93,18 @@ def read_plane_poses(path: Path) -> list[TiltedPlane]:
     Raises
     ------
     MissingFile, UnknownKey, BadValue
-        The file is not such a one.
+        A file is not such a one, or two planes share a name.
     """
-    planes = [_plane(path, pose) for pose in read_toml(path, _Poses).plane]
-    names = [plane.name for plane in planes]
-    if not planes:
-        raise BadValue(f"{path}: names no [[plane]]; add one")
-    if twice := {name for name in names if names.count(name) > 1}:
-        raise BadValue(f"{path}: two planes are called '{min(twice)}'; give each a name of its own")
-    return planes
+    planes: dict[str, TiltedPlane] = {}
+    for path in paths:
+        poses = read_toml(path, _Poses).plane
+        if not poses:
+            raise BadValue(f"{path}: names no [[plane]]; add one")
+        for pose in poses:
+            if pose.name in planes:
+                raise BadValue(f"{path}: two planes are called '{pose.name}'; give each a name of its own")
+            planes[pose.name] = _plane(path, pose)
+    return list(planes.values())
 
 
 def _plane(path: Path, pose: _Pose) -> TiltedPlane:

@@ -9,7 +9,7 @@ from recon.images import ElementalImages, Image
 from recon.operator import PlaneOperator
 from recon.smoothing import blurred
 
-# The metric is at least this part of its median: samples that hardly any view sees are led by their neighbours.
+# The metric is at least this part of its median where anything is seen: the rest is led by its neighbours.
 _LEAST_METRIC = 1e-3
 
 # A sample counts as at least this part of the typical light when curvature is asked for.
@@ -72,7 +72,7 @@ class DataFit:
         response = np.ones_like(self._coverage)
         np.divide(self._coverage, self.sensitivity, out=response, where=self.sensitivity > 0)
         metric = self._coverage * blurred(1 / (light_e * response + self._known_e2), (1,))
-        return np.asarray(np.maximum(metric, _LEAST_METRIC * np.median(metric)), plane.dtype)
+        return np.asarray(positive_metric(metric), plane.dtype)
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:
         """Return b + σ² as the samples meet it: averaged so that its inverse, with typical light added, is kept."""
@@ -82,3 +82,8 @@ class DataFit:
         mean = np.full_like(inverse, 1 / level_e)
         np.divide(inverse, self.sensitivity, out=mean, where=self.sensitivity > 0)
         return np.asarray(np.maximum(1 / mean - level_e, 0))
+
+
+def positive_metric(metric: Image) -> Image:
+    """Return a metric that is positive where no view sees anything, too."""
+    return np.maximum(metric, _LEAST_METRIC * np.median(metric[metric > 0]))

@@ -97,7 +97,7 @@ def chosen_weight(posed: Posed, guess: float, penalty: Penalty) -> ChosenWeight:
     Raises
     ------
     ValueError
-        There are fewer than `LEAST_VIEWS` views.
+        Fewer than `LEAST_VIEWS` views see anything.
 
     Notes
     -----
@@ -106,10 +106,10 @@ def chosen_weight(posed: Posed, guess: float, penalty: Penalty) -> ChosenWeight:
     """
     count = len(posed.views)
     if count < LEAST_VIEWS:
-        raise ValueError(f"need at least {LEAST_VIEWS} views to hold some out, got {count}")
-    pixels_of_fold = posed.images.electrons.size / _folds(count)
+        raise ValueError(f"need at least {LEAST_VIEWS} views that see anything to hold some out, got {count}")
+    pixels_of_fold = posed.images.electrons[0].size * count / _folds(count)
     needed = min(int(np.ceil(_LEAST_PREDICTED / pixels_of_fold)), _folds(count))
-    outs = [held_out_views(count, fold) for fold in range(needed)]
+    outs = [posed.views[held_out_views(count, fold)] for fold in range(needed)]
     search = _Search([_Fold(posed, penalty, out) for out in outs], guess)
     step = 1
     search.score(step)
@@ -146,8 +146,8 @@ class _Fold:
             tolerance=_TOLERANCE,
             dual=self._posed.dual() if near is None else near.dual,
         )
-        for iterate in iterates:
-            if iterate.certificate.distance <= _TOLERANCE or iterate.passes >= _PASSES:
+        for done, iterate in enumerate(iterates, 1):
+            if iterate.certificate.distance <= _TOLERANCE or max(done, iterate.passes) >= _PASSES:
                 break
         self.solutions[step] = iterate
         self.passes += iterate.passes * self._share + (1 - self._share)

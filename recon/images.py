@@ -96,7 +96,7 @@ class ElementalImages:
         """Return the images with `bins` by `bins` pixels added up, as one pixel of a coarser detector would count them.
 
         A sum of Poisson counts is one, and so is a sum of read noises: all that is said of images holds for these. A
-        bin counts where all its pixels do.
+        bin counts where all its pixels are `valid`; pixels that never count are the operator's to leave out.
         """
         if bins == 1:
             return self

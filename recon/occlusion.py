@@ -53,6 +53,7 @@ def transmission(
         if not farther:
             continue
         alone = [one if index == near else np.zeros_like(one) for index, one in enumerate(opacities)]
-        hidden = np.divide(operator.forward(alone), response, out=np.zeros(operator.images_shape), where=response > 0)
+        seen = operator.forward(alone)
+        hidden = np.divide(seen, response, out=np.zeros_like(seen), where=response > 0)
         through[farther] *= np.clip(1 - hidden, 0, 1)
     return through

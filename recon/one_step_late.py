@@ -135,7 +135,7 @@ def _one_step_late(
         last_step, step = step, next_plane - plane
         norms = float(np.linalg.norm(step)) * float(np.linalg.norm(last_step))
         alternation = float(np.vdot(step, last_step)) / norms if norms > 0 else 0.0
-        change = float(np.linalg.norm(step) / np.linalg.norm(plane))
+        change = float(np.linalg.norm(step) / np.linalg.norm(plane)) if step.any() else 0.0
         plane = next_plane
         yield Iterate(plane, Step(passes, change, alternation))
 

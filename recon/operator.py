@@ -77,6 +77,11 @@ class PlaneOperator:
         self.maps_shape = self._scene.maps_shape
         self.lattice_of_view = self.all_views * 0 if lattice_of_view is None else lattice_of_view
 
+    @property
+    def seeing_views(self) -> NDArray[np.intp]:
+        """The views of which some pixel that counts sees the plane."""
+        return self._scene.seeing_views
+
     def forward(self, plane: Image, views: Views = None) -> Image:
         """Return H f: the plane (row, column) as each view sees it, (view, row, column)."""
         return self._scene.forward([plane], views)

@@ -198,16 +198,16 @@ class _Pmlem:
                 self._scale *= 2
             while self._scale > _LARGEST_SCALE:
                 yield accepted  # no step leads further down: as far as these numbers go
-            plane, dual = self._step(accepted, gradient, metric)
+            plane, dual = self._step(accepted, gradient, metric, dual)
 
-    def _step(self, here: PmlemIterate, gradient: Image, metric: Image) -> tuple[Image, Dual]:
-        """Return the least of the quadratic and the penalty, and its dual field."""
+    def _step(self, here: PmlemIterate, gradient: Image, metric: Image, dual: Dual) -> tuple[Image, Dual]:
+        """Return the least of the quadratic and the penalty, and its dual field, sought from that of the last one."""
         scaled = metric if self._scale == 1 else metric * metric.dtype.type(self._scale)
         centre = here.plane - gradient / scaled
         if self._weight == 0:
-            plane, dual = np.maximum(centre, 0), here.dual
+            plane = np.maximum(centre, 0)
         else:
-            dual = here.dual.copy()
+            dual = dual.copy()
             size = norm(here.plane, scaled)
 
             def enough(plane: Image) -> float:
@@ -229,8 +229,15 @@ class _Pmlem:
         slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1]
         slack += float(np.sum(metric * plane * np.maximum(-after, 0), dtype=np.float64))
         size = norm(plane, metric)
-        distance = residual + np.sqrt(residual**2 + 2 * slack)
-        return Certificate(distance / size, residual / size, np.sqrt(2 * slack) / size)
+        parts = (residual + np.sqrt(residual**2 + 2 * slack), residual, np.sqrt(2 * slack))
+        return Certificate(*(_relative(part, size) for part in parts))
+
+
+def _relative(part: float, size: float) -> float:
+    """Return a part of a size; of a black plane everything is infinitely much, and nothing is nothing."""
+    if size == 0:
+        return 0.0 if part == 0 else np.inf
+    return float(part / size)
 
 
 def norm(plane: Image, metric: Image) -> float:

@@ -29,7 +29,7 @@ class Posed(Protocol):
 
     @property
     def views(self) -> NDArray[np.intp]:
-        """Return all views."""
+        """Return the views that see anything."""
 
     def start(self, views: Views = None) -> Image:
         """Return positive samples to start from."""
@@ -68,8 +68,8 @@ class PosedPlane:
 
     @property
     def views(self) -> NDArray[np.intp]:
-        """Return all views."""
-        return self.operator.all_views
+        """Return the views that see anything."""
+        return self.operator.seeing_views
 
     def start(self, views: Views = None) -> Image:
         """Return `recon.solvers.smooth_start`."""
@@ -117,8 +117,8 @@ class PosedScene:
 
     @property
     def views(self) -> NDArray[np.intp]:
-        """Return all views."""
-        return self.operator.all_views
+        """Return the views that see anything."""
+        return self.operator.seeing_views
 
     def start(self, views: Views = None) -> Image:
         """Return `recon.scene_fit.scene_start`."""

@@ -1,6 +1,7 @@
 """H of several planes at once: what each detector pixel of each view sees of a scene, and the exact adjoint."""
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -95,6 +96,11 @@ class SceneOperator:
     def sensitivity(self, views: Views = None) -> list[Image]:
         """Return s_z = H_zᵀ 1 (row, column) of each plane."""
         return self.adjoint_of_map(1.0, views)
+
+    @cached_property
+    def seeing_views(self) -> NDArray[np.intp]:
+        """The views of which some pixel that counts sees one of the planes."""
+        return np.array([view for view in self.all_views.tolist() if any(s.any() for s in self.sensitivity([view]))])
 
     def response(self) -> Image:
         """Return the relative response of each pixel (lattice, row, column)."""

@@ -5,13 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from recon.data_fit import positive_metric
 from recon.images import ElementalImages, Image
 from recon.scene import SceneOperator
 from recon.smoothing import blurred
 from recon.solvers import LEAST_LEVEL_E, START_BLUR
-
-# The metric is at least this part of its median: samples that hardly any view sees are led by their neighbours.
-_LEAST_METRIC = 1e-3
 
 # A pixel counts as at least this part of the typical light when curvature is asked for.
 _LEAST_LIGHT = 0.01
@@ -67,7 +65,7 @@ class SceneFit:
         to see to.
         """
         metric = self._operator.samples_of(self._row_sums(self._seen, self._light_e(samples)))
-        return np.asarray(np.maximum(metric, _LEAST_METRIC * np.median(metric)), samples.dtype)
+        return np.asarray(positive_metric(metric), samples.dtype)
 
     def metric_of_each(self, samples: Image) -> list[Image]:
         """Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` > 0 (row, column) of each plane: its metric were the others known."""
@@ -75,8 +73,7 @@ class SceneFit:
         metrics = []
         for index in range(len(operator.grids)):
             ones = [np.full(grid.shape, index == z, operator.dtype) for z, grid in enumerate(operator.grids)]
-            metric = self._row_sums(operator.forward(ones, self._views), light_e)[index]
-            metrics.append(np.maximum(metric, _LEAST_METRIC * np.median(metric)))
+            metrics.append(positive_metric(self._row_sums(operator.forward(ones, self._views), light_e)[index]))
         return metrics
 
     def _light_e(self, samples: Image) -> Image:

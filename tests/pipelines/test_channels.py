@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -269,3 +270,17 @@ def test_views_with_a_principal_point_of_their_own_look_past_it(make_set: SetMak
     moved = _back_projected(folder, 100.0)
     expected = ((frame[1:-1, 6:-1] - 100.0) / 2.0 + (frame[1:-1, 1:-6] - 100.0) / 2.0) / 2.0
     np.testing.assert_allclose(moved[1:-1, 6:-1], expected, rtol=1e-3)
+
+
+def test_a_bin_with_a_pixel_that_never_counts_does_not_count(make_set: SetMaker) -> None:
+    folder = make_set([np.full((12, 16), 500, np.uint16)] * 2)
+    unusable = np.zeros((12, 16), bool)
+    unusable[5, 9] = True
+    loaded = replace(load_set(folder), unusable=unusable)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout).binned(4)
+    factory = OperatorFactory(loaded, layout, images, bins=4)
+    grid = plane_grid(loaded, 100.0).binned(4)
+    seen = factory.at_depth(100.0, grid).forward(np.ones(grid.shape, np.float32), [0])[0]
+    assert seen[1, 2] == 0
+    assert np.count_nonzero(seen) == seen.size - 1

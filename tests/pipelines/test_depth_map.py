@@ -193,3 +193,27 @@ def test_the_pieces_of_a_photographed_chess_board_stand_in_their_order(
         # Of this set it is known that points move by −3.4 … +0.8 px
         assert near_to_far[0] == pytest.approx(-3.3, abs=0.2)
         assert -0.2 < near_to_far[-1] < 0.9
+
+
+def test_planes_of_one_pitch_make_one_picture(scene: Path, swept: Path, tmp_path: Path) -> None:
+    _run("reconstruct", scene, "--out", tmp_path, *SWEEP, "--pitch-mm", 2)
+    own, usual = (read_frame(folder / "all_in_focus.tiff").pixels_dn for folder in (tmp_path, swept))
+    farthest = read_frame(tmp_path / "plane_00900.0.tiff").pixels_dn
+    assert own.shape == farthest.shape != usual.shape
+    same = cv2.resize(own, usual.shape[::-1], interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(same.ravel(), usual.ravel())[0, 1] > 0.9
+
+
+def test_bins_that_are_stated_are_taken(scene: Path, tmp_path: Path) -> None:
+    loaded = load_set(scene)
+    chosen = compared_depths(loaded, [500.0, 700.0], tmp_path)
+    other = 2 * chosen.bins_px
+    stated = compared_depths(loaded, [500.0, 700.0], tmp_path, bins_px=other)
+    assert stated.bins_px == other
+    assert stated.planes[0].light.shape == tuple(side // other for side in (120, 160))
+
+
+def test_depths_that_are_the_same_count_once(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [word for _ in range(6) for word in ("--depth-mm", "500")]
+    assert run(["reconstruct", str(scene), "--out", str(tmp_path), *words, "--depth-map"]) == 2
+    assert "1 are given; give at least 5" in " ".join(capsys.readouterr().err.split())

@@ -132,6 +132,8 @@ def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: C
     said = json.loads(done("--json", "figures", out, "--only", 3, "--size-px", 64, 48).stdout)
     assert list(said["figures"]) == ["figure3"]
     assert (out / "figure2.png").read_bytes() == before
+    (out / "figure4.png").touch()  # of a figure that was cut short
+    done("figures", out, "--only", 3, "--size-px", 64, 48)
     page = (out / "figures.html").read_text()
     assert 'id="figure2"' in page
     assert 'id="figure3"' in page

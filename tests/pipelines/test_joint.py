@@ -72,3 +72,21 @@ def test_workers_find_planes_together(
     done(*words, "--out", tmp_path / "local")
     done(*words, "--out", tmp_path / "spread", "--workers", 1)
     assert _files(tmp_path / "spread") == _files(tmp_path / "local")
+
+
+def test_objectives_with_and_without_occlusion_are_of_one_kind(scene: Path, tmp_path: Path, done: Command) -> None:
+    options = ("--penalty", "huber-tv", "--likelihood", "least-squares", "--penalty-weight", 1)
+    done("reconstruct", scene, *BOTH, *options, "--joint", "--occlusion", "--out", tmp_path)
+    records = [tmp_path / name / "reconstruction.json" for name in ("joint", "occlusion")]
+    joint, occlusion = (json.loads(path.read_text())["planes"][0] for path in records)
+    assert joint["penalty"] == occlusion["penalty"]  # its δ follows the noise, which another start would shift
+    assert occlusion["objective"] <= joint["objective"]
+
+
+def test_what_memory_has_no_room_for_is_refused(
+    scene: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipelines.joint.available_bytes", lambda: 100_000)
+    ended = faintfield("reconstruct", scene, *BOTH, "--occlusion", "--out", tmp_path / "out")
+    assert ended.returncode == 1
+    assert "MemoryShort: planes found together need" in ended.stderr

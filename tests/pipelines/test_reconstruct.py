@@ -379,7 +379,8 @@ def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> 
         (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
         (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different ends"),
         (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),
-        (("--sweep-mm", "400:900:1"), 2, "at least 2 planes"),
+        (("--sweep-mm", "400:900:1"), 2, "2 to 10000 planes"),
+        (("--sweep-mm", "400:900:100000000000"), 2, "2 to 10000 planes"),
         (("--sweep-mm", "500:500.3:7"), 2, "would share a file name; keep them 0.1 mm apart"),
         (("--depth-mm", -500), 1, "GeometryMismatch: a plane at -500.0 mm is not in front of the camera"),
         (("--depth-mm", "nan"), 1, "GeometryMismatch: a plane at nan mm is not in front"),
@@ -398,3 +399,13 @@ def test_planes_that_cannot_be_are_refused_before_anything_is_written(
     assert len(ended.stderr.splitlines()) == 1
     assert ended.stdout == ""
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("method", ["pmlem", "mlem", "joint"])
+def test_a_plane_without_light_is_black_and_that_is_said(
+    method: str, scene: Path, edit: Edit, tmp_path: Path, done: Command
+) -> None:
+    edit(scene, lambda settings: settings["noise"].update(offset_dn=200.0))
+    ended = done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", method)
+    assert "1 of 1 planes are black" in ended.stderr
+    assert read_frame(tmp_path / "out" / "plane_00500.0.tiff").pixels_dn.max() < 1e-4

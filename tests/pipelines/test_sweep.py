@@ -15,7 +15,7 @@ import tifffile
 from pipelines.cli import run
 from pipelines.elemental_set import load_set
 from pipelines.files import UNFINISHED
-from pipelines.plane_files import PARTS
+from pipelines.plane_files import PARTS, PlaneFiles
 from pipelines.planes import solve
 from pipelines.reconstruct import Request, reconstruct_set
 from recon.errors import GeometryMismatch
@@ -133,3 +133,26 @@ def test_a_failure_leaves_the_planes_before_it(
         reconstruct_set(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
     assert {path.name for path in tmp_path.iterdir()} == {f"plane_00500.0.{kind}" for kind in ("tiff", "png", "json")}
     assert not (tmp_path / PARTS).exists()
+
+
+def test_what_a_killed_call_with_several_methods_left_goes(scene: Path, tmp_path: Path, done: Command) -> None:
+    left = tmp_path / f".shared.1234{UNFINISHED}"
+    left.mkdir()
+    (left / "grey.float32").write_bytes(b"1234")
+    done("reconstruct", scene, "--out", tmp_path, "--depth-mm", 500, "--method", "backprojection", "--method", "mlem")
+    assert not left.exists()
+
+
+def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
+    files = PlaneFiles(
+        tmp_path, "occlusion", 500.0, ("red", "green", "blue"), {"inputs": {}, "options": {}, "versions": {}}
+    )
+    one = {"plane": np.ones((4, 5), np.float32)}
+    entry = {"record": {"file": files.path.name}, "focus": None}
+    files.save_part("red", one | {"sigma": one["plane"], "opacity": one["plane"]}, entry)
+    for colour in ("green", "blue"):
+        files.save_part(colour, one | {"sigma": one["plane"]}, entry)
+    for record in files.finish(1.0)["planes"]:
+        assert record["sigma_file"] == "plane_00500.0_sigma.tiff"
+        assert "opacity_file" not in record
+    assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["plane_00500.0.tiff", "plane_00500.0_sigma.tiff"]

@@ -147,7 +147,7 @@ def test_any_normal_becomes_a_pose_whose_plane_holds_the_point(
     point = np.array([0.3 * depth_mm * beside[0], 0.3 * depth_mm * beside[1], depth_mm])
     with TemporaryDirectory() as folder:
         path = _poses(Path(folder) / "p.toml", {"name": "p", "point_mm": point.tolist(), "normal": list(normal)})
-        (plane,) = read_plane_poses(path)
+        (plane,) = read_plane_poses([path])
     assert abs(abs(plane.normal @ normal) / np.linalg.norm(normal) - 1) < 1e-9
     assert plane.normal @ point >= 0
     np.testing.assert_allclose(plane.on_plane(point[np.newaxis] / point[2]), [[0, 0]], atol=1e-6 * depth_mm)
@@ -168,8 +168,15 @@ def test_what_is_no_plane_is_refused(
     plane: dict[str, Any], failure: type[Exception], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(failure) as refused:
-        read_plane_poses(_poses(tmp_path / "p.toml", plane))
+        read_plane_poses([_poses(tmp_path / "p.toml", plane)])
     assert said in str(refused.value)
+
+
+def test_planes_of_two_files_with_one_name_are_refused(tmp_path: Path) -> None:
+    plane = {"name": "table", "rt_ref_plane": [0.0] * 5 + [600.0]}
+    one, other = (_poses(tmp_path / name, plane) for name in ("one.toml", "other.toml"))
+    with pytest.raises(BadValue, match=r"other.toml: two planes are called 'table'"):
+        read_plane_poses([one, other])
 
 
 def test_planes_that_the_view_does_not_meet_are_refused(target: Path, tmp_path: Path, faintfield: Command) -> None:

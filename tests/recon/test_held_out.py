@@ -72,3 +72,25 @@ def test_too_few_views_are_refused() -> None:
     few = PlaneOperator(np.stack([np.eye(3)] * 3), np.zeros((4, 4, 2)), PlaneGrid((4, 4), 1.0, (0.0, 0.0)))
     with pytest.raises(ValueError, match="at least 4 views"):
         chosen_weight(PosedPlane(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
+
+
+def test_views_that_see_nothing_are_neither_kept_nor_held_out() -> None:
+    operator, images = dark_views(scene(24), 1)
+    aside = np.stack([np.eye(3)] * 49)
+    aside[:, 0, 2] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
+    rays = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1)
+    posed = PosedPlane(PlaneOperator(aside, rays, operator.grid), images)
+    assert posed.views.tolist() == list(range(3, 49, 7))
+    assert np.isfinite([tried.held_out for tried in chosen_weight(posed, 1.0, Penalty()).tried]).all()
+
+
+def test_a_solver_that_finds_no_way_down_ends_the_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+    operator, images = dark_views(scene(24), 1)
+    true = DataFit.value_and_gradient
+
+    def misled(fit: DataFit, plane: Image) -> tuple[float, Image]:
+        value, gradient = true(fit, plane)
+        return value, -gradient
+
+    monkeypatch.setattr(DataFit, "value_and_gradient", misled)
+    assert chosen_weight(PosedPlane(operator, images), 1.0, Penalty()).tried

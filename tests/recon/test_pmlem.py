@@ -1,6 +1,7 @@
 """PMLEM against two solvers of other kinds on a matrix of its own; its certificate against true distances."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice, pairwise
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 from recon.data_fit import DataFit
 from recon.errors import NotConverged
 from recon.images import Image, LikelihoodName
+from recon.operator import PlaneOperator
 from recon.penalties import Penalty
+from recon.plane import PlaneGrid
 from recon.pmlem import PmlemIterate, norm, pmlem
 from recon.solvers import smooth_start
 from tests.recon.small_problems import (
@@ -179,3 +182,27 @@ def test_numbers_that_leave_the_finite_are_refused() -> None:
 
     with pytest.raises(NotConverged, match="pass 1 left the finite numbers"):
         next(pmlem(Overflowing(), np.ones(SHAPE), penalty_weight=1.0))
+
+
+def test_where_nothing_shines_the_optimum_is_black_and_certain() -> None:
+    posed = problem()
+    images = replace(posed.images, electrons=np.full_like(posed.images.electrons, -1.5))
+    fit = DataFit(posed.operator, images, 1.0)
+    for iterate in islice(pmlem(fit, np.ones(SHAPE), penalty_weight=WEIGHT), 20):
+        if iterate.certificate.distance == 0:
+            break
+    assert not iterate.plane.any()
+    assert iterate.certificate.distance == 0
+
+
+def test_samples_that_no_view_sees_follow_their_neighbours() -> None:
+    posed = problem()
+    wide = PlaneGrid((4 * SHAPE[0], 4 * SHAPE[1]), 1.0, (-1.5 * SHAPE[1], -1.5 * SHAPE[0]))
+    rays = np.stack(np.meshgrid(np.arange(float(SHAPE[1])), np.arange(float(SHAPE[0]))), axis=-1)
+    operator = PlaneOperator(np.stack([np.eye(3)] * 12), rays, wide, dtype=np.float64)
+    images = replace(posed.images, electrons=posed.images.electrons[:, 1:-1, 1:-1])
+    fit, start = DataFit(operator, images, 3.0), smooth_start(operator, images)
+    assert np.median(operator.sensitivity()) == 0
+    assert fit.metric(start).min() > 0
+    *_, last = islice(pmlem(fit, start, penalty_weight=WEIGHT), 10)
+    assert np.isfinite(last.plane).all()

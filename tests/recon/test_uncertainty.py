@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from pipelines.planes import Settings, certified
+from pipelines.planes import Objective, Settings, certified, solve
 from recon.images import ElementalImages, Image
 from recon.penalties import Penalty, PenaltyName
-from recon.posed import PosedPlane, PosedScene
+from recon.posed import PosedScene
 from recon.smoothing import blurred
 from recon.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
@@ -70,7 +70,7 @@ def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
     held = []
     for seed in range(3):
         operator, images = dark_views(truth, seed)
-        (found,) = certified(PosedPlane(operator, images), Settings(uncertainty=True))
+        found = solve(operator, images, "pmlem", Settings(uncertainty=True))
         held.append(np.mean((np.abs(found.plane - truth) <= 1.645 * found.beside["sigma"])[8:-8, 8:-8]))
     assert 0.85 <= np.mean(held) <= 0.995
 
@@ -78,7 +78,8 @@ def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
 def test_each_plane_of_a_scene_has_its_own_as_if_the_others_were_known() -> None:
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
-    found = certified(PosedScene(posed.operator, images), Settings(penalty_weight=0.8, uncertainty=True))
+    settings = Settings(penalty_weight=0.8, uncertainty=True)
+    found = certified(Objective.of(PosedScene(posed.operator, images), settings), settings)
     for solution, grid in zip(found, posed.operator.grids, strict=True):
         assert solution.beside["sigma"].shape == grid.shape
         assert solution.beside["sigma"].min() > 0
