@@ -55,6 +55,10 @@ class OutputExists(InputError):
     """The place to write to holds something already."""
 
 
+class OutputBusy(InputError):
+    """Another command is writing into the folder of results."""
+
+
 class MissingPackage(InputError):
     """A command needs a package that is not installed with the rest."""
 

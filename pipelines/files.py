@@ -1,20 +1,21 @@
 """Files written whole or not at all, and the fingerprints by which results name their inputs."""
 
 import errno
+import fcntl
 import hashlib
 import os
 import secrets
 import shutil
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
 
-from pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputExists
+from pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 
 # A short write of an array comes without a number: it, too, means that the disk is full.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -132,6 +133,35 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
     if kept:
         named = ", ".join(kept[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
         raise OutputExists(f"{out}: holds files already ({named}) that are not overwritten; name a new or empty folder")
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Have a folder of results to oneself, made if need be; it goes again if nothing was put into it.
+
+    Raises
+    ------
+    OutputBusy
+        Another command is writing there.
+    """
+    with reported_as_cannot_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as failure:
+        os.close(descriptor)
+        raise OutputBusy(
+            f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
+        ) from failure
+    except OSError:
+        pass  # some network file systems lock no folders
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
+        os.close(descriptor)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -18,7 +18,7 @@ from pipelines.depth_map import require_sweep, write_depth_map
 from pipelines.depths import depths_by_disparity, distinct_depths, swept_depths, swept_disparities
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
-from pipelines.files import remove_leftovers, require_room, write_json
+from pipelines.files import alone_in, remove_leftovers, require_room, write_json
 from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
@@ -229,6 +229,12 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
 
     Planes that are there, made of the same files with the same options, are not made again.
     """
+    with alone_in(out):
+        return _reconstructed(loaded, out, request, crew)
+
+
+def _reconstructed(loaded: LoadedSet, out: Path, request: Request, crew: Crew) -> dict[str, Any]:
+    """Do what `reconstruct_set` says."""
     started = time.monotonic()
     depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
     request = replace(request, depths_mm=depths, methods=methods)

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from pipelines.errors import CannotWrite, DiskFull, InputError, OutputExists
-from pipelines.files import building_folder, require_room, sha256, write_json, write_whole, writing
+from pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
+from pipelines.files import alone_in, building_folder, require_room, sha256, write_json, write_whole, writing
 
 
 def _everything_below(folder: Path) -> set[str]:
@@ -200,3 +200,15 @@ def test_every_failure_of_writing_is_an_input_error() -> None:
 def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
+    folder = tmp_path / "results"
+    with alone_in(folder):
+        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), alone_in(folder):
+            pass
+        assert folder.is_dir()
+    assert not folder.exists()  # nothing was put into it
+    with alone_in(folder):
+        (folder / "plane.tiff").touch()
+    assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
