@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from recon.elementary import compiled, inlined
 from recon.pixel_models import WORK_ROWS
-from recon.pointers import advanced, index
+from recon.pointers import advanced, index, wanted_soon
 
 BLOCK_PX = 64
 COLUMN_TAPS, ROW_TAPS = 4, 3
@@ -34,6 +34,7 @@ _OUTSIDE, _SCATTERED, _IN_STEP_2_2, _IN_STEP_2_3, _IN_STEP_3_3, _IN_STEP_3_4 = 0
 
 # Vectors are fastest where they do not straddle the processor's cache lines.
 _LINE_BYTES = 64
+_LINE_PX = 16
 
 # Where the rows of the scratch begin. Rows of shifted products have a margin on either side that stays zero.
 EXPECTED, COUNTED = 0, BLOCK_PX
@@ -301,6 +302,13 @@ def weigh(factors, pixel, to_next_plane, planes, count, scratch):
         pixel += to_next_plane
 
 
+@inlined
+def row_wanted_soon(numbers, at):
+    """Ask for the numbers of a block in a later row: processors look ahead within one page of memory only."""
+    for k in range(index(0), index(BLOCK_PX), index(_LINE_PX)):
+        wanted_soon(numbers, index(at) + k)
+
+
 @compiled
 def gather(samples, layout, planes, scratch, blocks):
     """Set `EXPECTED` to what a block's pixels see of all planes, and `COUNTED` to their greatest weight.
@@ -323,6 +331,7 @@ def gather(samples, layout, planes, scratch, blocks):
                 scratch[at] = max(scratch[at], scratch[place + index(_WEIGHT) + k])
         if blocks[block] > _SCATTERED:
             start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
+            row_wanted_soon(samples, start + ROW_TAPS * width)
             _gather_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         else:
             start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
@@ -336,6 +345,7 @@ def scatter(samples, layout, planes, scratch, blocks):
         block, place, width = index(4) * plane, _place(plane), layout[index(3) * plane + index(2)]
         if blocks[block] > _SCATTERED:
             start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
+            row_wanted_soon(samples, start + ROW_TAPS * width)
             _scatter_in_step(blocks[block], samples, start, width, row, column, scratch, place)
         elif blocks[block] == _SCATTERED:
             start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]

@@ -15,15 +15,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.blocks import BLOCK_PX, COUNTED, EXPECTED, copy, gather, locate_on_all, scatter, weigh, weights_of
+from recon.blocks import (
+    BLOCK_PX,
+    COUNTED,
+    EXPECTED,
+    copy,
+    gather,
+    locate_on_all,
+    row_wanted_soon,
+    scatter,
+    weigh,
+    weights_of,
+)
 from recon.elementary import compiled
 from recon.pixel_models import form_ratio_of_block
 from recon.pointers import advanced, index, pointer, wanted_soon
 
 TILE_ROWS = 8
-
-# Numbers of a line of the processor's cache, of float32
-_LINE_PX = 16
 
 FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH = 0, 1, 2, 3, 4, 5
 
@@ -140,13 +148,12 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     count = index(min(BLOCK_PX, columns - first))
                     at = index((view * rows + row) * columns + first)
                     if masked:
+                        wanted_soon(valid_at, at + index(columns))
                         weigh(valid_at, at, index(0), count_of_planes, count, scratch)
                     if occluded:
                         weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
                     pixel = index((image * rows + row) * columns + first)
-                    # Processors look ahead within a page of memory, and the next row begins another
-                    for k in range(index(0), index(BLOCK_PX), index(_LINE_PX)):
-                        wanted_soon(images_at, pixel + index(columns) + k)
+                    row_wanted_soon(images_at, pixel + index(columns))
                     if operation == ADJOINT:
                         copy(images_at, pixel, scratch, index(EXPECTED), count)
                     else:
