@@ -11,6 +11,9 @@ from calib.errors import LensNotInvertible
 # Undistorting and distorting again must return to the pixel within this.
 _ROUND_TRIP_PX = 1e-3
 
+# Distortion is undone until the pixel is met within this; rounding would keep a smaller miss from ever being reached.
+_UNDISTORTED_PX = 1e-11
+
 # OpenCV returns a wide Jacobian with every projected point: a strip at a time keeps it small.
 _STRIP_ROWS = 32
 
@@ -101,7 +104,7 @@ class Lens:
         """Return the rays of pixels (row, column, 2), checked by imaging them again."""
         if not any(self.distortion):
             return (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, _UNDISTORTED_PX)
         matrix, distortion = self.camera_matrix(), self._coefficients()
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, criteria=criteria)
         homogeneous = cv2.convertPointsToHomogeneous(rays)

@@ -242,12 +242,12 @@ def weight_curves(planes: list[Plane]) -> str | None:
     planes : list of Plane
         Of one column.
     """
-    from matplotlib.figure import Figure
-
     records = [(plane.depth_mm, record) for plane in planes for record in plane.records]
     known = [(depth, record) for depth, record in records if record.get("penalty_weight_curve")]
     if not known:
         return None
+    from matplotlib.figure import Figure  # loading it takes a while
+
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
     for (depth_mm, record), (colour, marker) in zip(known, cycle(_LINES)):
