@@ -8,7 +8,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from pipelines.check import ROOM_FACTOR
+from pipelines.check import ROOM_FACTOR, time_in_words
 from pipelines.console import console, progress, say
 from pipelines.errors import WrongUsage
 from pipelines.files import require_room
@@ -16,7 +16,6 @@ from pipelines.panel import Panel
 from pipelines.rig_file import decoded, read_rig
 from pipelines.terminal import TerminalView
 from rig.capture import Capture
-from rig.guide import spoken_duration
 from rig.opening import open_rig
 from rig.session.opening import has_session, opened, read_plan, refuse_other_rig
 from rig.session.session import FrozenPlan, is_sealed
@@ -75,7 +74,7 @@ def _planned(settings: RigSettings, session: Path) -> FrozenPlan:
     for warning in found.stage.warnings:
         say(f"warning: {warning}")
     require_room(session, round(ROOM_FACTOR * found.plan.disk_bytes()))
-    say(f"{found.plan.frames()} frames, {spoken_duration(found.duration_s)} without prompts")
+    say(f"{found.plan.frames()} frames, {time_in_words(found.duration_s, settings.stage)}")
     return FrozenPlan(found.plan, settings)
 
 

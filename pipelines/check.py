@@ -10,7 +10,8 @@ from pipelines.errors import BadValue
 from pipelines.files import require_room, write_json
 from pipelines.rig_file import read_rig
 from rig.guide import spoken_duration
-from rig.opening import open_rig
+from rig.opening import is_simulated, open_rig
+from rig.stages.settings import StageSettings
 from rig.survey import Survey, survey
 
 # Retaken and superseded frames stay: plan for half as much again.
@@ -33,7 +34,7 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
     changed = _changed_settings(stored, found)
     need = round(ROOM_FACTOR * found.plan.disk_bytes())
     require_room(rig, need)
-    for line in _lines(found, rig, need):
+    for line in _lines(found, settings.stage, rig, need):
         say(line)
     for warning in (*found.stage.warnings, *changed):
         say(f"warning: {warning}")
@@ -53,7 +54,13 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
     }
 
 
-def _lines(found: Survey, rig: Path, need: int) -> list[str]:
+def time_in_words(duration_s: float, stage: StageSettings) -> str:
+    """Return how long a capture takes, and by whose clock if that is not the one on the wall."""
+    words = f"{spoken_duration(duration_s)} without prompts"
+    return f"{words} by the simulated stage's clock, far less by yours" if is_simulated(stage) else words
+
+
+def _lines(found: Survey, stage: StageSettings, rig: Path, need: int) -> list[str]:
     """Return what people want to know."""
     plan, travel = found.plan, found.stage.travel_mm
     size_mb, need_mb = plan.disk_bytes() / 1e6, need / 1e6
@@ -61,7 +68,7 @@ def _lines(found: Survey, rig: Path, need: int) -> list[str]:
     return [
         f"stage: {found.stage.firmware}, travel {travel}; all {len(plan.path())} points of the way are allowed",
         f"camera: {found.camera.name}; all exposure times are offered",
-        f"plan: {plan.frames()} frames in {len(plan.steps)} steps, {spoken_duration(found.duration_s)} without prompts",
+        f"plan: {plan.frames()} frames in {len(plan.steps)} steps, {time_in_words(found.duration_s, stage)}",
         f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
     ]
 

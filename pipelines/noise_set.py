@@ -148,7 +148,7 @@ def temperature_notes(settings: NoiseSet) -> tuple[dict[str, float] | None, list
 def _check_numbers(path: Path, frame: NoiseFrame) -> None:
     """Refuse exposures, temperatures and photons that cannot be."""
     for key, value in (("exposure_s", frame.exposure_s), ("photons", frame.photons)):
-        if value is not None and not (np.isfinite(value) and value >= 0):
-            raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must be finite and not negative")
+        if value is not None and value < 0:
+            raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must not be negative")
     if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
         raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")

@@ -61,7 +61,7 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
     PlanRefused
         A simulated camera needs a simulated stage: only there it is known where the camera truly is.
     """
-    bench = _simulated_bench(settings.stage) if _is_simulated(settings.stage) else None
+    bench = _simulated_bench(settings.stage) if is_simulated(settings.stage) else None
     stage = open_stage(settings.stage, traffic, bench)
     match settings.camera:
         case GPhoto2Settings():
@@ -100,14 +100,14 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench
         No such stage is simulated.
     """
     traffic = traffic or NoTrafficLog()
-    if _is_simulated(settings):
+    if is_simulated(settings):
         bench = bench or _simulated_bench(settings)
         port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
         return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
     return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
 
 
-def _is_simulated(settings: StageSettings) -> bool:
+def is_simulated(settings: StageSettings) -> bool:
     """Return whether the stage that `settings` describe exists in the computer alone."""
     return settings.protocol == "simulated" or settings.port.startswith(SIMULATED)
 

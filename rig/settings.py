@@ -67,6 +67,11 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
     board_corners: int = 6
     leak_dn: float = 8.0
 
+    def __post_init__(self) -> None:
+        for name in ("saturated_share", "sharpness_share"):
+            if not 0.0 <= (share := getattr(self, name)) <= 1.0:
+                raise ValueError(f"{name} = {share:g}; a share lies between 0 and 1")
+
 
 class DriftSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """The `[drift]` table: homing again, to find lost steps that no report shows.

@@ -1,5 +1,6 @@
 """The boards of a simulated lab, as they come from the printer and stand before the camera."""
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -40,11 +41,14 @@ def standing_board(board: Board, sweep: int, place: int, optics: SimulatedOptics
     standing = places[sweep % len(places)]
     standing = replace(standing, rt_ref_board=standing.rt_ref_board + place * _BESIDE_MM)
     px_mm = float(standing.rt_ref_board[5]) / optics.fx_px
-    # A whole number of samples per square, or the print would not be true to size
-    samples = max(round(board.square_mm * _SAMPLES_PER_PX / px_mm), 8)
+    drawn = board.in_opencv()
+    # A whole number of samples per square, or the print would not be true to size, and one for each bit of a marker
+    bits = drawn.getDictionary().markerSize + 2
+    least = math.ceil(bits * board.square_mm / board.marker_mm)
+    samples = max(round(board.square_mm * _SAMPLES_PER_PX / px_mm), least)
     pitch_mm = board.square_mm / samples
     margin = round(_MARGIN_MM / pitch_mm)
-    printed = board.in_opencv().generateImage((board.columns * samples, board.rows * samples)) / np.float32(255)
+    printed = drawn.generateImage((board.columns * samples, board.rows * samples)) / np.float32(255)
     paper = _BLACK + (_WHITE - _BLACK) * np.pad(printed, margin, constant_values=1.0)
     picture = cv2.GaussianBlur(paper.astype(np.float32), (0, 0), _BLUR_PX * px_mm / pitch_mm)
     edge_mm = margin * pitch_mm + board.square_mm

@@ -9,13 +9,23 @@ from unittest import mock
 import pytest
 
 from pipelines import cli
+from pipelines.check import time_in_words
+from pipelines.rig_file import read_rig
 from rig.session.disk import locked
 from rig.session.journal import Journal
 from rig.session.opening import taken_frames
 from rig.simulation.lab import SimulatedLab
+from rig.stages.settings import StageSettings
 
-STEPS = [("charuco", 49), ("charuco", 49), ("bright", 49), ("dark_scene", 49), ("noise_reference", 49), ("dark", 40),
-         ("flat", 20)]  # fmt: skip
+STEPS = [
+    *[("charuco", 49)] * 6,
+    ("bright", 49),
+    ("dark_scene", 49),
+    ("noise_reference", 49),
+    ("dark", 40),
+    ("flat", 20),
+]
+FRAMES = sum(count for _, count in STEPS)
 
 
 KEEP_OUT = "[[stage.keep_out]]\nx_mm = [-260, -240]\ny_mm = [-260, -240]"
@@ -61,21 +71,21 @@ def small(shell: Shell) -> Shell:
 
 
 def test_the_whole_experiment_unattended(shell: Shell) -> None:
-    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 305
+    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == FRAMES
     verdict = shell.result("verify", shell.session)
     assert verdict["problems"] == []
-    assert (verdict["planned"], verdict["present"], verdict["sealed"]) == (305, 305, True)
+    assert (verdict["planned"], verdict["present"], verdict["sealed"]) == (FRAMES, FRAMES, True)
     frames = [frame for frame, _, _ in taken_frames(shell.session)]
     assert [(kind, sum(frame.step == step for frame in frames)) for step, (kind, _) in enumerate(STEPS)] == STEPS
     assert [frame.kind for frame in frames] == [kind for kind, count in STEPS for _ in range(count)]
-    assert [frame.number for frame in frames] == list(range(305))
+    assert [frame.number for frame in frames] == list(range(FRAMES))
     grid = [frame.stop.node for frame in frames[:49]]
     assert grid[:8] == [(0, column) for column in range(7)] + [(1, 6)]
     assert {frame.exposure_s for frame in frames if frame.kind == "dark"} == {0.05, 0.1, 0.5, 1.0}
     with Journal(shell.session / "journal.sqlite", read_only=True) as journal:
-        assert [it.frame for it in journal.committed()] == list(range(305))
+        assert [it.frame for it in journal.committed()] == list(range(FRAMES))
         assert not journal.uncommitted()
-        assert len(journal.events("drift_check")) == 5
+        assert len(journal.events("drift_check")) == 9
         assert len(journal.events("settling")) == 1
 
 
@@ -84,11 +94,28 @@ def test_check_moves_nothing_and_says_what_matters(shell: Shell) -> None:
         found = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called
-    assert found["frames"] == 305
-    assert found["disk_bytes"] == 305 * (2 * 64 * 48 + 512)
+    assert found["frames"] == FRAMES
+    assert found["disk_bytes"] == FRAMES * (2 * 64 * 48 + 512)
     assert 300.0 < found["duration_s"] < 1000.0
-    for words in ("305 frames in 7 steps", "about 8 min without prompts", "travel [-400, 0]", "are free"):
+    for words in (
+        "501 frames in 11 steps",
+        "about 13 min without prompts by the simulated stage's clock",
+        "travel [-400, 0]",
+        "are free",
+    ):
         assert words in shell.words
+
+
+def test_a_simulated_stage_has_a_clock_of_its_own() -> None:
+    real, simulated = StageSettings("grbl", port="/dev/ttyUSB0"), StageSettings("simulated")
+    assert time_in_words(600.0, real) == "about 10 min without prompts"
+    words = "about 10 min without prompts by the simulated stage's clock, far less by yours"
+    assert time_in_words(600.0, simulated) == time_in_words(600.0, StageSettings("grbl", "simulated:grbl")) == words
+
+
+def test_the_template_shows_as_many_board_poses_as_the_geometry_asks_for(shell: Shell) -> None:
+    settings = read_rig(shell.rig)
+    assert len(settings.board) * sum(step.kind == "charuco" for step in settings.step) >= 6
 
 
 def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
@@ -118,11 +145,58 @@ def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
             "meets",
         ),
         ("pitch_mm", "pich_mm", "UnknownKey", "did you mean 'pitch_mm'?"),
-        ('kind = "bright"', 'kind = "brigth"', "BadValue", "brigth"),
+        (
+            'kind = "bright"',
+            'kind = "brigth"',
+            "BadValue",
+            "step[6].kind = 'brigth'; choose from 'bright', 'charuco', 'dark', 'dark_scene', 'flat', "
+            "'noise_reference'; did you mean 'bright'?",
+        ),
+        ('"serpentine"', '"snake"', "BadValue", "grid.order = 'snake'; choose from 'raster', 'serpentine'"),
+        ('protocol = "simulated"', 'protocol = "klipper"', "BadValue", "choose from 'grbl', 'marlin', 'simulated'"),
         ("square_mm = 40.0", "square_mm = 4.0", "BadValue", "markers smaller"),
         ('dictionary = "DICT_5X5_1000"', 'dictionary = "5X5"', "BadValue", "no dictionary of OpenCV"),
         ("exposure_s = 0.1\n", "exposure_s = 0.0\n", "BadValue", "above 0 s"),
-        ('backend = "simulated"', 'backend = "simulatd"', "BadValue", "simulatd"),
+        (
+            'backend = "simulated"',
+            'backend = "gphoto"',
+            "BadValue",
+            "camera.backend = 'gphoto'; choose from 'gphoto2', 'micromanager', 'folder', 'simulated'; "
+            "did you mean 'gphoto2'?",
+        ),
+        *[
+            (
+                'backend = "simulated"',
+                f'backend = "{other}"',
+                "UnknownKey",
+                "'camera.size_px' is not a key that is read; it is for backend = 'simulated' alone: remove it",
+            )
+            for other in ("gphoto2", "micromanager", "folder")
+        ],
+        (
+            "[grid]",
+            "[grid]\ndepth_mm = 3.0",
+            "UnknownKey",
+            "'grid.depth_mm' is not a key that is read; it belongs in an",
+        ),
+        *[
+            (f"{key} = ", f"{key} = {value} #", "BadValue", f"{place}.{key} = {value}; numbers are finite")
+            for place, key, value in (
+                ("grid", "pitch_mm", "inf"),
+                ("settle", "limit_px", "nan"),
+                ("settle", "longest_s", "nan"),
+                ("checks", "leak_dn", "nan"),
+            )
+        ],
+        *[
+            ("exposure_s = 0.1\n", f"exposure_s = {value}\n", "BadValue", f"step[6].exposure_s = {shown}; numbers are")
+            for value, shown in (("inf", "inf"), ("nan", "nan"), ("1e308", "1e+308"), ("1" + 400 * "0", "1" + 23 * "0"))
+        ],
+        ("origin_mm = [-350.0", "origin_mm = [-inf", "BadValue", "grid.origin_mm[0] = -inf; numbers are finite"),
+        *[
+            (f"{key} = ", f"{key} = {value} #", "BadValue", f"{key} = {value}; a share lies between 0 and 1")
+            for key, value in (("saturated_share", "7"), ("sharpness_share", "-0.5"))
+        ],
         ("size_px = [64, 48]", "size_px = [400000, 400000]", "DiskFull", "are needed"),
     ],
 )
@@ -163,12 +237,12 @@ def test_ctrl_c_stops_after_the_present_frame_and_running_again_goes_on(shell: S
     with mock.patch.object(SimulatedLab, "expose", interrupted):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
     assert signal.getsignal(signal.SIGINT) is before
-    assert "CaptureStopped: stopped with 7 of 80 frames taken; run the same command to go on" in shell.words
+    assert "CaptureStopped: stopped with 7 of 96 frames taken; run the same command to go on" in shell.words
     verdict = shell.result("verify", shell.session)
-    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 73, False)
-    assert "73 still to be taken" in shell.words
-    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 73
-    assert "7 of 80 frames are there; going on" in shell.words
+    assert (verdict["present"], len(verdict["missing"]), verdict["sealed"]) == (7, 89, False)
+    assert "89 still to be taken" in shell.words
+    assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 89
+    assert "7 of 96 frames are there; going on" in shell.words
     assert shell.result("capture", shell.rig, shell.session, "--yes")["taken"] == 0
     assert shell.result("verify", shell.session)["sealed"] is True
 

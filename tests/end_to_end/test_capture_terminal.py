@@ -63,17 +63,18 @@ def test_keys_lead_through_a_capture(tmp_path: Path, capsys: pytest.CaptureFixtu
     terminal = Terminal(*command)
     terminal.wait_for("Homing")
     terminal.press("g")
-    terminal.wait_for("Step 1 of 7: Board sweep 1")
+    terminal.wait_for("Step 1 of 11: Board sweep 1")
     terminal.wait_for("(Enter: go on)")
     terminal.press("x")  # no key of ours
     terminal.press("\n")
     terminal.wait_for("▀▀▀▀")
     terminal.wait_for("board_corners")
-    terminal.wait_for("Step 2 of 7: Board sweep 2")
-    terminal.press("s")
-    terminal.wait_for("Step 3 of 7: Bright set")
+    for sweep in range(2, 7):
+        terminal.wait_for(f"Step {sweep} of 11: Board sweep {sweep}")
+        terminal.press("s")
+    terminal.wait_for("Step 7 of 11: Bright set")
     terminal.press("q")
     assert terminal.end() == 1
-    assert "CaptureStopped: stopped with 4 of 80 frames taken" in terminal.seen.replace("\r\n", " ")
+    assert "CaptureStopped: stopped with 4 of 96 frames taken" in terminal.seen.replace("\r\n", " ")
     assert verify(session).present == 4
     capsys.readouterr()

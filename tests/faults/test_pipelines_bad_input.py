@@ -63,7 +63,7 @@ DAMAGED: dict[str, tuple[Damage, str, str]] = {
     "pose that is no number": (
         _settings(lambda s: s["view"][7].update(rt_cam_ref=[float("nan")] * 6)),
         "BadValue",
-        "view[7] (view_r2_c1.tiff): pose",
+        "view[7].rt_cam_ref[0] = nan",
     ),
     "unknown key": (
         _settings(lambda s: s["camera"].update(focal_px=3.0)),
