@@ -14,7 +14,7 @@ from pipelines.channels import OperatorFactory, channel_layouts, load_channel, p
 from pipelines.console import progress
 from pipelines.elemental_set import LoadedSet
 from pipelines.errors import WrongUsage
-from pipelines.files import sha256, write_json, write_whole
+from pipelines.files import remove, sha256, write_json, write_whole
 from pipelines.frames import read_frame
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.large_arrays import memory_or_file
@@ -149,7 +149,7 @@ def write_depth_map(
         "median": float(np.median(values[known])) if known.any() else None,
     }
     for method, folder in folders.items():
-        (folder / DEPTH_MAP_FILE).unlink(missing_ok=True)
+        remove(folder / DEPTH_MAP_FILE)
         _write(folder, name, unit, values, confidence, scale)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
         write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)

@@ -186,7 +186,8 @@ class LoadedSet:
             raise BadValue(
                 f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
                 f"give a number below {self._disparity_at_infinity_px(steps, shift_px):.3g} px, that of infinitely far "
-                "points (cameras that move right see near points move left, by a negative number)"
+                "points (cameras that move right see near points move left, by a negative number), or import pictures "
+                "that were aligned on a plane again, with its --disparity-px"
             )
         return float(1 / inverse_depth)
 

@@ -53,7 +53,8 @@ def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float
     from skimage.restoration import denoise_tv_chambolle  # loading it takes a second
 
     plane = back_projection(operator, images)
-    return np.asarray(denoise_tv_chambolle(plane, weight=weight, max_num_iter=100), np.float32)
+    # Its usual tolerance stops it anywhere, and weights could not be compared
+    return np.asarray(denoise_tv_chambolle(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
 
 
 def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
@@ -68,14 +69,15 @@ OURS: Method = "pmlem"
 BEST = "pmlem-best"
 
 _PMLEM_WEIGHTS = tuple(np.geomspace(1.0, 3.2, 6).tolist())
-_DENOISING_WEIGHTS_E = tuple(np.geomspace(0.1, 3.2, 9).tolist())
+_TV_WEIGHTS_E = tuple(np.geomspace(0.25, 1.6, 8).tolist())
+_BM3D_WEIGHTS_E = tuple(np.geomspace(0.4, 1.2, 5).tolist())
 
 # What stands first is drawn as the reference that the others have to beat.
 METHODS = (
     FigureMethod("backprojection", "back-projection", back_projection),
-    FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _DENOISING_WEIGHTS_E),
+    FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _TV_WEIGHTS_E),
     *(
-        [FigureMethod("bm3d", "back-projection + BM3D, best weight", _bm3d_denoised, _DENOISING_WEIGHTS_E)]
+        [FigureMethod("bm3d", "back-projection + BM3D, best weight", _bm3d_denoised, _BM3D_WEIGHTS_E, draws=2)]
         if find_spec("bm3d")
         else []
     ),

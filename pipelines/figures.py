@@ -14,7 +14,7 @@ from pipelines.console import say
 from pipelines.elemental_set import NOISE_REFERENCE, load_set
 from pipelines.figure4 import PAPERS_AXIS, as_csv, as_rows, curves, is_monotone, measure, over_best
 from pipelines.figure_methods import BEST, METHODS, OURS
-from pipelines.files import check_free, write_json, write_whole
+from pipelines.files import check_free, remove, write_json, write_whole
 from pipelines.frames import read_frame
 from pipelines.overview import INTEGRAL_IMAGE, grey_scale_dn
 from pipelines.pages import data_uri, template
@@ -79,7 +79,7 @@ def figures(
     made = {}
     for number in wanted:
         started = time.monotonic()
-        (out / f"figure{number}_provenance.json").unlink(missing_ok=True)
+        remove(out / f"figure{number}_provenance.json")
         made[f"figure{number}"] = makers[number]()
         record = provenance("figures", options, {}) | {"wall_time_s": time.monotonic() - started}
         write_json(out / f"figure{number}_provenance.json", record)

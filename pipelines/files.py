@@ -164,6 +164,12 @@ def alone_in(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
+def remove(path: Path) -> None:
+    """Remove a result that others will replace, if it is there."""
+    with reported_as_cannot_write(path):
+        path.unlink(missing_ok=True)
+
+
 def remove_leftovers(folder: Path) -> None:
     """Remove what a process that was killed has left half-written in a folder; nobody may be writing there."""
     for path in folder.glob(f".*{UNFINISHED}"):

@@ -20,7 +20,7 @@ from calib.geometry import (
 )
 from calib.geometry.stage import StageReport
 from calib.lens import Lens
-from pipelines.files import write_json, write_whole
+from pipelines.files import remove, write_json, write_whole
 from pipelines.measured_poses import CAMERA_FILE, CORNERS_FILE, COVARIANCE_FILE, GEOMETRY_FILE
 from pipelines.stage_page import write_stage_page
 
@@ -46,9 +46,9 @@ def write_geometry(
     out: Path, geometry: RigGeometry, observations: Sequence[BoardObservation], content: dict[str, Any]
 ) -> Path:
     """Write the files of a geometry into `out`, geometry.json last, and return the path of its page."""
-    (out / GEOMETRY_FILE).unlink(missing_ok=True)  # it would vouch for files that replace its own
+    remove(out / GEOMETRY_FILE)  # it would vouch for files that replace its own
     for earlier in out.glob(CAMERA_FILE.format("*", "*")):
-        earlier.unlink()  # it may be of a node that is none any more
+        remove(earlier)  # it may be of a node that is none any more
     solved = {board.target for board in geometry.boards}
     write_whole(out / COVARIANCE_FILE, _covariance_npz(geometry))
     write_whole(out / CORNERS_FILE, _corners_npz([seen for seen in observations if seen.target in solved]))

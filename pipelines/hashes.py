@@ -1,10 +1,12 @@
 """Hashes of a session's files, remembered as long as the files do not change: frames are read once, not every time."""
 
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
 
+from pipelines.errors import CannotWrite
 from pipelines.files import sha256, write_json
 
 CACHE_FILE = ".hashes.json"
@@ -56,6 +58,10 @@ class Hashes:
         return digest
 
     def save(self) -> None:
-        """Keep what was computed for the next time, but for files that had changed only just before."""
+        """Keep what was computed for the next time, but for files that had changed only just before.
+
+        Where the folder cannot be written to, nothing is kept: it costs time, nothing else.
+        """
         if self._changed:
-            write_json(self._folder / CACHE_FILE, self._known)
+            with suppress(CannotWrite):
+                write_json(self._folder / CACHE_FILE, self._known)

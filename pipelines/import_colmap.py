@@ -7,10 +7,10 @@ from cyclopts import Parameter
 
 from pipelines.arguments import Positive
 from pipelines.colmap_files import MODEL_FILES, ColmapImage, ColmapModel, model_files, read_model, write_model
-from pipelines.elemental_set import load_set
 from pipelines.files import building_folder
 from pipelines.imported_set import PosedImage
 from pipelines.posed_images import import_posed, lens_of_each_view
+from pipelines.session_set import load_set_or_session
 
 
 def import_colmap(
@@ -60,7 +60,7 @@ def import_colmap(
 
 
 def export_colmap(
-    elemental_set: Annotated[Path, Parameter(name="SET")],
+    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")],
     out: Path,
     /,
     *,
@@ -74,7 +74,7 @@ def export_colmap(
     Parameters
     ----------
     elemental_set
-        Folder with elemental.toml.
+        A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder to write.
     binary
@@ -82,7 +82,7 @@ def export_colmap(
     overwrite
         Replace an earlier model in OUT, a folder that holds nothing else.
     """
-    loaded = load_set(elemental_set)
+    loaded = load_set_or_session(elemental_set)
     lenses = lens_of_each_view(loaded)
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}
     model = ColmapModel(

@@ -8,13 +8,13 @@ from cyclopts import Parameter
 
 from calib.lens import Lens
 from pipelines.arguments import Positive
-from pipelines.elemental_set import load_set
 from pipelines.errors import BadValue, MissingFile
 from pipelines.files import building_folder, write_whole
 from pipelines.frames import IMAGE_SUFFIXES
 from pipelines.geometry_files import camera_model_text
 from pipelines.imported_set import PosedImage
 from pipelines.posed_images import import_posed, lens_of_each_view
+from pipelines.session_set import load_set_or_session
 
 _SUFFIX = ".cameramodel"
 _MODELS = {"LENSMODEL_PINHOLE", "LENSMODEL_OPENCV4", "LENSMODEL_OPENCV5", "LENSMODEL_OPENCV8"}
@@ -67,20 +67,20 @@ def import_mrcal(
 
 
 def export_mrcal(
-    elemental_set: Annotated[Path, Parameter(name="SET")], out: Path, /, *, overwrite: bool = False
+    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
 
     Parameters
     ----------
     elemental_set
-        Folder with elemental.toml.
+        A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder to write.
     overwrite
         Replace earlier models in OUT, a folder that holds nothing else.
     """
-    loaded = load_set(elemental_set)
+    loaded = load_set_or_session(elemental_set)
     count = next(count for count in _LENS_MODEL if count >= len(loaded.lens.distortion))
     padded = (*loaded.lens.distortion, *[0.0] * (count - len(loaded.lens.distortion)))
     models: dict[str, str] = {}

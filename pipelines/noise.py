@@ -10,7 +10,7 @@ from calib.errors import CalibrationError
 from calib.noise import NoiseCalibration, calibrate
 from pipelines.console import say
 from pipelines.errors import MissingFile
-from pipelines.files import sha256, write_json, write_whole
+from pipelines.files import remove, sha256, write_json, write_whole
 from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS
 from pipelines.noise_frames import Plane, read_series
 from pipelines.noise_page import draw_page
@@ -57,7 +57,7 @@ def noise(folder: Path, /, *, out: Path | None = None) -> dict[str, Any]:
     described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
     inputs = {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}
     # The numbers come last: where noise.json stands, everything that it names stands too.
-    (out / NOISE_FILE).unlink(missing_ok=True)
+    remove(out / NOISE_FILE)
     write_maps(out / NOISE_MAPS, maps_of(readout, calibrations))
     result = result_of(readout, calibrations) | {
         "temperature_c": temperature_c,

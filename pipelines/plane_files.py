@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import MissingFile
-from pipelines.files import sha256, write_json, writing
+from pipelines.files import remove, sha256, write_json, writing
 from pipelines.image_files import grey_levels, white_level, write_plane, write_png
 from pipelines.planes import Method
 from pipelines.provenance import first_difference
@@ -99,7 +99,7 @@ class PlaneFiles:
                 written.append(path)
                 beside[f"{name}_file"] = path.name
             else:
-                path.unlink(missing_ok=True)  # of the plane that was here before
+                remove(path)  # of the plane that was here before
         record = {
             "format": 1,
             "planes": [entry["record"] | beside for entry in entries],

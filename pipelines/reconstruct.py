@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from pipelines.arguments import Count, NotNegative, Positive
+from pipelines.arguments import Count, NotNegativeOrAuto, Positive
 from pipelines.autofocus import BestFocus, best_focus
 from pipelines.channels import channel_layouts, default_pitch_px, plane_grid
 from pipelines.cluster import crew_of
@@ -18,7 +18,7 @@ from pipelines.depth_map import require_sweep, write_depth_map
 from pipelines.depths import depths_by_disparity, distinct_depths, swept_depths, swept_disparities
 from pipelines.elemental_set import LoadedSet, load_set
 from pipelines.errors import WrongUsage
-from pipelines.files import alone_in, remove_leftovers, require_room, write_json
+from pipelines.files import alone_in, remove, remove_leftovers, require_room, write_json
 from pipelines.measured_poses import with_measured_geometry
 from pipelines.metrics import METRICS_FILE, assess
 from pipelines.overview import write_overview
@@ -92,7 +92,7 @@ def reconstruct(
     method: list[Method] | None = None,
     joint: bool = False,
     occlusion: bool = False,
-    penalty_weight: NotNegative | Literal["auto"] = "auto",
+    penalty_weight: NotNegativeOrAuto = "auto",
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
     uncertainty: bool = False,
@@ -169,10 +169,14 @@ def reconstruct(
             "no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT, --disparity-px, --sweep-px or "
             "--plane-pose"
         )
-    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(method or []):
-        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
-    if plane_pose and (occlusion or "occlusion" in (method or [])):
+    if depth_map and "auto" in (depth_mm or []):
+        raise WrongUsage(
+            "--depth-map compares depths of a sweep, and --depth-mm auto leaves few; give --sweep-mm alone"
+        )
+    methods = _methods(method or [], joint=joint, occlusion=occlusion)
+    if plane_pose and "occlusion" in methods:
         raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
+    _refuse_what_methods_know_not(methods, likelihood, penalty, uncertainty=uncertainty)
     swept = swept_depths(sweep_mm) if sweep_mm else []
     swept_px = swept_disparities(sweep_px) if sweep_px else []
     tilted = read_plane_poses(plane_pose or [])
@@ -188,8 +192,6 @@ def reconstruct(
         require_sweep(distinct_depths(depths))
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
-    asked: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
-    methods = [*(method or []), *(name for name, wanted in asked.items() if wanted)] or [DEFAULT_METHOD]
     request = Request(
         depths,
         methods,
@@ -202,6 +204,23 @@ def reconstruct(
         found=found.record if found else None,
     )
     return reconstruct_set(loaded, out, request, crew)
+
+
+def _methods(given: list[Method], *, joint: bool, occlusion: bool) -> list[Method]:
+    """Return the methods that are asked for, by name or by an option of their own."""
+    of_options: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
+    return [*given, *(name for name, wanted in of_options.items() if wanted)] or [DEFAULT_METHOD]
+
+
+def _refuse_what_methods_know_not(
+    methods: list[Method], likelihood: str, penalty: PenaltyName, *, uncertainty: bool
+) -> None:
+    """Refuse options that would change nothing, or cannot be (WrongUsage)."""
+    if likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
+        raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
+    if (uncertainty or penalty != "tv") and not {"pmlem", *TOGETHER} & set(methods):
+        option = "--uncertainty" if uncertainty else f"--penalty {penalty}"
+        raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
 
 
 def _opened(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> tuple[LoadedSet, Path]:
@@ -244,7 +263,7 @@ def _reconstructed(loaded: LoadedSet, out: Path, request: Request, crew: Crew) -
     for folder in {out, *folders.values()}:
         remove_leftovers(folder)
     for folder in folders.values():
-        (folder / RECONSTRUCTION_FILE).unlink(missing_ok=True)  # or it would vouch for planes that replace its own
+        remove(folder / RECONSTRUCTION_FILE)  # or it would vouch for planes that replace its own
     try:
         sweep.run(crew, out)
     finally:
@@ -256,10 +275,10 @@ def _reconstructed(loaded: LoadedSet, out: Path, request: Request, crew: Crew) -
     if request.with_depth_map:
         mapped = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins, out)
     metrics = assess(loaded, sweep.written)
-    (out / METRICS_FILE).unlink(missing_ok=True)  # of planes that were here before
+    remove(out / METRICS_FILE)  # of planes that were here before
     if metrics:
         write_json(out / METRICS_FILE, metrics)
-    (out / REPORT_FILE).unlink(missing_ok=True)  # likewise
+    remove(out / REPORT_FILE)  # likewise
     for name, folder in folders.items():
         result = {
             "format": 1,

@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from calib.lens import Lens
 from pipelines.console import say
-from pipelines.elemental_set import Camera, ElementalSet, LoadedSet, View
+from pipelines.elemental_set import Camera, ElementalSet, LoadedSet, View, load_set
 from pipelines.errors import BadValue, MissingFile
 from pipelines.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from pipelines.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
 from rig.plan import CapturePlan, StepKind, Stop
 from rig.session.frames import planned_frames
-from rig.session.opening import read_plan, taken_frames
+from rig.session.opening import has_session, read_plan, taken_frames
 from rig.session.session import PLAN
 
 RECONSTRUCTIONS = "reconstructions"
@@ -44,6 +44,11 @@ def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | 
         Frames are missing, or the noise or the geometry has not been measured; the message says what to run.
     """
     return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
+
+
+def load_set_or_session(folder: Path) -> LoadedSet:
+    """Return an elemental set, or the dark scene of a session."""
+    return load_session(folder) if has_session(folder) else load_set(folder)
 
 
 def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:

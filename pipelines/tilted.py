@@ -146,6 +146,11 @@ def tilted_grid(loaded: LoadedSet, plane: TiltedPlane, pitch_mm: float) -> Plane
         A part of the reference view does not meet the plane in front of the camera, or only very far away.
     """
     width, height = loaded.settings.camera.size_px
+    if not plane.depth_mm > 0:
+        raise GeometryMismatch(
+            f"plane '{plane.name}': lies behind the camera, at {plane.depth_mm:g} mm along its axis; z points forward: "
+            "correct its pose"
+        )
     if plane.size_mm is not None:
         low, high = -np.array(plane.size_mm) / 2, np.array(plane.size_mm) / 2
     else:

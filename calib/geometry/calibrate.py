@@ -197,7 +197,8 @@ def _require_fit(geometry: RigGeometry, settings: GeometrySettings) -> None:
         return
     added_px = geometry.rms_inlier_px * np.sqrt(ratio**2 - 1)
     if added_px > settings.negligible_holdout_px:
+        other = "" if geometry.lens_model == "opencv8" else "try --lens opencv8, "
         raise PoorFit(
             f"boards left out of the fit are off by {ratio:.2f} times its residual of {geometry.rms_inlier_px:.3g} px, "
-            f"limit {limit}; check square_mm and the flatness of the boards, try --lens opencv8, or show more boards"
+            f"limit {limit}; check square_mm and the flatness of the boards, {other}or show more boards"
         )

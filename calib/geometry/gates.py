@@ -21,10 +21,15 @@ _MORE = "show more boards, nearer and tilted about both axes, or raise --limit-p
 
 
 def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.float64]:
-    """Return σ in pixels (node, point) of the transfer by the plane across the axis at a depth; NaN where unseen."""
+    """Return σ in pixels (node, point) of the transfer by the plane across the axis at a depth.
+
+    It is NaN where a view does not see the point, and for the reference view, whose transfer to itself is exact.
+    """
     covariances = [geometry.lens_and_pose_covariance(node) for node in range(len(geometry.nodes))]
     rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
-    return transfer_sigma_px(geometry.lens, geometry.rt_cam_ref, covariances, rt_ref_plane)
+    sigma_px = transfer_sigma_px(geometry.lens, geometry.rt_cam_ref, covariances, rt_ref_plane)
+    sigma_px[geometry.reference] = np.nan
+    return sigma_px
 
 
 def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
@@ -46,15 +51,27 @@ def require_determined(
     """
     for depth_mm in depths_mm:
         try:
-            sigma_px = rms_over_views(transfer_sigma_at(geometry, depth_mm))
+            of_views_px = transfer_sigma_at(geometry, depth_mm)
         except LensNotInvertible:  # a lens that nothing determines folds over itself
-            sigma_px = np.inf
+            of_views_px = np.full((len(geometry.nodes), 1), np.inf)
+        _require_seen(of_views_px, depth_mm)
+        sigma_px = rms_over_views(of_views_px)
         if not sigma_px <= limit_px:
             raise NotIdentifiable(
                 f"plane at {depth_mm:g} mm: its transfer between views is known to {sigma_px:.3g} px only, "
                 f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
                 f"{'; '.join(lacks(geometry, observations, depth_mm) or [_MORE])}"
             )
+
+
+def _require_seen(sigma_px: NDArray[np.float64], depth_mm: float) -> None:
+    """Refuse a plane that less than half of the views see anything of."""
+    seen, others = int((~np.isnan(sigma_px)).any(axis=1).sum()), len(sigma_px) - 1
+    if 2 * seen < others:
+        raise NotIdentifiable(
+            f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
+            "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
+        )
 
 
 def lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:

@@ -74,6 +74,8 @@ def test_the_version_is_told(faintfield: Command) -> None:
         (("darken", "SET", "OUT", "--quantum-efficiency", "1.5"), "at most 1, got 1.5."),
         (("import", "grid", "SRC", "OUT", "--rows", "0"), "Must be at least 1, got 0."),
         (("import", "grid", "SRC", "OUT", "--disparity-px", "-2"), "Must be at least 0, got -2."),
+        (("reconstruct", "SET", "--penalty-weight", "-1"), "Must be at least 0, got -1."),
+        (("reconstruct", "SET", "--penalty-weight", "nan"), "got nan."),
         (("import", "nonsense"), "nonsense"),
         (("reconstruct", "SET", "--depth-mm", "500"), "--out"),
         (("reconstruct", "SET", "--out", "OUT", "--method", "magic"), "magic"),

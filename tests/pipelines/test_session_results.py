@@ -9,10 +9,13 @@ import pytest
 
 from pipelines.board_set import load_board_set
 from pipelines.channels import channel_layouts, load_channel
+from pipelines.colmap_files import read_model
 from pipelines.errors import BadValue, MissingFile, WrongUsage
 from pipelines.frames import read_frame
 from pipelines.geometry import geometry
 from pipelines.image_files import write_frame
+from pipelines.import_colmap import export_colmap
+from pipelines.import_mrcal import export_mrcal
 from pipelines.noise import noise
 from pipelines.reconstruct import reconstruct
 from pipelines.run import run
@@ -50,6 +53,17 @@ def test_the_geometry_of_a_session_is_where_its_camera_was(session: Path) -> Non
     for axis in "xy":  # the gantry comes from below, whatever the order: its play cannot show
         assert content["stage"][f"backlash_{axis}_mm"]["value"] is None
         assert "approach_mm = 0" in content["stage"][f"backlash_{axis}_mm"]["why"]
+
+
+def test_what_was_measured_goes_out_to_other_programs(session: Path, tmp_path: Path) -> None:
+    run(session, depth_mm=[700.0], passes=5)
+    export_mrcal(session, tmp_path / "mrcal")
+    export_colmap(session, tmp_path / "colmap")
+    entries = json.loads((session / "geometry.json").read_text())["nodes"]
+    model = read_model(tmp_path / "colmap")
+    assert len(list((tmp_path / "mrcal").iterdir())) == len(model.images) == len(entries) == 9
+    poses = {tuple(np.round(image.rt_cam_world, 6)) for image in model.images}
+    assert poses == {tuple(np.round(entry["rt_cam_ref"], 6)) for entry in entries}
 
 
 def test_a_session_without_boards_is_told_from_one_whose_frames_are_gone(recorded: Path, tmp_path: Path) -> None:

@@ -172,6 +172,14 @@ def test_what_is_no_plane_is_refused(
     assert said in str(refused.value)
 
 
+def test_a_plane_behind_the_camera_is_refused(target: Path, tmp_path: Path, faintfield: Command) -> None:
+    behind = {"name": "behind", "point_mm": [0, 0, -600.0], "normal": [0, 0, 1.0], "size_mm": [100.0, 80.0]}
+    poses = _poses(tmp_path / "p.toml", behind)
+    ended = faintfield("reconstruct", target, "--out", tmp_path / "out", "--plane-pose", poses)
+    assert ended.returncode == 1
+    assert "plane 'behind': lies behind the camera, at -600 mm along its axis" in ended.stderr
+
+
 def test_planes_of_two_files_with_one_name_are_refused(tmp_path: Path) -> None:
     plane = {"name": "table", "rt_ref_plane": [0.0] * 5 + [600.0]}
     one, other = (_poses(tmp_path / name, plane) for name in ("one.toml", "other.toml"))

@@ -74,7 +74,8 @@ def test_stated_transfer_sigma_is_that_of_the_transfers(many: list[tuple[Simulat
     plane, pixels = fronto_parallel_rt_ref_plane(600.0), image_lattice(OPTICS.size_px)
     square = []
     for given, geometry in many:
-        for rt, rt_true in zip(geometry.rt_cam_ref, given.poses, strict=True):
+        others = np.arange(len(given.poses)) != geometry.reference
+        for rt, rt_true in zip(geometry.rt_cam_ref[others], given.poses[others], strict=True):
             there = transfer(TRUE_LENS, rt_true, plane, pixels)
             inside = ((there >= -0.5) & (there <= np.array(OPTICS.size_px) - 0.5)).all(axis=1)
             square.append(np.square(transfer(geometry.lens, rt, plane, pixels) - there)[inside].sum(axis=1))
@@ -181,6 +182,15 @@ def test_too_few_nodes_are_refused(nodes: tuple[Node, ...]) -> None:
     few = [one for one in simulated(9).observations if one.node in nodes]
     with pytest.raises(TooFewViews, match=rf"^{len(nodes)} node\(s\) show the boards .*, limit 4; take more nodes"):
         calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1))
+
+
+@pytest.mark.parametrize("depth_mm", [0.5, 5.0])
+def test_a_plane_that_other_views_do_not_see_is_refused(depth_mm: float) -> None:
+    given = simulated(9)
+    with pytest.raises(NotIdentifiable, match=rf"plane at {depth_mm:g} mm: 0 of the 8 views .* --depth-mm in mm"):
+        calibrate_geometry(
+            BOARDS, given.observations, OPTICS.size_px, (1, 1), GeometrySettings(depths_mm=(500.0, depth_mm))
+        )
 
 
 def test_few_nodes_are_named_where_the_transfer_is_not_known() -> None:
