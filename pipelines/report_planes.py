@@ -174,7 +174,7 @@ def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], w
 def sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) -> dict[str, Any] | None:
     """Return the standard deviations as pictures on one scale of their own, None where none were asked for."""
     ordered = sorted(planes, key=lambda plane: plane.depth_mm)
-    known = [(plane, plane.sigma_e()) for plane in ordered if plane.depth_mm in depths]
+    known = [(plane, plane.sigma_e()) for plane in ordered if plane.name or plane.depth_mm in depths]
     found = [(plane, sigma) for plane, sigma in known if sigma is not None]
     if not found:
         return None
