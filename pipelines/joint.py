@@ -101,4 +101,4 @@ def _of_what_is_there(one: Solution, record: dict[str, Any]) -> Solution:
 def _without_occlusion(joint: list[Solution], why: str) -> list[Solution]:
     """Return the planes as they are, and say so."""
     say(f"occlusion is left out: {why}; the planes are those of joint")
-    return [replace(one, record=one.record | {"occlusion": False}) for one in joint]
+    return [replace(one, record=one.record | {"occlusion": False, "occlusion_left_out": why}) for one in joint]

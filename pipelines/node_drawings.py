@@ -36,8 +36,8 @@ def node_drawing(geometry: dict[str, Any]) -> str | None:
     factor = _magnification(residuals, float(pitch.min()))
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
-    height = float(np.clip(6.0 * across_mm[1] / across_mm[0], 2.5, 8)) + 0.7
-    figure = Figure(figsize=(6.6, height), layout="constrained")
+    height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
+    figure = Figure(figsize=(5.4, height), layout="constrained")
     axes = figure.subplots()
     axes.plot(
         *nominal.T, "+", color=INK, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
@@ -55,41 +55,43 @@ def node_drawing(geometry: dict[str, Any]) -> str | None:
     axes.set_xlabel("x (mm)")
     axes.set_ylabel("y, downwards (mm)")
     inked(axes)
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False, labelcolor=INK)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
     return svg(figure)
 
 
-def sigma_maps(geometry: dict[str, Any]) -> str:
-    """Return maps over the nodes of the standard deviation of position and rotation as SVG.
+def sigma_maps(geometry: dict[str, Any]) -> list[str]:
+    """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each.
 
     Parameters
     ----------
     geometry : dict
         The contents of geometry.json.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
     largest_rad = max(node["sigma_rad"] for node in geometry["nodes"])
     per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
-    for axes, key, factor, words in zip(
-        figure.subplots(1, 2),
-        ("sigma_mm", "sigma_rad"),
-        (1e3, per_rad),
-        ("σ of position, √ of the variances' sum (µm)", f"σ of rotation, √ of the variances' sum ({unit})"),
-        strict=True,
-    ):
-        first, values = _map_of_nodes(geometry["nodes"], key, factor)
-        rows, columns = values.shape
-        extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
-        image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
-        _colour_bar(figure, image, axes, words)
-        if values.size <= _MOST_WRITTEN:
-            _write_values(axes, first, values)
-        axes.set_xlabel("column of the grid")
-        axes.set_ylabel("row of the grid")
-        axes.locator_params(integer=True)
-        inked(axes)
+    return [
+        _sigma_map(geometry["nodes"], "sigma_mm", 1e3, "σ of position, √ of the variances' sum (µm)"),
+        _sigma_map(geometry["nodes"], "sigma_rad", per_rad, f"σ of rotation, √ of the variances' sum ({unit})"),
+    ]
+
+
+def _sigma_map(nodes: list[dict[str, Any]], key: str, factor: float, words: str) -> str:
+    """Return the map of one number of the nodes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.8, 4.0), layout="constrained")
+    axes = figure.subplots()
+    first, values = _map_of_nodes(nodes, key, factor)
+    rows, columns = values.shape
+    extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
+    image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
+    _colour_bar(figure, image, axes, words)
+    if values.size <= _MOST_WRITTEN:
+        _write_values(axes, first, values)
+    axes.set_xlabel("column of the grid")
+    axes.set_ylabel("row of the grid")
+    axes.locator_params(integer=True)
+    inked(axes)
     return svg(figure)
 
 

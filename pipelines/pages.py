@@ -67,7 +67,7 @@ def svg(figure: "Figure") -> str:
 def inked(*axes: Any) -> None:
     """Draw axes in the page's ink, without a frame above and to the right."""
     for one in axes:
-        one.tick_params(colors=INK)
+        one.tick_params(which="both", colors=INK)
         one.spines[:].set_color(INK)
         one.spines[["top", "right"]].set_visible(False)
         one.yaxis.get_offset_text().set_color(INK)

@@ -11,6 +11,7 @@ from pipelines.measured_poses import GEOMETRY_FILE
 from pipelines.metrics import METRICS_FILE
 from pipelines.overview import OVERVIEW_FILE
 from pipelines.pages import template
+from pipelines.planes import TOGETHER
 from pipelines.report_calibration import (
     NOISE_FILE,
     find_beside,
@@ -22,10 +23,14 @@ from pipelines.report_depth import depth_sections
 from pipelines.report_lead import facts
 from pipelines.report_planes import (
     METHOD_NAMES,
+    OF_A_SESSION,
+    Plane,
     best_column,
     column_titles,
     first_depth,
     focus_curve,
+    method_title,
+    plane_words,
     read_planes,
     shared_white,
     shown_depths,
@@ -84,17 +89,17 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         "geometry": geometry_section(directory, geometry, inputs) if geometry else None,
     }
     sets = set_sections(_below(directory, OVERVIEW_FILE))
-    planes, errors = _plane_sections(directory, results), _error_sections(directory)
-    led_by = [row for row in errors["metrics"] if _is_of(row, *planes["best"])]
+    planes = read_planes(directory, results)
+    shown, errors = _plane_sections(planes, results), _error_sections(directory, planes)
+    led_by = [row for row in errors["metrics"] if _is_of(row, shown["best"])]
     page = template("report.html").render(
         title=_title(directory, results),
         facts=facts(sets[0] if sets else None, **calibrations, against_truth=errors["geometry_off"], errors=led_by),
         sets=sets,
-        **planes,
+        **shown,
         depth_maps=depth_sections(directory, results),
         **calibrations,
         **errors,
-        method_names=METHOD_NAMES,
         links=_links(directory),
         results=[_origin(directory, folder, result) for folder, result in results.items()],
         calibrations=records(calibrations.values()),
@@ -120,9 +125,8 @@ def results_below(directory: Path) -> dict[Path, dict[str, Any]]:
     return results
 
 
-def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
+def _plane_sections(planes: list[Plane], results: dict[Path, dict[str, Any]]) -> dict[str, Any]:
     """Return what the page says of the planes: the best, all side by side, on sliders, and where they are sharp."""
-    planes = read_planes(directory, results)
     depths = sorted({plane.depth_mm for plane in planes if not plane.name})
     places = len({plane.place for plane in planes})
     focus = next((result["focus"] for result in results.values() if result.get("focus")), None)
@@ -133,12 +137,16 @@ def _plane_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> dic
     of_best = [plane for plane in planes if plane.column == best]
     place = columns.index(best)
     return {
-        "best": (of_best[0].method, of_best[0].poses),
+        "best": of_best[0],
         "best_title": titles[best],
+        "left_out": next(
+            (why for one in of_best for record in one.records if (why := record.get("occlusion_left_out"))), None
+        ),
+        "blurred": places > 1 and of_best[0].method not in TOGETHER,
         "best_planes": [(row["words"], row["cells"][place]) for row in rows if row["cells"][place]],
         "weight_curves": weight_curves(of_best),
         "certificates": [
-            (plane.depth_mm, record["certificate"])
+            (plane_words(*plane.place), record["certificate"])
             for plane in of_best
             for record in plane.records
             if record["certificate"] and "value" in record["certificate"]
@@ -170,9 +178,13 @@ def _links(directory: Path) -> list[tuple[str, str]]:
 def _origin(directory: Path, folder: Path, result: dict[str, Any]) -> dict[str, Any]:
     """Return how one folder's planes were made, and when."""
     written = datetime.fromtimestamp(int((folder / RECONSTRUCTION_FILE).stat().st_mtime), UTC)
-    methods = sorted({METHOD_NAMES.get(plane["method"], plane["method"]) for plane in result["planes"]})
     where = folder.relative_to(directory).as_posix()
-    return {"where": where, "method": ", ".join(methods), "written": f"{written:%Y-%m-%d %H:%M:%S} UTC", **result}
+    return {
+        "where": where,
+        "method": method_title(result["planes"]),
+        "written": f"{written:%Y-%m-%d %H:%M:%S} UTC",
+        **result,
+    }
 
 
 def _below(directory: Path, name: str) -> list[Path]:
@@ -180,18 +192,23 @@ def _below(directory: Path, name: str) -> list[Path]:
     return sorted({path for depth in range(4) for path in directory.glob("*/" * depth + name)})
 
 
-def _error_sections(directory: Path) -> dict[str, Any]:
+def _error_sections(directory: Path, planes: list[Plane]) -> dict[str, Any]:
     """Return the errors against the truth, the folder's own or those of the folders within it, and by poses."""
     own = directory / METRICS_FILE
     found = [read_result(path, Errors) for path in ([own] if own.is_file() else _below(directory, METRICS_FILE))]
-    rows = [row for metrics in found for row in metrics["planes"]]
+    rows = [row | {"title": _title_of(row, planes)} for metrics in found for row in metrics["planes"]]
     geometry = next((metrics["geometry"] for metrics in found if "geometry" in metrics), None)
     return {"metrics": rows, "geometry_off": geometry, **_by_poses(rows)}
 
 
-def _is_of(row: dict[str, Any], method: str, poses: str) -> bool:
-    """Return whether errors are those of a method's planes; of stated poses, errors say whether they are true."""
-    return row["method"] == method and poses in ("stated", row["poses"])
+def _is_of(row: dict[str, Any], plane: Plane) -> bool:
+    """Return whether errors are of a plane's method; of stated poses, errors say whether they are true."""
+    return bool(row["method"] == plane.method and plane.poses in ("stated", row["poses"]))
+
+
+def _title_of(row: dict[str, Any], planes: list[Plane]) -> str:
+    """Return what the method of errors is called beside the planes."""
+    return next((plane.title for plane in planes if _is_of(row, plane)), METHOD_NAMES.get(row["method"], row["method"]))
 
 
 def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -199,7 +216,7 @@ def _by_poses(rows: list[dict[str, Any]]) -> dict[str, Any]:
     kinds = [kind for kind in POSES if any(row["poses"] == kind for row in rows)]
     places: dict[tuple[float, str, str], dict[str, float]] = {}
     for row in rows:
-        places.setdefault((row["depth_mm"], row["object"], row["method"]), {})[row["poses"]] = row["mse_bright"]
+        places.setdefault((row["depth_mm"], row["object"], row["title"]), {})[row["poses"]] = row["mse_bright"]
     compared = [(*place, errors) for place, errors in places.items() if len(errors) > 1]
     return {"pose_kinds": kinds, "by_poses": sorted(compared, key=lambda row: row[:3])}
 
@@ -211,4 +228,11 @@ def _title(directory: Path, results: dict[Path, dict[str, Any]]) -> str:
     planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
     parts = [f"planes at {planes}"] if depths else []
     parts += list(dict.fromkeys(f"plane {record['name']}" for record in records if "rt_ref_plane" in record))
-    return f"{directory.resolve().name}: {', '.join(parts)}"
+    return f"{_name(directory.resolve())}: {', '.join(parts)}"
+
+
+def _name(folder: Path) -> str:
+    """Return what is reconstructed in a folder: of a session its own name, and which of its sets."""
+    if folder.name == OF_A_SESSION:
+        return folder.parent.name
+    return f"{folder.parent.parent.name}, {folder.name}" if folder.parent.name == OF_A_SESSION else folder.name

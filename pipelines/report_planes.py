@@ -22,7 +22,7 @@ _LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D")
 
 _POSES = ("measured", "nominal", "true", "stated")
 
-_OF_A_SESSION = "reconstructions"
+OF_A_SESSION = "reconstructions"
 
 METHOD_NAMES = {
     "backprojection": "back-projection",
@@ -46,6 +46,11 @@ class Plane:
     records: list[dict[str, Any]]
 
     @property
+    def title(self) -> str:
+        """What the method is called."""
+        return method_title(self.records)
+
+    @property
     def name(self) -> str:
         """What a plane that was given by a pose is called; nothing for others."""
         return str(self.records[0].get("name", ""))
@@ -65,6 +70,16 @@ class Plane:
         return None if name is None else read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn
 
 
+def method_title(records: list[dict[str, Any]]) -> str:
+    """Return what the method of records is called, by what came of it: occlusion may have been left out."""
+    method = str(records[0]["method"])
+    left_out = dict.fromkeys(record["channel"] for record in records if record.get("occlusion") is False)
+    if not left_out:
+        return METHOD_NAMES.get(method, method)
+    in_colours = "" if all(record["channel"] in left_out for record in records) else f" in {', '.join(left_out)}"
+    return f"{METHOD_NAMES['joint']} (occlusion left out{in_colours})"
+
+
 def read_planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[Plane]:
     """Return all planes, in the order of folders and depths; a colour plane has one record per channel."""
     planes = []
@@ -78,7 +93,7 @@ def read_planes(directory: Path, results: dict[Path, dict[str, Any]]) -> list[Pl
             existing(path)
             method = records[0]["method"]
             # The folder of a method says no more than its name, and that of a session's reconstructions nothing.
-            parts = [part for part in where.parts if part not in (method, _OF_A_SESSION)]
+            parts = [part for part in where.parts if part not in (method, OF_A_SESSION)]
             column = f"{parts[-1]}/{method}" if parts else method
             planes.append(Plane(column, method, _poses(result), records[0]["depth_mm"], path, records))
     methods = list(METHOD_NAMES)
@@ -111,7 +126,7 @@ def column_titles(planes: list[Plane]) -> dict[str, str]:
     told_apart = len(set(by_poses.values())) == len(columns) and len({plane.poses for plane in planes}) > 1
     titles = {}
     for column, plane in columns.items():
-        where, name = column.rpartition("/")[0], METHOD_NAMES.get(plane.method, plane.method)
+        where, name = column.rpartition("/")[0], plane.title
         if told_apart and plane.poses != "stated":
             titles[column] = f"{name}, {plane.poses} poses"
         else:
@@ -152,21 +167,21 @@ def side_by_side(planes: list[Plane], columns: list[str], depths: list[float], w
     for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
         found = [by_place.get((place, column)) for column in columns]
         cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
-        rows.append({"words": _words(*place), "cells": cells})
+        rows.append({"words": plane_words(*place), "cells": cells})
     return rows
 
 
 def sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) -> dict[str, Any] | None:
     """Return the standard deviations as pictures on one scale of their own, None where none were asked for."""
     ordered = sorted(planes, key=lambda plane: plane.depth_mm)
-    known = [(plane, plane.sigma_e()) for plane in ordered if plane.depth_mm in depths]
+    known = [(plane, plane.sigma_e()) for plane in ordered if plane.name or plane.depth_mm in depths]
     found = [(plane, sigma) for plane, sigma in known if sigma is not None]
     if not found:
         return None
     white = max(white_level(sigma) for _, sigma in found)
     pictures = [
         {
-            "title": f"{titles[plane.column]}, {plane.depth_mm:g} mm",
+            "title": f"{titles[plane.column]}, {plane_words(*plane.place)}",
             "median_e": float(np.median(sigma)),
             "src": _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
         }
@@ -194,10 +209,10 @@ def _slide(plane: Plane, white: float) -> dict[str, Any]:
     """Return one picture of the sliders, and how many samples across the plane has."""
     pixels = plane.pixels()
     picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
-    return {"depth_mm": plane.depth_mm, "words": _words(*plane.place), "samples": pixels.shape[1], "src": picture}
+    return {"depth_mm": plane.depth_mm, "words": plane_words(*plane.place), "samples": pixels.shape[1], "src": picture}
 
 
-def _words(depth_mm: float, name: str) -> str:
+def plane_words(depth_mm: float, name: str) -> str:
     """Return what a plane is called."""
     return f"{name}, {depth_mm:.1f} mm on the axis" if name else f"{round(depth_mm, 1):g} mm"
 
@@ -218,7 +233,7 @@ def focus_curve(focus: dict[str, Any]) -> str:
     """Return the focus curve as SVG that takes its colour from the page."""
     from matplotlib.figure import Figure  # loading it costs most of a second, and most reports have no curve
 
-    figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+    figure = Figure(figsize=(6.0, 2.6), layout="constrained")
     axes = figure.subplots()
     axes.plot(focus["depth_mm"], focus["detail_e2"], "o-", color="#2b8cbe", markersize=3, linewidth=1.5)
     top = max(focus["detail_e2"])
@@ -242,20 +257,26 @@ def weight_curves(planes: list[Plane]) -> str | None:
     planes : list of Plane
         Of one column.
     """
-    records = [(plane.depth_mm, record) for plane in planes for record in plane.records]
-    known = [(depth, record) for depth, record in records if record.get("penalty_weight_curve")]
+    known = [(plane, one) for plane in planes for one in plane.records if one.get("penalty_weight_curve")]
     if not known:
         return None
     from matplotlib.figure import Figure  # loading it takes a while
 
-    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    figure = Figure(figsize=(5.6, 3.0), layout="constrained")
     axes = figure.subplots()
-    for (depth_mm, record), (colour, marker) in zip(known, cycle(_LINES)):
+    for (plane, record), (colour, marker) in zip(known, cycle(_LINES)):
         curve = sorted(record["penalty_weight_curve"], key=lambda point: float(point["weight"]))
         weights = [point["weight"] for point in curve]
         worse = np.array([point["held_out"] for point in curve]) - min(point["held_out"] for point in curve)
         colour_name = "" if record["channel"] == "grey" else f", {record['channel']}"
-        axes.plot(weights, worse, marker=marker, markersize=4, color=colour, label=f"{depth_mm:g} mm{colour_name}")
+        axes.plot(
+            weights,
+            worse,
+            marker=marker,
+            markersize=4,
+            color=colour,
+            label=f"{plane.name or f'{plane.depth_mm:g} mm'}{colour_name}",
+        )
         axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):

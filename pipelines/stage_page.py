@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.geometry import RigGeometry
+from calib.geometry import GeometrySettings, RigGeometry
 from pipelines.files import write_whole
 from pipelines.measured_poses import GEOMETRY_PAGE
 from pipelines.node_drawings import node_drawing, sigma_maps
-from pipelines.pages import template
+from pipelines.pages import figure, template
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -32,6 +32,7 @@ def write_stage_page(out: Path, geometry: RigGeometry, content: dict[str, Any]) 
     """Write geometry.html into `out` and return its path."""
     page = template("geometry.html").render(
         rows=stage_rows(content["stage"]),
+        holdout=holdout_rows(content),
         lens=lens_rows(content["lens"]),
         drawing=node_drawing(content),
         maps=sigma_maps(content),
@@ -49,6 +50,38 @@ def write_stage_page(out: Path, geometry: RigGeometry, content: dict[str, Any]) 
 def stage_rows(stage: dict[str, Any]) -> list[dict[str, str]]:
     """Return the table of the `stage` of geometry.json: words, value, uncertainty, unit, or why there is none."""
     return [_row(stage[name], words, unit, factor) for name, words, unit, factor in _FIGURES]
+
+
+def holdout_rows(geometry: dict[str, Any]) -> list[dict[str, str]]:
+    """Return what is said of boards left out of the fit: the ratio and what it adds, each beside its limit, or why not.
+
+    Parameters
+    ----------
+    geometry : dict
+        The contents of geometry.json.
+    """
+    words, ratio, limits = (
+        "residual of boards left out, over that of the fit",
+        geometry["holdout_ratio"],
+        GeometrySettings(),
+    )
+    if ratio is None:
+        why = "none can be left out: some node would see no other board"
+        if len(geometry["boards"]) < 2:
+            why = "none can be left out: there is one only"
+        return [{"words": words, "value": "–", "why": why}]
+    added_px = geometry["rms_inlier_px"] * np.sqrt(max(ratio**2 - 1, 0))
+    limit = f"limit {limits.most_holdout_ratio:g}"
+    if ratio > limits.most_holdout_ratio:
+        limit += ", waived: what it adds to so small a residual is negligible"
+    return [
+        {"words": words, "value": figure(ratio), "why": limit},
+        {
+            "words": "what leaving them out adds, rms per axis",
+            "value": figure(added_px),
+            "why": f"px; up to {limits.negligible_holdout_px:g} px is never refused",
+        },
+    ]
 
 
 def lens_rows(lens: dict[str, Any]) -> list[dict[str, str]]:

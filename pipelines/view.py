@@ -10,7 +10,7 @@ from pipelines.errors import MissingPackage
 from pipelines.frames import read_frame
 from pipelines.image_files import white_level
 from pipelines.report import results_below
-from pipelines.report_planes import METHOD_NAMES
+from pipelines.report_planes import method_title
 from pipelines.stacks import planes_in_order, stack_scale
 
 # From so many depths in equal steps on, planes are one layer with a slider.
@@ -52,7 +52,7 @@ def _layers(directory: Path, folder: Path, result: dict[str, Any]) -> list[dict[
     tilted = {record["file"]: record for record in result["planes"] if "rt_ref_plane" in record}.values()
     method = result["planes"][0]["method"]
     where = folder.relative_to(directory).as_posix()
-    name = METHOD_NAMES.get(method, method) + (f", {where}" if where not in (".", method) else "")
+    name = method_title(result["planes"]) + (f", {where}" if where not in (".", method) else "")
     alone = [_layer(folder, [plane], f"{name}, {plane['name']}") for plane in tilted]
     if not planes:
         return alone

@@ -134,6 +134,22 @@ def test_nothing_hangs_over_the_edge(width: int, page: Tab) -> None:
     assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+def test_on_a_phone_drawings_fit_and_what_scrolls_fades_where_there_is_more(page: Tab) -> None:
+    _resize(page, 390, 844)
+    assert page.evaluate(
+        "[...document.querySelectorAll('svg')].map(one => one.getBoundingClientRect().right <= 390)"
+    ) == [True]
+    table = "document.querySelector('#errors .wide')"
+    page.wait_until(f"{table}.className === 'wide after'")
+    mask = f"getComputedStyle({table}).maskImage"
+    assert "rgba(0, 0, 0, 0)" in page.evaluate(mask)
+    page.evaluate(f"{table}.scrollLeft = 10000")
+    page.wait_until(f"{table}.className === 'wide before'")
+    _resize(page, 1200, 844)
+    page.wait_until(f"{table}.className === 'wide'")
+    assert "rgba(0, 0, 0, 0)" not in page.evaluate(mask)
+
+
 def test_in_print_everything_is_there_but_the_controls(page: Tab) -> None:
     _move(page, "depth", 1)
     page.call("Emulation.setEmulatedMedia", media="print", features=[{"name": "prefers-color-scheme", "value": "dark"}])

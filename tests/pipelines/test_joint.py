@@ -81,6 +81,7 @@ def test_objectives_with_and_without_occlusion_are_of_one_kind(scene: Path, tmp_
     joint, occlusion = (json.loads(path.read_text())["planes"][0] for path in records)
     assert joint["penalty"] == occlusion["penalty"]  # its δ follows the noise, which another start would shift
     assert occlusion["objective"] <= joint["objective"]
+    assert occlusion["occlusion"] != ("occlusion_left_out" in occlusion)
 
 
 def test_what_memory_has_no_room_for_is_refused(

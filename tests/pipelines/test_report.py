@@ -187,12 +187,36 @@ def test_results_in_folders_are_shown_together(planes: Path, tmp_path: Path, don
             assert f"{where} set: {title} at 600 mm" in alternatives
 
 
+@pytest.mark.parametrize("kept", [False, True])
+def test_planes_are_called_by_what_came_of_occlusion(kept: bool, planes: Path, done: Command) -> None:
+    made = {"method": "occlusion", "occlusion": kept} | ({} if kept else {"occlusion_left_out": "it is no better"})
+    (planes / "pmlem-osl").rename(planes / "occlusion")
+    for path in (planes / "occlusion" / "reconstruction.json", planes / "metrics.json"):
+        content = json.loads(path.read_text())
+        content["planes"] = [one | made if one["method"] == "pmlem-osl" else one for one in content["planes"]]
+        path.write_text(json.dumps(content))
+    done("report", planes)
+    page = _Page((planes / "report.html").read_text())
+    title = "PMLEM, all planes together" + (", with occlusion" if kept else " (occlusion left out)")
+    assert f"The planes below are by {title}." in page.words
+    assert f"{title} at 600 mm" in page.attributes("img", "alt")
+    assert page.words.count(title) >= 1 + 1 + 2 + 1  # the lead, the slider, errors of two planes, provenance
+    assert ("with occlusion" in page.words) == kept
+    assert ("left out: it is no better." in page.words) == (not kept)
+    assert "--joint" not in page.words
+
+
+def test_the_blur_of_other_depths_is_named_where_planes_were_found_alone(page: _Page) -> None:
+    assert page.words.count("blur in it is light of what stands at other depths, most of which --joint") == 3
+
+
 def test_a_single_plane_needs_no_slider(scene: Path, tmp_path: Path, done: Command) -> None:
     done("reconstruct", scene, "--out", tmp_path / "out", "--depth-mm", 500, "--method", "backprojection")
     page = _Page((tmp_path / "out" / "report.html").read_text())
     assert page.mistakes == page.open == []
     assert not page.attributes("input", "type")
     assert "planes at 500 mm" in page.words
+    assert "other depths" not in page.words
 
 
 def _without(key: str) -> Callable[[dict[str, Any]], object]:

@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ from pipelines.frames import read_frame
 from pipelines.image_files import write_png
 from pipelines.report import write_report
 from pipelines.report_calibration import find_beside, photon_budget
+from pipelines.stage_page import holdout_rows
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -84,8 +86,41 @@ def test_a_session_shows_its_noise_and_geometry_wherever_the_page_stands(
     assert "−20.0 °C" in text
     assert "5450 corners" in text
     assert "approached from one side" in text
-    assert text.count("<svg") == 2
+    assert text.count("<svg") == 3
     assert "http-equiv" in text
+
+
+@pytest.mark.parametrize(("place", "title"), [("", "session"), ("reconstructions/scene", "session, scene")])
+def test_a_page_is_titled_by_its_session(place: str, title: str, session: Path, done: Command) -> None:
+    done("report", session / place)
+    assert f"<h1>{title}: planes at 500 mm</h1>" in (session / place / "report.html").read_text()
+
+
+def test_planes_in_the_results_folder_of_a_session_are_titled_by_the_session(
+    drawn: Path, tmp_path: Path, done: Command
+) -> None:
+    folder = Path(shutil.copytree(drawn, tmp_path / "truck" / "reconstructions"))
+    done("report", folder)
+    assert "<h1>truck: planes at 500 mm</h1>" in (folder / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("ratio", "boards", "said"),
+    [
+        (1.25, 2, [("1.25", "limit 1.3"), ("0.00750", "px; up to 0.1 px is never refused")]),
+        (10.0, 2, [("10.0", "waived"), ("0.0995", "px; up to 0.1 px")]),  # 0.01 √(10² − 1)
+        (None, 1, [("–", "there is one only")]),
+        (None, 2, [("–", "some node would see no other board")]),
+    ],
+)
+def test_what_boards_left_out_add_is_told_beside_its_limit(
+    ratio: float | None, boards: int, said: list[tuple[str, str]]
+) -> None:
+    rows = holdout_rows({"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [{}] * boards})
+    for row, (value, why) in zip(rows, said, strict=True):
+        assert row["value"] == value
+        assert why in row["why"]
+        assert ("waived" in row["why"]) == (why == "waived")
 
 
 def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_path: Path, done: Command) -> None:
@@ -145,7 +180,7 @@ def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, 
     (session / "geometry.json").write_text(json.dumps(content))
     done("report", session)
     text = (session / "report.html").read_text()
-    assert text.count("<svg") == 1
+    assert text.count("<svg") == 2
     assert "one column only" in text
 
 
@@ -221,11 +256,21 @@ def test_weights_tried_and_certificates_are_shown(session: Path, done: Command) 
     assert 'id="weight"' not in (session / "report.html").read_text()
     curve = [{"weight": 0.1 * 2**k, "held_out": 50.0 + (k - 2) ** 2} for k in range(5)]
     certificate = {"kind": "bound", "value": 0.00823, "reached": False}
-    content["planes"][0] |= {"penalty_weight_curve": curve, "penalty_weight": 0.4, "certificate": certificate}
+    content["planes"][0] |= {
+        "penalty_weight_curve": curve,
+        "penalty_weight": 0.4,
+        "certificate": certificate,
+        "name": "table",
+    }
     path.write_text(json.dumps(content))
     done("report", session)
     text = (session / "report.html").read_text()
     part = text[text.index('id="weight"') : text.index('id="noise"')]
+    # Every word of the drawing, small ticks among them, is in the page's own ink
+    for drawn_words in part.split('<g id="text_')[1:]:
+        assert "fill: currentColor" in re.findall("<g ([^>]*)>", drawn_words)[0]
+    assert "<!-- table -->" in part
+    assert "table, 500.0 mm on the axis" in part
     assert part.count("<svg") == 1
     assert "0.823 %: stopped early" in part
 

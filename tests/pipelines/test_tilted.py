@@ -132,7 +132,9 @@ def test_tilted_planes_stand_beside_depths_on_the_page_and_stay_when_asked_again
 def test_a_plane_across_the_axis_by_its_pose_is_that_of_the_depth(target: Path, tmp_path: Path, done: Command) -> None:
     poses = _poses(tmp_path / "poses.toml", {"name": "same", "point_mm": [0, 0, 600.0], "normal": [0, 0, -1.0]})
     options = ("--plane-pose", poses, "--depth-mm", 600, "--method", "pmlem", "--passes", 3)
-    done("reconstruct", target, "--out", tmp_path / "out", *options)
+    done("reconstruct", target, "--out", tmp_path / "out", *options, "--uncertainty")
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert all(f'"Standard deviation: PMLEM, {words}' in report for words in ("600 mm", "same, 600.0 mm on the axis"))
     by_depth, by_pose = (read_frame(tmp_path / "out" / f"plane_{name}.tiff").pixels_dn for name in ("00600.0", "same"))
     np.testing.assert_allclose(by_pose, by_depth, rtol=1e-5)
 
