@@ -12,6 +12,7 @@ from pipelines.errors import MissingFile
 from pipelines.frames import read_frame
 from pipelines.image_files import encoded, grey_levels, shrunk, white_level
 from pipelines.pages import INK, data_uri, inked, svg
+from pipelines.planes import TOGETHER
 
 # So many depths stand side by side; more of them are shown on a slider only.
 _MOST_ROWS = 6
