@@ -12,6 +12,7 @@ from pipelines.errors import MissingFile
 from pipelines.frames import read_frame
 from pipelines.image_files import encoded, grey_levels, shrunk, white_level
 from pipelines.pages import INK, data_uri, inked, svg
+from pipelines.planes import TOGETHER
 
 # So many depths stand side by side; more of them are shown on a slider only.
 _MOST_ROWS = 6
@@ -257,14 +258,20 @@ def weight_curves(planes: list[Plane]) -> str | None:
     planes : list of Plane
         Of one column.
     """
-    known = [(plane, one) for plane in planes for one in plane.records if one.get("penalty_weight_curve")]
+    known = [
+        ("all planes" if plane.method in TOGETHER else plane.name or f"{plane.depth_mm:g} mm", one)
+        for plane in planes
+        for one in plane.records
+        if one.get("penalty_weight_curve")
+    ]
     if not known:
         return None
+    known = list({(words, one["channel"]): (words, one) for words, one in known}.values())
     from matplotlib.figure import Figure  # loading it takes a while
 
     figure = Figure(figsize=(5.6, 3.0), layout="constrained")
     axes = figure.subplots()
-    for (plane, record), (colour, marker) in zip(known, cycle(_LINES)):
+    for (words, record), (colour, marker) in zip(known, cycle(_LINES)):
         curve = sorted(record["penalty_weight_curve"], key=lambda point: float(point["weight"]))
         weights = [point["weight"] for point in curve]
         worse = np.array([point["held_out"] for point in curve]) - min(point["held_out"] for point in curve)
@@ -275,7 +282,7 @@ def weight_curves(planes: list[Plane]) -> str | None:
             marker=marker,
             markersize=4,
             color=colour,
-            label=f"{plane.name or f'{plane.depth_mm:g} mm'}{colour_name}",
+            label=f"{words}{colour_name}",
         )
         axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
