@@ -69,7 +69,7 @@ OURS: Method = "pmlem"
 BEST = "pmlem-best"
 
 _PMLEM_WEIGHTS = tuple(np.geomspace(1.0, 3.2, 6).tolist())
-_TV_WEIGHTS_E = tuple(np.geomspace(0.25, 1.6, 8).tolist())
+_TV_WEIGHTS_E = tuple(np.geomspace(0.1, 1.6, 12).tolist())
 _BM3D_WEIGHTS_E = tuple(np.geomspace(0.4, 1.2, 5).tolist())
 
 # What stands first is drawn as the reference that the others have to beat.
