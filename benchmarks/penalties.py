@@ -59,9 +59,10 @@ def least_errors(picture: Image, seed: int = 1) -> dict[str, float]:
     least: dict[str, float] = {}
     for name in _PENALTIES:
         errors = []
+        penalty = Penalty.for_noise(name, lambda: noise_e)
         for factor in _FACTORS:
             weight = guess * float(factor)
-            for iterate in pmlem(fit, start, penalty_weight=weight, penalty=Penalty.for_noise(name, noise_e)):
+            for iterate in pmlem(fit, start, penalty_weight=weight, penalty=penalty):
                 if iterate.certificate.distance < 0.01 or iterate.passes >= 20:
                     break
             errors.append(float(mean_square_error(iterate.plane / scale_e, picture)))

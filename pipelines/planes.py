@@ -128,7 +128,10 @@ class Objective[Posed: (PosedPlane, PosedScene)]:
         level_e = posed.level_e(start)
         likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
         posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
-        noise_e = float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
+
+        def noise_e() -> float:
+            return float(1 / np.sqrt(np.median(posed.fit(level_e).metric(start)[posed.well_seen()])))
+
         return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
 
 

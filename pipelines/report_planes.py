@@ -276,14 +276,7 @@ def weight_curves(planes: list[Plane]) -> str | None:
         weights = [point["weight"] for point in curve]
         worse = np.array([point["held_out"] for point in curve]) - min(point["held_out"] for point in curve)
         colour_name = "" if record["channel"] == "grey" else f", {record['channel']}"
-        axes.plot(
-            weights,
-            worse,
-            marker=marker,
-            markersize=4,
-            color=colour,
-            label=f"{words}{colour_name}",
-        )
+        axes.plot(weights, worse, marker=marker, markersize=4, color=colour, label=f"{words}{colour_name}")
         axes.axvline(record["penalty_weight"], color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):

@@ -1,5 +1,6 @@
 """What a plane's roughness costs: the penalties of PMLEM, and total variation smoothed as in the paper."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -38,13 +39,16 @@ class Penalty:
             raise ValueError(f"{self.name} needs a smoothing_e > 0, got {self.smoothing_e}")
 
     @classmethod
-    def for_noise(cls, name: PenaltyName, noise_e: float) -> "Penalty":
-        """Return a penalty whose δ suits a back-projection with noise of a standard deviation of `noise_e`.
+    def for_noise(cls, name: PenaltyName, noise_e: Callable[[], float]) -> "Penalty":
+        """Return a penalty whose δ suits a back-projection with noise of a standard deviation of `noise_e()`.
+
+        Total variation has no δ, and does not ask.
 
         The quadratic penalty then weighs differences as large as the noise about as total variation does; Huber's is
         total variation for differences above a tenth of the noise.
         """
-        return cls(name, {"quadratic": noise_e, "huber-tv": 0.1 * noise_e}.get(name, 0.0))
+        share = {"quadratic": 1.0, "huber-tv": 0.1}.get(name, 0.0)
+        return cls(name, share * noise_e() if share else 0.0)
 
     @property
     def bounded(self) -> bool:

@@ -76,7 +76,7 @@ def test_smooth_penalties_find_what_a_quasi_newton_method_finds(
     likelihood: LikelihoodName, penalty: str, phi: Callable[[float], Callable[[Image], tuple[Image, Image]]]
 ) -> None:
     posed = problem(likelihood)
-    found = solved(posed, WEIGHT, Penalty.for_noise(penalty, 0.7))  # type: ignore[arg-type]
+    found = solved(posed, WEIGHT, Penalty.for_noise(penalty, lambda: 0.7))  # type: ignore[arg-type]
     delta = {"quadratic": 0.7, "huber-tv": 0.07}[penalty]
     assert distance(found.plane, smooth_solution(posed, WEIGHT, phi(delta))) <= 1e-4
 
