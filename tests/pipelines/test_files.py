@@ -212,3 +212,18 @@ def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
     with alone_in(folder):
         (folder / "plane.tiff").touch()
     assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
+
+
+def test_an_interrupt_as_soon_as_the_file_is_there_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = Path.open
+
+    def interrupted(self: Path, *arguments: Any) -> None:
+        opened(self, *arguments).close()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "open", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "plane.json", "{}")
+    assert list(tmp_path.iterdir()) == []
