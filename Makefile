@@ -55,8 +55,8 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	@touch $@
 
 # numba notices a change of the file that it compiled, not of those whose functions that file calls
-$(VENV)/compiled: $(VENV)/installed $(wildcard recon/*.py)
+$(VENV)/compiled: $(VENV)/installed $(wildcard recon/*.py recon/*/*.py)
 	@echo "Compiling the kernels ..."
-	rm -f recon/__pycache__/*.nb[ci]
-	$(BIN)/python -c 'from recon import operator, proximal; operator.compile_kernels(); proximal.compile_kernels()'
+	find recon -name '*.nb[ci]' -delete
+	$(BIN)/python -c 'from faintfield.recon.operator import plane; from faintfield.recon.solver import proximal; plane.compile_kernels(); proximal.compile_kernels()'
 	@touch $@

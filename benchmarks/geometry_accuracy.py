@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.geometry import (
+from faintfield.calib.board import Board
+from faintfield.calib.geometry import (
     BoardObservation,
     GeometrySettings,
     RigGeometry,
@@ -24,11 +24,11 @@ from calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
-from calib.lens import Lens
-from rig.grid import grid_nodes
-from rig.simulation.boards import six_boards
-from rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
+from faintfield.calib.lens import Lens
+from faintfield.rig.grid import grid_nodes
+from faintfield.rig.simulation.boards import six_boards
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 
 _CORNER_ROWS, _CORNER_COLUMNS, _SQUARE_MM = 9, 14, 27.0
 _NOISE_PX = 0.2

@@ -7,16 +7,16 @@ from pathlib import Path
 
 import numpy as np
 
-from rig.cameras.protocol import Exposure
-from rig.cameras.settings import SimulatedSettings
-from rig.opening import open_rig
-from rig.plan import Grid
-from rig.session.opening import opened
-from rig.session.session import FrozenPlan
-from rig.settings import RigSettings, StepSettings
-from rig.stages.protocol import Point
-from rig.stages.settings import StageSettings
-from rig.survey import survey
+from faintfield.rig.cameras.protocol import Exposure
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.plan import Grid
+from faintfield.rig.session.access import opened
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.settings import RigSettings, StepSettings
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.settings import StageSettings
 
 FRAMES = 40
 SHAPE = (3000, 4000)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.plane import PlaneOperator
 
 _NORM_OF_GRADIENT = 8**0.5
 _STEPS = 4000

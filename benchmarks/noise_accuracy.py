@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
-from calib.noise.exact import PARAMETERS, Counts, exact_likelihood
+from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
+from faintfield.calib.noise.exact import PARAMETERS, Counts, exact_likelihood
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -15,7 +15,7 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from benchmarks.problem import Problem
-from recon.scene import SceneOperator
+from faintfield.recon.operator.scene import SceneOperator
 
 type Run = Callable[[], object]
 

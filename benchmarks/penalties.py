@@ -9,15 +9,15 @@ import sys
 
 import numpy as np
 
-from recon.data_fit import DataFit
-from recon.images import ElementalImages, Image
-from recon.metrics import mean_square_error, signal_scale_for_snr
-from recon.operator import PlaneOperator
-from recon.penalties import Penalty, PenaltyName
-from recon.plane import PlaneGrid
-from recon.pmlem import pmlem
-from recon.solvers import smooth_start, universal_penalty_weight
-from rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.penalties import Penalty, PenaltyName
+from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
+from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
 
 _VIEWS, _SIZE_PX, _SNR, _READ_VARIANCE_E2, _DARK_E = 49, 192, 0.16, 12.0, 0.02
 _PENALTIES: tuple[PenaltyName, ...] = ("tv", "huber-tv", "quadratic")

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from calib.lens import Lens
-from recon.images import ElementalImages
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
-from rig.grid import nominal_poses_rt_cam_ref
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.lens import Lens
+from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.rig.grid import nominal_poses_rt_cam_ref
 
 DEPTH_MM = 500.0
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from benchmarks.library_solver import primal_dual
 from benchmarks.problem import Problem
-from recon.data_fit import DataFit
-from recon.images import ElementalImages, Image
-from recon.one_step_late import pmlem_one_step_late
-from recon.operator import PlaneOperator
-from recon.pmlem import pmlem
-from recon.solvers import smooth_start, universal_penalty_weight
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.one_step_late import pmlem_one_step_late
+from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
 
 _IN_A_ROW = 10
 _LIMIT_S = 15.0

@@ -11,12 +11,12 @@ import sys
 
 import numpy as np
 
-from pipelines.planes import Settings, solve
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
-from rig.simulation.experiment import paper_experiment
-from rig.simulation.scene import render
+from faintfield.pipelines.reconstruction.planes import Settings, solve
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.scene import render
 
 # Two-sided 90 % of the normal distribution.
 _WITHIN = 1.6449

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board, predefined_dictionary
-from calib.corner_fit import refine_corners
+from faintfield.calib.board import Board, predefined_dictionary
+from faintfield.calib.corner_fit import refine_corners
 
 # The darkest and brightest shares of pixels that a stretch may lose.
 _STRETCH_QUANTILES = (0.002, 0.998)

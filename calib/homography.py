@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.lens import Lens
+from faintfield.calib.lens import Lens
 
 # Step of the central differences over 1 + |value|: rounding and curvature both stay below 1e-6 of a derivative.
 _STEP = 1e-6

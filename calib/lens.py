@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import LensNotInvertible
+from faintfield.calib.errors import LensNotInvertible
 
 # Undistorting and distorting again must return to the pixel within this.
 _ROUND_TRIP_PX = 1e-3

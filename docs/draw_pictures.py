@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from PIL import Image
 
-from pipelines.frames import read_frame
-from pipelines.image_files import contact_sheet, grey_levels, shrunk, write_png
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, shrunk, write_png
 from tests.end_to_end.browser import Tab, browsing
 
 _PICTURES = Path(__file__).parent / "pictures"
@@ -73,7 +73,7 @@ def draw_pages(demo: Path) -> None:
 @contextmanager
 def _capturing(folder: Path) -> Iterator[str]:
     """Run a capture of a board sweep and a bright set on a simulated rig, and yield the address of its page."""
-    from pipelines.init import init
+    from faintfield.pipelines.commands.init import init
 
     rig = folder / "rig.toml"
     init(rig)
@@ -85,7 +85,7 @@ def _capturing(folder: Path) -> Iterator[str]:
     command = [
         sys.executable,
         "-c",
-        "from pipelines.cli import main; main()",
+        "from faintfield.pipelines.cli import main; main()",
         "capture",
         str(rig),
         str(folder / "it"),

@@ -1,6 +1,6 @@
 """The command line: which commands there are, and how their ends become exit codes.
 
-A command is a function that takes its arguments and returns its result, a JSON-able object. `pipelines.commands` lists
+A command is a function that takes its arguments and returns its result, a JSON-able object. `pipelines.registry` lists
 them by name, so that a module is imported only when its command runs.
 """
 
@@ -13,10 +13,10 @@ from typing import Annotated, Any
 import msgspec
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from pipelines.commands import register_commands
-from pipelines.console import framed_console, say
-from pipelines.errors import NAMED_FAILURES, WrongUsage
-from pipelines.log_file import logged
+from faintfield.pipelines.console import framed_console, say
+from faintfield.pipelines.errors import NAMED_FAILURES, WrongUsage
+from faintfield.pipelines.log_file import logged
+from faintfield.pipelines.registry import register_commands
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 

@@ -18,9 +18,9 @@ WrongUsage
 Every message says what is wrong, the value found, the limit it broke, and what to do.
 """
 
-from calib.errors import CalibrationError
-from recon.errors import ReconstructionError
-from rig.errors import RigError
+from faintfield.calib.errors import CalibrationError
+from faintfield.recon.errors import ReconstructionError
+from faintfield.rig.errors import RigError
 
 
 class InputError(Exception):

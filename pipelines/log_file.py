@@ -11,8 +11,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipelines.errors import CannotWrite
-from pipelines.provenance import versions
+from faintfield.pipelines.errors import CannotWrite
+from faintfield.pipelines.formats.provenance import versions
 
 logger = logging.getLogger("faintfield")
 logger.setLevel(logging.INFO)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from recon.images import Image
+from faintfield.recon.likelihood.images import Image
 
 
 def snr_from_powers(object_e: NDArray[np.floating], reference_e: NDArray[np.floating]) -> float:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from recon.images import Image
+from faintfield.recon.likelihood.images import Image
 
 
 def blurred(image: Image, spacings: Sequence[int]) -> Image:

@@ -6,10 +6,10 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
-from rig.grid import centre_node
-from rig.stages.motion import one_sided, path_duration_s
-from rig.stages.protocol import MotionLimits, Point
-from rig.stages.workspace import Workspace
+from faintfield.rig.grid import centre_node
+from faintfield.rig.stages.motion import one_sided, path_duration_s
+from faintfield.rig.stages.protocol import MotionLimits, Point
+from faintfield.rig.stages.workspace import Workspace
 
 type Order = Literal["serpentine", "raster"]
 type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"]

@@ -4,10 +4,10 @@ import math
 
 from msgspec import Struct
 
-from rig.boards import Board
-from rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
-from rig.plan import Grid, Step, StepKind
-from rig.stages.settings import StageSettings
+from faintfield.rig.boards import Board
+from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
+from faintfield.rig.plan import Grid, Step, StepKind
+from faintfield.rig.stages.settings import StageSettings
 
 
 class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,10 +9,10 @@ from types import ModuleType
 
 import pytest
 
-import calib.errors
-import pipelines.errors
-import recon.errors
-import rig.errors
+import faintfield.calib.errors
+import faintfield.pipelines.errors
+import faintfield.recon.errors
+import faintfield.rig.errors
 
 _ROOT = Path(__file__).parents[1]
 _DOCUMENTS = [_ROOT / "README.md", *sorted((_ROOT / "docs").glob("*.md"))]
@@ -59,7 +59,11 @@ def test_results_are_collected_from_a_demo(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("tree", [rig.errors, calib.errors, recon.errors, pipelines.errors], ids=lambda it: it.__name__)
+@pytest.mark.parametrize(
+    "tree",
+    [faintfield.rig.errors, faintfield.calib.errors, faintfield.recon.errors, faintfield.pipelines.errors],
+    ids=lambda it: it.__name__,
+)
 def test_the_guide_says_what_to_do_for_every_named_failure(tree: ModuleType) -> None:
     guide = (_ROOT / "docs" / "guide.md").read_text()
     table = guide[guide.index("## When you see this, do that") :]

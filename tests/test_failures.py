@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-import calib.errors
-import pipelines.errors
-import recon.errors
-import rig.errors
+import faintfield.calib.errors
+import faintfield.pipelines.errors
+import faintfield.recon.errors
+import faintfield.rig.errors
 
 _ROOT = Path(__file__).parents[1]
-_TREES = (calib.errors, pipelines.errors, recon.errors, rig.errors)
+_TREES = (faintfield.calib.errors, faintfield.pipelines.errors, faintfield.recon.errors, faintfield.rig.errors)
 NAMED = {name for tree in _TREES for name, value in vars(tree).items() if isinstance(value, type)}
 
 

@@ -1,9 +1,9 @@
 """Where the camera was at every node, what its lens does, and how well both are known."""
 
-from calib.geometry.calibrate import GeometrySettings, calibrate_geometry
-from calib.geometry.gates import rms_over_views, transfer_sigma_at
-from calib.geometry.observations import BoardObservation, Node, Target
-from calib.geometry.rig_geometry import BoardPose, Repeatability, RigGeometry
+from faintfield.calib.geometry.acceptance import rms_over_views, transfer_sigma_at
+from faintfield.calib.geometry.calibrate import GeometrySettings, calibrate_geometry
+from faintfield.calib.geometry.observations import BoardObservation, Node, Target
+from faintfield.calib.geometry.rig_geometry import BoardPose, Repeatability, RigGeometry
 
 __all__ = [
     "BoardObservation",

@@ -10,8 +10,8 @@ import mrcal
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.observations import Observations
-from calib.geometry.seed import Seed, seed_from
+from faintfield.calib.geometry.initialization import Seed, seed_from
+from faintfield.calib.geometry.observations import Observations
 
 LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8)}}
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.errors import PoorFit, TooFewViews
-from calib.geometry.bundle import LENS_MODELS, Bundle, Problem, solve
-from calib.geometry.covariance import Uncertainty, uncertainty
-from calib.geometry.doubts import doubtful_views
-from calib.geometry.gates import lacks, require_determined
-from calib.geometry.holdout import holdout_ratio
-from calib.geometry.observations import BoardObservation, Node, Observations, gather
-from calib.geometry.rig_geometry import BoardPose, RigGeometry
-from calib.lens import Lens
+from faintfield.calib.board import Board
+from faintfield.calib.errors import PoorFit, TooFewViews
+from faintfield.calib.geometry.acceptance import lacks, require_determined
+from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, Problem, solve
+from faintfield.calib.geometry.covariance import Uncertainty, uncertainty
+from faintfield.calib.geometry.diagnostics import doubtful_views
+from faintfield.calib.geometry.holdout import holdout_ratio
+from faintfield.calib.geometry.observations import BoardObservation, Node, Observations, gather
+from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
+from faintfield.calib.lens import Lens
 
 # Larger residuals are of no board.
 _MOST_RESIDUAL_PX = 5.0

@@ -16,10 +16,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from calib.errors import NotIdentifiable
-from calib.geometry.bundle import Bundle
-from calib.geometry.observations import Observations
-from calib.geometry.rig_geometry import Repeatability
+from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.geometry.bundle import Bundle
+from faintfield.calib.geometry.observations import Observations
+from faintfield.calib.geometry.rig_geometry import Repeatability
 
 # Directions in which a node's misses are absorbed by the fit tell nothing of them.
 _LEAST_EIGENVALUE = 1e-6

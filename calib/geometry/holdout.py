@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from calib.errors import NotIdentifiable
-from calib.geometry.bundle import Bundle, fit_boards, solve_again
-from calib.geometry.observations import Observations
+from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.geometry.bundle import Bundle, fit_boards, solve_again
+from faintfield.calib.geometry.observations import Observations
 
 
 def holdout_ratio(bundle: Bundle, observations: Observations) -> float | None:

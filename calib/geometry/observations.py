@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import TooFewViews
+from faintfield.calib.errors import TooFewViews
 
 type Node = tuple[int, int]
 

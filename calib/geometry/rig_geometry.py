@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.observations import Node, Target
-from calib.lens import Lens
+from faintfield.calib.geometry.observations import Node, Target
+from faintfield.calib.lens import Lens
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.doubts import doubtful_scale, nodes_elsewhere
-from calib.geometry.observations import Node
-from calib.geometry.rig_geometry import RigGeometry
+from faintfield.calib.geometry.diagnostics import doubtful_scale, nodes_elsewhere
+from faintfield.calib.geometry.observations import Node
+from faintfield.calib.geometry.rig_geometry import RigGeometry
 
 type Numbers = NDArray[np.float64]
 

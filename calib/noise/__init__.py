@@ -4,10 +4,10 @@
 `cramer_rao` says how well it could be done at all.
 """
 
-from calib.noise.bounds import Sensor, cramer_rao
-from calib.noise.calibrate import calibrate
-from calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
-from calib.noise.statistics import Conditions, Series, SeriesSums, measure_series
+from faintfield.calib.noise.bounds import Sensor, cramer_rao
+from faintfield.calib.noise.calibrate import calibrate
+from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
+from faintfield.calib.noise.statistics import Conditions, Series, SeriesSums, measure_series
 
 __all__ = [
     "Conditions",

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise.gaussian import ROUNDING_DN2, information
-from calib.noise.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.gaussian import ROUNDING_DN2, information
+from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 
 
 @dataclass(frozen=True)

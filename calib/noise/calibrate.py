@@ -5,16 +5,16 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise.doubts import check_series, frame_doubts, level_doubt, noise_doubt
-from calib.noise.estimates import estimate_all
-from calib.noise.fitting import Fitted, fit_series
-from calib.noise.histogram import Histogram, compare_histogram
-from calib.noise.maps import offset_and_dark_signal, shrunk_variance_ratio
-from calib.noise.pixels import hot_pixels, noisy_pixels, variance_ratio
-from calib.noise.response import Response, measure_response
-from calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
-from calib.noise.selection import MOST_VALUES_DN, Likelihood, collect_counts
-from calib.noise.statistics import Series
+from faintfield.calib.noise.diagnostics import check_series, frame_doubts, level_doubt, noise_doubt
+from faintfield.calib.noise.estimates import estimate_all
+from faintfield.calib.noise.fitting import Fitted, fit_series
+from faintfield.calib.noise.histogram import Histogram, compare_histogram
+from faintfield.calib.noise.maps import offset_and_dark_signal, shrunk_variance_ratio
+from faintfield.calib.noise.pixels import hot_pixels, noisy_pixels, variance_ratio
+from faintfield.calib.noise.response import Response, measure_response
+from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
+from faintfield.calib.noise.selection import MOST_VALUES_DN, Likelihood, collect_counts
+from faintfield.calib.noise.statistics import Series
 
 
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:

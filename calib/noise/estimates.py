@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.noise.fitting import Fitted
-from calib.noise.gaussian import Fit, dark_variances_dn2
-from calib.noise.moments import Moments
-from calib.noise.response import Response, quantum_efficiency
-from calib.noise.result import Estimate
-from calib.noise.statistics import Series
+from faintfield.calib.noise.fitting import Fitted
+from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2
+from faintfield.calib.noise.moments import Moments
+from faintfield.calib.noise.response import Response, quantum_efficiency
+from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.statistics import Series
 
 # A relative standard error above this is no measurement.
 MOST_RELATIVE_SE = 0.1

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from calib.errors import PoorFit
-from calib.noise.gaussian import Fit, flat_log_likelihood
-from calib.noise.mass import DARK_LOG_WEIGHTS, MASS_PARAMETERS, MassTable, mass_function
-from calib.noise.moments import FlatMoments
+from faintfield.calib.errors import PoorFit
+from faintfield.calib.noise.gaussian import Fit, flat_log_likelihood
+from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, MASS_PARAMETERS, MassTable, mass_function
+from faintfield.calib.noise.moments import FlatMoments
 
 PARAMETERS = (*MASS_PARAMETERS, "offset_dn", "log_dsnu_dn")
 _DCNU = PARAMETERS.index("dcnu")

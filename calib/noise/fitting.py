@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise.exact import fit_exact
-from calib.noise.gaussian import Fit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
-from calib.noise.moments import Moments, gather_moments
-from calib.noise.selection import (
+from faintfield.calib.noise.exact import fit_exact
+from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
+from faintfield.calib.noise.moments import Moments, gather_moments
+from faintfield.calib.noise.selection import (
     Likelihood,
     censored_start,
     choose_likelihood,
@@ -17,7 +17,7 @@ from calib.noise.selection import (
     gaussian_start,
     shared_noise_dn2,
 )
-from calib.noise.statistics import Series
+from faintfield.calib.noise.statistics import Series
 
 
 @dataclass(frozen=True)

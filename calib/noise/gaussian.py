@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import PoorFit
-from calib.noise.moments import FlatMoments, Moments
+from faintfield.calib.errors import PoorFit
+from faintfield.calib.noise.moments import FlatMoments, Moments
 
 ROUNDING_DN2 = 1.0 / 12.0
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
-from calib.noise.mass import mass_function
+from faintfield.calib.noise.mass import mass_function
 
 # The Poisson sum costs memory with the charge; beyond this many electrons the normal law is as good.
 _MOST_CHARGE_E = 200.0

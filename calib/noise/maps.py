@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise.statistics import Series
+from faintfield.calib.noise.statistics import Series
 
 
 def offset_and_dark_signal(

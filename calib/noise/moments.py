@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.noise.statistics import Series
+from faintfield.calib.noise.statistics import Series
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.noise.statistics import Series, robust_sigma
+from faintfield.calib.noise.statistics import Series, robust_sigma
 
 # Hot: this many robust standard deviations above the median dark signal.
 _HOT_SIGMA = 5.0

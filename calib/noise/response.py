@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from calib.noise.pixels import dead_pixels
-from calib.noise.statistics import Series
+from faintfield.calib.noise.pixels import dead_pixels
+from faintfield.calib.noise.statistics import Series
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.errors import NotIdentifiable
-from calib.noise.histogram import Histogram
-from calib.noise_model import Map, NoiseModel
+from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.noise.histogram import Histogram
+from faintfield.calib.noise_model import Map, NoiseModel
 
 
 @dataclass(frozen=True)

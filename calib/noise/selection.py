@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from calib.errors import NotIdentifiable
-from calib.noise.exact import Counts
-from calib.noise.gaussian import Fit, dark_variances_dn2
-from calib.noise.statistics import Series, sample_index
+from faintfield.calib.errors import NotIdentifiable
+from faintfield.calib.noise.exact import Counts
+from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2
+from faintfield.calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.
 _SUBTLE_READ_E, _SUBTLE_READ_DN = 1.0, 0.5

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.errors import BadFrame, LightLeak, SaturatedFlat
+from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
 
 # Pixels this many robust standard deviations off in the first frame of a series are left out of its row and column
 # means: a hot pixel's shot noise would otherwise spread along its row.

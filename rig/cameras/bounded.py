@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 
-from rig.errors import CameraTimeout
+from faintfield.rig.errors import CameraTimeout
 
 
 def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:

@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.cameras.settings import FolderSettings
-from rig.clock import Clock
-from rig.errors import CameraError, CameraTimeout
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.settings import FolderSettings
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import CameraError, CameraTimeout
 
 _POLL_S = 0.25
 # A file that has not grown for this many looks is taken as complete.

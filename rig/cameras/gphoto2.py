@@ -4,10 +4,10 @@ import re
 from pathlib import PurePath
 from typing import Any
 
-from rig.cameras.bounded import call_within
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.cameras.settings import GPhoto2Settings
-from rig.errors import CameraError, CameraTimeout, MissingExtra
+from faintfield.rig.cameras.bounded import call_within
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.settings import GPhoto2Settings
+from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 
 _SHUTTER_NAMES = ("shutterspeed", "shutterspeed2", "exposuretime")
 _RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focusmode", "batterylevel", "cameramodel")

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rig.cameras.bounded import call_within
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.cameras.settings import MicroManagerSettings
-from rig.errors import CameraError, CameraTimeout, MissingExtra
+from faintfield.rig.cameras.bounded import call_within
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.settings import MicroManagerSettings
+from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 
 
 class MicroManagerCamera:

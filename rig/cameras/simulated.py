@@ -1,10 +1,10 @@
 """A camera in the simulated lab; its exposures take simulated time."""
 
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.cameras.settings import SimulatedSettings
-from rig.clock import Clock
-from rig.errors import CameraError
-from rig.simulation.lab import SimulatedLab
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import CameraError
+from faintfield.rig.simulation.lab import SimulatedLab
 
 # Under this name the record of a frame has the pose that only a simulated world can know.
 TRUE_POSE = "true_rt_cam_ref"

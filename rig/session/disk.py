@@ -10,8 +10,8 @@ from pathlib import Path
 
 import tifffile
 
-from rig.cameras.protocol import Exposure
-from rig.errors import SessionBusy, SessionUnwritable
+from faintfield.rig.cameras.protocol import Exposure
+from faintfield.rig.errors import SessionBusy, SessionUnwritable
 
 PART = ".part"
 

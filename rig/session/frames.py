@@ -4,7 +4,7 @@ from collections import Counter
 
 from msgspec import Struct
 
-from rig.plan import CapturePlan, StepKind, Stop
+from faintfield.rig.plan import CapturePlan, StepKind, Stop
 
 
 class PlannedFrame(Struct, frozen=True):

@@ -14,8 +14,8 @@ from typing import Any, Self
 import msgspec
 from msgspec import Struct
 
-from rig.errors import SessionCorrupt, SessionUnwritable
-from rig.stages.transport import Direction
+from faintfield.rig.errors import SessionCorrupt, SessionUnwritable
+from faintfield.rig.stages.transport import Direction
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS event (

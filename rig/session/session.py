@@ -8,12 +8,12 @@ from typing import Any
 
 from msgspec import Struct
 
-from rig.cameras.protocol import Exposure
-from rig.plan import CapturePlan
-from rig.session.disk import file_of, sha256, write_new
-from rig.session.frames import PlannedFrame, planned_frames
-from rig.session.journal import Committed, Journal
-from rig.settings import RigSettings
+from faintfield.rig.cameras.protocol import Exposure
+from faintfield.rig.plan import CapturePlan
+from faintfield.rig.session.disk import file_of, sha256, write_new
+from faintfield.rig.session.frames import PlannedFrame, planned_frames
+from faintfield.rig.session.journal import Committed, Journal
+from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
 
@@ -46,7 +46,7 @@ class Written(Struct, frozen=True):
 
 
 class Session:
-    """An open session that no other capture has; made by `rig.session.opening.opened`.
+    """An open session that no other capture has; made by `rig.session.access.opened`.
 
     Parameters
     ----------

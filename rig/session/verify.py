@@ -6,12 +6,12 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from rig.errors import SessionCorrupt
-from rig.session.disk import locked, sha256
-from rig.session.frames import PlannedFrame, planned_frames
-from rig.session.journal import Committed, Journal
-from rig.session.opening import read_plan
-from rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed
+from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.session.access import read_plan
+from faintfield.rig.session.disk import locked, sha256
+from faintfield.rig.session.frames import PlannedFrame, planned_frames
+from faintfield.rig.session.journal import Committed, Journal
+from faintfield.rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed
 
 
 class Verdict(Struct, frozen=True):

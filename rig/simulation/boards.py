@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.simulation.optics import SimulatedOptics, distort
-from rig.simulation.scene import TexturedPlane
+from faintfield.rig.simulation.optics import SimulatedOptics, distort
+from faintfield.rig.simulation.scene import TexturedPlane
 
 # Turned about x and y (degrees) and put at x, y, z (mm): tilted all ways, near and far, seen from the whole grid.
 _SIX_PLACES = (

@@ -6,7 +6,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.stages.protocol import Point
+from faintfield.rig.stages.protocol import Point
 
 # Bent rails and eccentric pulleys: waves of these lengths over the travel, so many of them.
 _WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)

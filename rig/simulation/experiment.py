@@ -5,11 +5,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.grid import centre_node, nominal_poses_rt_cam_ref
-from rig.simulation.objects import toy_airplane, toy_truck
-from rig.simulation.optics import SimulatedOptics
-from rig.simulation.scene import TexturedPlane
-from rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.grid import centre_node, nominal_poses_rt_cam_ref
+from faintfield.rig.simulation.objects import toy_airplane, toy_truck
+from faintfield.rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.scene import TexturedPlane
+from faintfield.rig.simulation.sensor import SimulatedSensor
 
 
 @dataclass(frozen=True)

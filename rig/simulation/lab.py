@@ -8,15 +8,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.boards import Board
-from rig.cameras.settings import SimulatedSettings
-from rig.plan import StepKind
-from rig.simulation.carriage import Carriage
-from rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from rig.simulation.lab_boards import standing_board
-from rig.simulation.scene import TexturedPlane, render
-from rig.simulation.sensor import through_mosaic
-from rig.stages.protocol import Point
+from faintfield.rig.boards import Board
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.plan import StepKind
+from faintfield.rig.simulation.carriage import Carriage
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.lab_boards import standing_board
+from faintfield.rig.simulation.scene import TexturedPlane, render
+from faintfield.rig.simulation.sensor import through_mosaic
+from faintfield.rig.stages.protocol import Point
 
 # Of a white object's light, what a flat has of it.
 _FLAT = 0.5

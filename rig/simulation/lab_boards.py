@@ -6,10 +6,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rig.boards import Board
-from rig.simulation.boards import printed_board, six_boards
-from rig.simulation.optics import SimulatedOptics
-from rig.simulation.scene import TexturedPlane
+from faintfield.rig.boards import Board
+from faintfield.rig.simulation.boards import printed_board, six_boards
+from faintfield.rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.scene import TexturedPlane
 
 _MARGIN_MM = 12.0
 

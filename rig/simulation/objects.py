@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.simulation.scene import TexturedPlane
+from faintfield.rig.simulation.scene import TexturedPlane
 
 # Drawn this many times finer than the texture and averaged down, so that edges have soft shares.
 _OVERSAMPLING = 4

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.optics import SimulatedOptics
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 
 from msgspec import Struct
 
-from rig.errors import OutsideTravel, PlanRefused, PositionDrifted
-from rig.stages.drift import DriftWatch
-from rig.stages.gantry import Gantry
-from rig.stages.motion import path_duration_s
-from rig.stages.protocol import Point
+from faintfield.rig.errors import OutsideTravel, PlanRefused, PositionDrifted
+from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.motion import path_duration_s
+from faintfield.rig.stages.protocol import Point
 
 _SLOWEST_REPORTS_PER_S = 4.0
 _REPORTS = 10

@@ -13,8 +13,8 @@ import math
 
 from msgspec import Struct
 
-from rig.errors import PlanRefused, PositionDrifted, StageError
-from rig.stages.protocol import AxisIndex, Point, Stage
+from faintfield.rig.errors import PlanRefused, PositionDrifted, StageError
+from faintfield.rig.stages.protocol import AxisIndex, Point, Stage
 
 # Serial adapters hold a short answer back for up to this long.
 _JITTER_S = 0.016

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol
 
-from rig.clock import Clock
-from rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from rig.stages.motion import duration_s, one_sided, path_duration_s
-from rig.stages.protocol import AxisIndex, Box, Homing, Identity, Point, Position
-from rig.stages.settings import StageSettings
-from rig.stages.workspace import Workspace
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
+from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s
+from faintfield.rig.stages.protocol import AxisIndex, Box, Homing, Identity, Point, Position
+from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.workspace import Workspace
 
 _BLIND_JOG_MM = 10.0
 

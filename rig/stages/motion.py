@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
-from rig.stages.protocol import MotionLimits, Point
+from faintfield.rig.stages.protocol import MotionLimits, Point
 
 
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable
 
-from rig.errors import NotHomed
-from rig.stages.drift import DriftWatch
-from rig.stages.protocol import Stage
+from faintfield.rig.errors import NotHomed
+from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.protocol import Stage
 
 
 def recover(stage: Stage, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:

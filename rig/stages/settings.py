@@ -4,7 +4,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from rig.stages.protocol import Box
+from faintfield.rig.stages.protocol import Box
 
 type ProtocolName = Literal["grbl", "marlin", "simulated"]
 

@@ -7,8 +7,8 @@ from typing import Literal, Protocol
 import serial
 from serial.tools.list_ports import comports
 
-from rig.clock import Clock
-from rig.errors import StageLost
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import StageLost
 
 type Direction = Literal["sent", "received"]
 

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 from msgspec import Struct
 
-from rig.errors import KeepOutCrossed, OutsideTravel
-from rig.stages.protocol import Box, Point
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
+from faintfield.rig.stages.protocol import Box, Point
 
 # Positions computed from a pitch end a few units in the last place off an edge that they mean to touch.
 _ROUNDING_MM = 1e-6

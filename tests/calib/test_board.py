@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.board import Board, black_rectangles_mm
+from faintfield.calib.board import Board, black_rectangles_mm
 
 
 def drawn(board: Board, px_per_mm: int) -> np.ndarray[Any, Any]:

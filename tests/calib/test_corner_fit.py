@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.corner_fit import refine_corners
+from faintfield.calib.corner_fit import refine_corners
 
 _PITCH, _SIDE = 40, 6
 _SQUARES = np.array([[30.0, 4.0], [-5.0, 26.0]])

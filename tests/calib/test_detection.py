@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.detection import BoardCorners, detect_all, detect_boards
-from pipelines.frames import read_frame
-from pipelines.simulate_boards import standing_board
-from rig.simulation.boards import SimulatedBoard, six_boards
-from rig.simulation.experiment import paper_experiment
-from rig.simulation.scene import render
+from faintfield.calib.board import Board
+from faintfield.calib.detection import BoardCorners, detect_all, detect_boards
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.simulation.boards import standing_board
+from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.scene import render
 
 EXPERIMENT = paper_experiment(1200, 900)
 BOARD = Board("a", 8, 6, 40.0, 29.0, "DICT_5X5_1000", 100)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 
 poses = st.integers(0, 2**32 - 1).map(
     lambda seed: np.random.default_rng(seed).uniform(-1, 1, (3, 6)) * np.repeat([0.5, 200.0], 3)

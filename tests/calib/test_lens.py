@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.errors import LensNotInvertible
-from calib.lens import Lens
-from rig.simulation.optics import SimulatedOptics
+from faintfield.calib.errors import LensNotInvertible
+from faintfield.calib.lens import Lens
+from faintfield.rig.simulation.optics import SimulatedOptics
 
 DISTORTIONS: list[tuple[float, ...]] = [
     (),

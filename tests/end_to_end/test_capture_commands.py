@@ -8,14 +8,14 @@ from unittest import mock
 
 import pytest
 
-from pipelines import cli
-from pipelines.check import time_in_words
-from pipelines.rig_file import read_rig
-from rig.session.disk import locked
-from rig.session.journal import Journal
-from rig.session.opening import taken_frames
-from rig.simulation.lab import SimulatedLab
-from rig.stages.settings import StageSettings
+from faintfield.pipelines import cli
+from faintfield.pipelines.commands.check import time_in_words
+from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.rig.session.access import taken_frames
+from faintfield.rig.session.disk import locked
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.stages.settings import StageSettings
 
 STEPS = [
     *[("charuco", 49)] * 6,
@@ -90,7 +90,10 @@ def test_the_whole_experiment_unattended(shell: Shell) -> None:
 
 
 def test_check_moves_nothing_and_says_what_matters(shell: Shell) -> None:
-    with mock.patch("rig.stages.gantry.Gantry.move_to") as move, mock.patch("rig.stages.gantry.Gantry.home") as home:
+    with (
+        mock.patch("faintfield.rig.stages.gantry.Gantry.move_to") as move,
+        mock.patch("faintfield.rig.stages.gantry.Gantry.home") as home,
+    ):
         found = shell.result("check", shell.rig)
         assert not move.called
         assert not home.called

@@ -14,17 +14,17 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.capture_page import serving_page
-from pipelines.panel import Panel
-from pipelines.terminal import TerminalView
-from rig.capture import Capture
-from rig.errors import CaptureStopped, RigError
-from rig.opening import open_rig
-from rig.session.journal import Journal
-from rig.session.opening import opened
-from rig.session.session import FrozenPlan
-from rig.session.verify import verify
-from rig.survey import survey
+from faintfield.pipelines.live.capture_page import serving_page
+from faintfield.pipelines.live.panel import Panel
+from faintfield.pipelines.live.terminal import TerminalView
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.errors import CaptureStopped, RigError
+from faintfield.rig.session.access import opened
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import CHROMIUM, Tab, browsing
 from tests.faults.capturing import FRAMES, SMALL_RIG
 

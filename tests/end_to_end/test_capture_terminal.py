@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import cli
-from rig.session.verify import verify
+from faintfield.pipelines import cli
+from faintfield.rig.session.verify import verify
 
 _LONGEST_WAIT_S = 60.0
 
@@ -59,7 +59,14 @@ def test_keys_lead_through_a_capture(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert cli.run(["init", str(rig)]) == 0
     text = rig.read_text().replace("size_px = [640, 480]", "size_px = [64, 48]")
     rig.write_text(text.replace("rows = 7\ncolumns = 7", "rows = 2\ncolumns = 2"))
-    command = (sys.executable, "-c", "from pipelines.cli import main; main()", "capture", str(rig), str(session))
+    command = (
+        sys.executable,
+        "-c",
+        "from faintfield.pipelines.cli import main; main()",
+        "capture",
+        str(rig),
+        str(session),
+    )
     terminal = Terminal(*command)
     terminal.wait_for("Homing")
     terminal.press("g")

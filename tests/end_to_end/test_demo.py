@@ -11,12 +11,12 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from pipelines.frames import read_frame
-from pipelines.planes import TOGETHER, Method
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.reconstruction.planes import TOGETHER, Method
 
 METHODS = [method for method in get_args(Method.__value__) if method not in TOGETHER]
 _ROOT = Path(__file__).parents[2]
-_MAIN = "from pipelines.cli import main; main({words!r})"
+_MAIN = "from faintfield.pipelines.cli import main; main({words!r})"
 
 
 def _run(words: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
@@ -138,7 +138,7 @@ def test_memory_of_a_reconstruction_is_bounded_by_its_images(tmp_path: Path) -> 
     # Of the 200 MB, 90 are library code. How much of that is resident the page cache decides, not this program: what
     # is its own is the peak less the mapped files, and has the rest as its bound.
     own_kb = (
-        "from pipelines.cli import run; assert run({words!r}) == 0; "
+        "from faintfield.pipelines.cli import run; assert run({words!r}) == 0; "
         "lines = dict(line.split(':') for line in open('/proc/self/status')); "
         "print(*(int(lines[key].split()[0]) for key in ('VmHWM', 'RssFile')))"
     )

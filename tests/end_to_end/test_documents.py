@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from pipelines.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import tomli_w
 
-from pipelines.noise import noise
-from pipelines.reconstruct import reconstruct
-from pipelines.simulate import simulate
-from rig.simulation.sensor import SimulatedSensor
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.commands.reconstruct import reconstruct
+from faintfield.pipelines.commands.simulate import simulate
+from faintfield.rig.simulation.sensor import SimulatedSensor
 from tests.pipelines.noise_sets import write_frames
 
 

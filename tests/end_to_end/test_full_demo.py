@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(540)]
 @pytest.fixture(scope="module")
 def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("full") / "demo"
-    call = "import sys; from pipelines.cli import main; main(sys.argv[1:])"
+    call = "import sys; from faintfield.pipelines.cli import main; main(sys.argv[1:])"
     ended = subprocess.run([sys.executable, "-c", call, "demo", str(out)], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
     return dict(json.loads((out / "metrics.json").read_text()))

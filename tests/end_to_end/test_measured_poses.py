@@ -6,14 +6,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from calib.board import Board
-from pipelines.elemental_set import ElementalSet, load_set, write_set
-from pipelines.geometry import geometry
-from pipelines.reconstruct import reconstruct
-from pipelines.simulate import simulate
-from pipelines.simulate_boards import simulate_board_set
-from pipelines.truth import read_truth
-from rig.simulation.experiment import paper_experiment
+from faintfield.calib.board import Board
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.reconstruct import reconstruct
+from faintfield.pipelines.commands.simulate import simulate
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, write_set
+from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.simulation.boards import simulate_board_set
+from faintfield.rig.simulation.experiment import paper_experiment
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(3)]
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from pipelines.cli import run
-from recon.metrics import mean_square_error, peak_snr_db
+from faintfield.pipelines.cli import run
+from faintfield.recon.metrics import mean_square_error, peak_snr_db
 
 # The plane of the middle pieces: its points move by so much from node to node
 _DISPARITY_PX = -2.0

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.cli import run
+from faintfield.pipelines.cli import run
 from tests.end_to_end.browser import CHROMIUM, Tab, browsing
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")

@@ -5,13 +5,13 @@ from typing import Any
 
 import pytest
 
-from pipelines.demo_truth import true_set, write_truth
-from pipelines.frames import read_frame
-from pipelines.metrics import assess
-from pipelines.plane_files import plane_name
-from pipelines.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
-from pipelines.run import run_steps, session_steps
-from pipelines.session_set import load_session
+from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
+from faintfield.pipelines.commands.run import run_steps, session_steps
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.plane_files import plane_name
+from faintfield.pipelines.formats.sets.session_set import load_session
+from faintfield.pipelines.paper.demo_truth import true_set, write_truth
+from faintfield.pipelines.reconstruction.accuracy import assess
 from tests.pipelines.sessions import captured, rig_toml
 
 _DEPTH_MM = 500.0

@@ -11,20 +11,20 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from rig.cameras.settings import SimulatedSettings
-from rig.capture import Capture
-from rig.guide import Unattended
-from rig.opening import open_rig
-from rig.plan import Grid
-from rig.session import disk, session
-from rig.session.journal import Journal
-from rig.session.opening import opened
-from rig.session.session import FrozenPlan
-from rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
-from rig.simulation.lab import SimulatedLab
-from rig.stages.protocol import Point
-from rig.stages.settings import StageSettings
-from rig.survey import survey
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.capture.guide import Unattended
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.plan import Grid
+from faintfield.rig.session import disk, session
+from faintfield.rig.session.access import opened
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
+from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.settings import StageSettings
 
 SMALL_RIG = RigSettings(
     stage=StageSettings("simulated"),

@@ -10,23 +10,23 @@ import msgspec
 import numpy as np
 import pytest
 
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.capture import Capture
-from rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
-from rig.guide import Answer, Operator, Prompt, Unattended
-from rig.opening import Rig
-from rig.session.disk import file_of
-from rig.session.journal import Journal
-from rig.session.opening import opened, read_plan, taken_frames
-from rig.session.session import FrozenPlan, is_sealed
-from rig.session.verify import verify
-from rig.settings import DriftSettings, RigSettings
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.faults import Fault, faults_of
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.protocol import Point
-from rig.survey import survey
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.capture.guide import Answer, Operator, Prompt, Unattended
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import Rig
+from faintfield.rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
+from faintfield.rig.session.access import opened, read_plan, taken_frames
+from faintfield.rig.session.disk import file_of
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import FrozenPlan, is_sealed
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import DriftSettings, RigSettings
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.faults import Fault, faults_of
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
@@ -234,7 +234,7 @@ def capture_read_only(folder: Path, place: str) -> None:
             if next(taken) == 6:
                 (folder / place).chmod(0o500)
 
-    from rig.opening import open_rig
+    from faintfield.rig.devices import open_rig
 
     plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
     with opened(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig.session.journal import Journal
-from rig.session.verify import verify
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, STEPS, capture_and_die, capture_small, in_process
 
 # A process that captures the small session alone is done long before this.

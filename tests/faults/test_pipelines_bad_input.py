@@ -13,7 +13,7 @@ import pytest
 import tifffile
 import tomli_w
 
-from pipelines.cli import run
+from faintfield.pipelines.cli import run
 
 type Damage = Callable[[Path], object]
 
@@ -166,7 +166,7 @@ def test_decoders_add_no_words_of_their_own(name: str, whole_set: Path, tmp_path
         content = bytearray(whole[:8])  # a header that leads nowhere, which the reader logs
     (folder / name).write_bytes(content)
     words = ["reconstruct", str(folder), "--out", str(tmp_path / "out"), "--depth-mm", "500"]
-    code = f"from pipelines.cli import main; main({words!r})"
+    code = f"from faintfield.pipelines.cli import main; main({words!r})"
     ended = run_process([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.startswith("faintfield: UnreadableImage: ")

@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.cli import run
-from pipelines.elemental_set import load_set
-from pipelines.files import UNFINISHED
-from pipelines.frames import read_frame
-from pipelines.plane_files import PARTS
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.plane_files import PARTS
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 
 # A test may run in the background, where interrupts are ignored and stay so in children
 _LAUNCH = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {before}; " + (
-    "from pipelines.cli import main; main({words!r})"
+    "from faintfield.pipelines.cli import main; main({words!r})"
 )
 _DEADLINE_S = 60.0
 

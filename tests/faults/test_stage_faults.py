@@ -9,16 +9,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.errors import RigError, StageError
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.faults import FAULTS, Fault, faults_of
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.link import PtyLink, SocketLink
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.drift import DriftWatch
-from rig.stages.gantry import Gantry
-from rig.stages.protocol import Point
-from rig.stages.recovery import recover
+from faintfield.rig.errors import RigError, StageError
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.faults import FAULTS, Fault, faults_of
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.link import PtyLink, SocketLink
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.recovery import recover
 
 type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
 

@@ -13,8 +13,8 @@ import pytest
 import tomli_w
 from numpy.typing import NDArray
 
-from pipelines.cli import run
-from pipelines.image_files import write_frame
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.image_files import write_frame
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipelines.cli import run
+from faintfield.pipelines.cli import run
 
 _RIG = """
 [stage]

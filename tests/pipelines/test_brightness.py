@@ -10,8 +10,8 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.brightness import brightness
-from pipelines.elemental_set import load_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.brightness import brightness
 
 type SetMaker = Callable[..., Path]
 

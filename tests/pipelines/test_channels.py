@@ -11,18 +11,18 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.channels import (
+from faintfield.pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import (
     OperatorFactory,
     channel_layouts,
     default_pitch_px,
     load_channel,
     plane_grid,
 )
-from pipelines.elemental_set import load_set
-from pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
-from recon.errors import GeometryMismatch
-from recon.images import ElementalImages
-from recon.solvers import back_projection
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.solver.starts import back_projection
 
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]

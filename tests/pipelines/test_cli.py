@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from cyclopts import App
 
-from pipelines import cli
-from pipelines.errors import BadValue
-from recon.errors import NotConverged
+from faintfield.pipelines import cli
+from faintfield.pipelines.errors import BadValue
+from faintfield.recon.errors import NotConverged
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -165,7 +165,7 @@ def test_named_failures_are_one_line_as_it_is_and_exit_code_1(
     def fail(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr("pipelines.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
     ended = faintfield("report", "folder")
     assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", line)
 
@@ -174,7 +174,7 @@ def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatc
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipelines.report.write_report", interrupt)
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", interrupt)
     ended = faintfield("report", "folder")
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.startswith("faintfield: Interrupted: ")
@@ -185,7 +185,7 @@ def test_a_bug_is_not_dressed_up_as_a_named_failure(monkeypatch: pytest.MonkeyPa
     def fail(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("pipelines.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
     with pytest.raises(ZeroDivisionError):
         cli.run(["report", "folder"])
 

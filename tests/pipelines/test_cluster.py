@@ -11,12 +11,12 @@ from typing import Any
 import numba
 import pytest
 
-from pipelines.cluster import crew_of
-from pipelines.elemental_set import LoadedSet, load_set
-from pipelines.files import UNFINISHED
-from pipelines.reconstruct import Request, reconstruct_set
-from pipelines.sweep import PlaneTask
-from pipelines.tilted import Place
+from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
+from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.plane_poses import Place
+from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
+from faintfield.pipelines.reconstruction.cluster import crew_of
+from faintfield.pipelines.reconstruction.sweep import PlaneTask
 
 type Command = Callable[..., CompletedProcess[str]]
 

@@ -14,11 +14,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from pipelines.elemental_set import load_set
-from pipelines.errors import BadValue
-from pipelines.import_colmap import export_colmap, import_colmap
-from pipelines.imported_set import relative
+from faintfield.pipelines.commands.imports.colmap import export_colmap, import_colmap
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
+from faintfield.pipelines.formats.exchange.imported_set import relative
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 
 STORED = Path(__file__).parent / "colmap"
 

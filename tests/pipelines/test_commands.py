@@ -7,8 +7,8 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from pipelines import cli
-from pipelines.commands import COMMANDS, EXPORTS, IMPORTS, Command
+from faintfield.pipelines import cli
+from faintfield.pipelines.registry import COMMANDS, EXPORTS, IMPORTS, Command
 
 EXAMPLES = [
     *(example for commands in COMMANDS.values() for example in commands),

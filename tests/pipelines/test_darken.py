@@ -12,10 +12,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.channels import channel_layouts, load_channel
-from pipelines.elemental_set import load_set
-from pipelines.frames import read_frame
-from pipelines.image_files import write_frame
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]

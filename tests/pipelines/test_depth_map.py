@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.autofocus import searched_range_mm
-from pipelines.cli import run
-from pipelines.depth_map import compared_depths
-from pipelines.elemental_set import load_set
-from pipelines.frames import read_frame
-from pipelines.truth import read_truth, texture_and_region
-from recon.best_focus import SURE
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
+from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
+from faintfield.pipelines.reconstruction.depth_map import compared_depths
+from faintfield.recon.depth.best_focus import SURE
 from tests.pipelines.conftest import Command, SetMaker
 
 SWEEP = ("--sweep-mm", "400:900:26", "--method", "backprojection", "--depth-map")

@@ -15,8 +15,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipelines.elemental_set import Camera, ElementalSet, Noise, View, load_set, write_set
-from pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
+from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
+from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, Noise, View, load_set, write_set
 
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]

@@ -7,8 +7,16 @@ from typing import Any
 
 import pytest
 
-from pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
-from pipelines.files import alone_in, building_folder, require_room, sha256, write_json, write_whole, writing
+from faintfield.pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
+from faintfield.pipelines.formats.files import (
+    alone_in,
+    building_folder,
+    require_room,
+    sha256,
+    write_json,
+    write_whole,
+    writing,
+)
 
 
 def _everything_below(folder: Path) -> set[str]:

@@ -12,8 +12,8 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.errors import MissingFile, UnreadableImage
-from pipelines.frames import read_frame
+from faintfield.pipelines.errors import MissingFile, UnreadableImage
+from faintfield.pipelines.formats.frames import read_frame
 
 type Writer = Callable[[Path, NDArray[np.generic]], object]
 

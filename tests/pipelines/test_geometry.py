@@ -9,23 +9,28 @@ import mrcal
 import numpy as np
 import pytest
 
-from calib.board import Board
-from calib.geometry import GeometrySettings, calibrate_geometry
-from pipelines import cli
-from pipelines.board_pdf import board
-from pipelines.board_set import load_board_set
-from pipelines.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from pipelines.elemental_set import load_set
-from pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
-from pipelines.geometry import geometry
-from pipelines.geometry_files import read_corners
-from pipelines.import_colmap import export_colmap, import_colmap
-from pipelines.import_mrcal import export_mrcal, import_mrcal
-from pipelines.measured_poses import CORNERS_FILE, COVARIANCE_FILE, read_geometry, with_measured_geometry
-from pipelines.simulate import simulate
-from pipelines.simulate_boards import simulate_board_set
-from pipelines.truth import read_truth
-from rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.calib.board import Board
+from faintfield.calib.geometry import GeometrySettings, calibrate_geometry
+from faintfield.pipelines import cli
+from faintfield.pipelines.commands.board import board
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.imports.colmap import export_colmap, import_colmap
+from faintfield.pipelines.commands.imports.mrcal import export_mrcal, import_mrcal
+from faintfield.pipelines.commands.simulate import simulate
+from faintfield.pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
+from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
+from faintfield.pipelines.formats.results.geometry import read_corners
+from faintfield.pipelines.formats.sets.board_set import load_board_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.sets.measured_poses import (
+    CORNERS_FILE,
+    COVARIANCE_FILE,
+    read_geometry,
+    with_measured_geometry,
+)
+from faintfield.pipelines.simulation.boards import simulate_board_set
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
 
@@ -234,7 +239,7 @@ def test_a_binary_model_is_the_text_model(tmp_path: Path) -> None:
 
 
 def load_lens() -> Any:
-    from calib.lens import Lens
+    from faintfield.calib.lens import Lens
 
     return Lens((640, 480), 800.0, 801.0, 319.0, 241.0, (-0.1, 0.02, 0.001, -0.002, 0.003))
 

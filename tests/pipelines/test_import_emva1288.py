@@ -6,12 +6,12 @@ from pathlib import Path
 import cv2
 import pytest
 
-from pipelines.cli import run
-from pipelines.errors import BadValue, MissingFile
-from pipelines.files import sha256
-from pipelines.import_emva1288 import import_emva1288, parse_descriptor
-from pipelines.noise import noise
-from pipelines.noise_set import load_noise_set
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.imports.emva1288 import import_emva1288, parse_descriptor
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.calib.noise.darkroom import expose, specimen
 
 DESCRIPTOR = """# a comment

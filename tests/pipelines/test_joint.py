@@ -87,7 +87,7 @@ def test_objectives_with_and_without_occlusion_are_of_one_kind(scene: Path, tmp_
 def test_what_memory_has_no_room_for_is_refused(
     scene: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.joint.available_bytes", lambda: 100_000)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.joint.available_bytes", lambda: 100_000)
     ended = faintfield("reconstruct", scene, *BOTH, "--occlusion", "--out", tmp_path / "out")
     assert ended.returncode == 1
     assert "MemoryShort: planes found together need" in ended.stderr

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import tifffile
 
-from pipelines import large_arrays
-from pipelines.channels import channel_layouts, load_channel
-from pipelines.elemental_set import load_set
-from pipelines.errors import DiskFull
-from pipelines.large_arrays import available_bytes, memory_or_file
+from faintfield.pipelines.errors import DiskFull
+from faintfield.pipelines.formats import large_arrays
+from faintfield.pipelines.formats.large_arrays import available_bytes, memory_or_file
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]
@@ -25,9 +25,11 @@ type SetMaker = Callable[..., Path]
 _LIMITED = """
 import re, resource, sys
 from pathlib import Path
-from pipelines import large_arrays, overview, report
-from pipelines.elemental_set import load_set
-from pipelines.reconstruct import Request, reconstruct_set
+from faintfield.pipelines.formats import large_arrays
+from faintfield.pipelines.pages import report
+from faintfield.pipelines.reconstruction import overview
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
 loaded, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
 out, request = Path(sys.argv[2]), Request([500.0], ["backprojection"])
 reconstruct_set(warm, out.with_name("warm-out"), request)

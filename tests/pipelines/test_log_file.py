@@ -8,7 +8,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from pipelines import cli
+from faintfield.pipelines import cli
 
 type Command = Callable[..., CompletedProcess[str]]
 _LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) (.*)")
@@ -48,7 +48,7 @@ def test_a_bug_leaves_its_traceback_and_a_warning_its_words(tmp_path: Path, monk
         logging.getLogger("some.library").warning("the wind has turned")
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("pipelines.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
     log = tmp_path / "day.log"
     with pytest.raises(ZeroDivisionError):
         cli.run(["report", "folder", "--log", str(log)])

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from calib.noise import Conditions, calibrate, measure_series
-from pipelines.cli import run
-from pipelines.elemental_set import Camera, ElementalSet, View, load_set, write_set
-from pipelines.errors import BadValue
-from pipelines.files import write_json
-from pipelines.fitted_noise import read_fitted_noise
-from pipelines.frames import Frame, exif_exposure_s
-from pipelines.image_files import write_frame
-from pipelines.noise import noise
-from pipelines.noise_page import draw_page, page_panels
+from faintfield.calib.noise import Conditions, calibrate, measure_series
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.frames import Frame, exif_exposure_s
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
+from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, View, load_set, write_set
+from faintfield.pipelines.pages.noise_page import draw_page, page_panels
 from tests.calib.noise.darkroom import darks, specimen
 from tests.pipelines.noise_sets import take_set, write_frames
 
@@ -309,7 +309,7 @@ def raw_like(path: Path) -> Frame:
 def test_masked_pixels_that_disagree_with_the_darks_raise_a_doubt(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipelines.noise_frames.read_frame", raw_like)
+    monkeypatch.setattr("faintfield.pipelines.calibration.noise_frames.read_frame", raw_like)
     result = noise(write_frames(tmp_path, take_set(*specimen(16, shape=(96, 96)))))
     assert [plane["masked_black_dn"] for plane in result["planes"]] == [100, 100, 100, 140]
     assert result["saturation_dn"] == 4095

@@ -9,10 +9,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.brightness import brightness
-from pipelines.elemental_set import load_set
-from pipelines.image_files import mask_picture, write_png
-from pipelines.object_region import OBJECT_REGION, object_region, segmented
+from faintfield.pipelines.formats.image_files import mask_picture, write_png
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.brightness import brightness
+from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION, object_region, segmented
 
 type SetMaker = Callable[..., Path]
 

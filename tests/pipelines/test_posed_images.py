@@ -11,8 +11,8 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from pipelines.elemental_set import load_set
-from pipelines.files import sha256
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from pipelines.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
-from pipelines.cli import run
-from pipelines.elemental_set import load_set
-from pipelines.frames import read_frame
-from pipelines.image_files import grey_levels, white_level
-from recon.likelihoods import negative_log_likelihood
-from recon.penalties import total_variation
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import grey_levels, white_level
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
+from faintfield.recon.likelihood.likelihoods import negative_log_likelihood
+from faintfield.recon.solver.penalties import total_variation
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]

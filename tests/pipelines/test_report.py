@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from pipelines.cli import run
-from pipelines.image_files import grey_levels, white_level
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.image_files import grey_levels, white_level
 
 type Command = Callable[..., CompletedProcess[str]]
 

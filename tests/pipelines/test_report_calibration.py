@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.cli import run
-from pipelines.frames import read_frame
-from pipelines.image_files import write_png
-from pipelines.report import write_report
-from pipelines.report_calibration import find_beside, photon_budget
-from pipelines.stage_page import holdout_rows
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_png
+from faintfield.pipelines.pages.report import write_report
+from faintfield.pipelines.pages.report_calibration import find_beside, photon_budget
+from faintfield.pipelines.pages.stage_page import holdout_rows
 
 type Command = Callable[..., CompletedProcess[str]]
 

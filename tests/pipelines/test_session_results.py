@@ -7,21 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.board_set import load_board_set
-from pipelines.channels import channel_layouts, load_channel
-from pipelines.colmap_files import read_model
-from pipelines.errors import BadValue, MissingFile, WrongUsage
-from pipelines.frames import read_frame
-from pipelines.geometry import geometry
-from pipelines.image_files import write_frame
-from pipelines.import_colmap import export_colmap
-from pipelines.import_mrcal import export_mrcal
-from pipelines.noise import noise
-from pipelines.reconstruct import reconstruct
-from pipelines.run import run
-from pipelines.session_set import load_session
-from rig.session.opening import taken_frames
-from rig.session.verify import verify
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.imports.colmap import export_colmap
+from faintfield.pipelines.commands.imports.mrcal import export_mrcal
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.commands.reconstruct import reconstruct
+from faintfield.pipelines.commands.run import run
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongUsage
+from faintfield.pipelines.formats.exchange.colmap import read_model
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.board_set import load_board_set
+from faintfield.pipelines.formats.sets.session_set import load_session
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.rig.session.access import taken_frames
+from faintfield.rig.session.verify import verify
 from tests.pipelines.sessions import SWEEPS, captured, rig_toml
 
 
@@ -149,7 +149,7 @@ class TestRun:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr("pipelines.reconstruct.write_report", interrupted)
+            patch.setattr("faintfield.pipelines.commands.reconstruct.write_report", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 run(copy, depth_mm=[700.0], passes=4)
         assert [step["step"] for step in run(copy, depth_mm=[700.0], passes=4)["steps"] if step["ran"]] == ["report"]

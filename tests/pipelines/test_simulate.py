@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.brightness import brightness
-from pipelines.elemental_set import load_set
-from pipelines.frames import read_frame
-from recon.metrics import photons_from_linear_snr, photons_from_moments
-from rig.simulation.experiment import paper_experiment
-from rig.simulation.scene import render
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.brightness import brightness
+from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.scene import render
 
 type Command = Callable[..., CompletedProcess[str]]
 

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import tifffile
 
-from pipelines.cli import run
-from pipelines.elemental_set import load_set
-from pipelines.files import UNFINISHED
-from pipelines.plane_files import PARTS, PlaneFiles
-from pipelines.planes import solve
-from pipelines.reconstruct import Request, reconstruct_set
-from recon.errors import GeometryMismatch
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
+from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.recon.errors import GeometryMismatch
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -35,7 +35,7 @@ def killing(descriptor):
         os.kill(os.getpid(), signal.SIGKILL)
     fsync(descriptor)
 os.fsync = killing
-from pipelines.cli import main
+from faintfield.pipelines.cli import main
 main(sys.argv[2:])
 """
 
@@ -128,7 +128,7 @@ def test_a_failure_leaves_the_planes_before_it(
             raise GeometryMismatch("made up")
         return solve(*arguments)
 
-    monkeypatch.setattr("pipelines.sweep.solve", failing)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.sweep.solve", failing)
     with pytest.raises(GeometryMismatch, match="made up"):
         reconstruct_set(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
     assert {path.name for path in tmp_path.iterdir()} == {f"plane_00500.0.{kind}" for kind in ("tiff", "png", "json")}

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pipelines.elemental_set import load_set
-from pipelines.errors import BadValue, UnknownKey
-from pipelines.frames import read_frame
-from pipelines.image_files import write_frame
-from pipelines.tilted import TiltedPlane, read_plane_poses
+from faintfield.pipelines.errors import BadValue, UnknownKey
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.plane_poses import TiltedPlane, read_plane_poses
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 from tests.pipelines.conftest import Command
 
 WIDTH, HEIGHT, FOCAL_PX = 120, 90, 150.0

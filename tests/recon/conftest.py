@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.plane import PlaneOperator
 
 type LinearOperatorCheck = Callable[[PlaneOperator], Image]
 

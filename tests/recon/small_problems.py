@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from recon.images import ElementalImages, Image, Likelihood, LikelihoodName
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
+from faintfield.recon.likelihood.images import ElementalImages, Image, Likelihood, LikelihoodName
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
 
 SHAPE = (9, 12)
 DETECTOR = (11, 14)  # a sample more on each side

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from recon.best_focus import SURE, likeliest_depth_mm, places_of_focus
-from recon.depth import Agreement, agreement, bins_for, depth_map
-from recon.images import ElementalImages
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
+from faintfield.recon.depth.agreement import Agreement, agreement, bins_for, depth_map
+from faintfield.recon.depth.best_focus import SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
 
 type Scene = Callable[[NDArray[np.floating], NDArray[np.floating], float], NDArray[np.floating]]
 

@@ -3,15 +3,15 @@
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from recon.data_fit import DataFit
-from recon.held_out import chosen_weight
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
-from recon.penalties import Penalty
-from recon.plane import PlaneGrid
-from recon.pmlem import pmlem
-from recon.posed import PosedPlane
-from recon.solvers import smooth_start, universal_penalty_weight
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.cross_validation import chosen_weight
+from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.problem import PosedPlane
+from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
 
 SIZE = 48
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from recon.metrics import (
+from faintfield.recon.metrics import (
     expected_snr_from_powers,
     mean_square_error,
     noise_variance_e2,

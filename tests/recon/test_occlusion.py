@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from recon.occlusion import opacity, transmission
-from recon.plane import PlaneGrid
-from recon.scene import SceneOperator
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import opacity, transmission
+from faintfield.recon.operator.scene import SceneOperator
 
 
 def test_what_shines_is_opaque_and_faint_ghosts_are_not() -> None:

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from calib.lens import Lens
-from recon.blocks import EDGE_TOLERANCE
-from recon.errors import GeometryMismatch
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
-from rig.simulation.optics import SimulatedOptics
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.lens import Lens
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.blocks import EDGE_TOLERANCE
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.rig.simulation.optics import SimulatedOptics
 
 type LinearOperatorCheck = Callable[[PlaneOperator], Image]
 

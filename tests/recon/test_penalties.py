@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recon.images import Image
-from recon.penalties import total_variation, total_variation_gradient
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.solver.penalties import total_variation, total_variation_gradient
 
 planes = st.tuples(
     st.integers(2, 7), st.integers(2, 7), st.sampled_from([1e-3, 1.0, 1e3]), st.integers(0, 2**32 - 1)

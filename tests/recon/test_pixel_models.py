@@ -8,9 +8,15 @@ import pytest
 from scipy.special import gammaln, logsumexp
 from scipy.stats import norm, poisson
 
-from recon import elementary
-from recon.images import Image
-from recon.pixel_models import LEAST_SQUARES, POISSON_GAUSSIAN, SHIFTED_POISSON, WORK_ROWS, form_ratio
+from faintfield.recon import elementary
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.pixel_models import (
+    LEAST_SQUARES,
+    POISSON_GAUSSIAN,
+    SHIFTED_POISSON,
+    WORK_ROWS,
+    form_ratio,
+)
 
 PIXELS = 100
 PRECISIONS = [(np.float32, 3e-6), (np.float64, 1e-10)]

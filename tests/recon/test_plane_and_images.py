@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recon.images import ElementalImages
-from recon.plane import PlaneGrid
+from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.operator.grid import PlaneGrid
 
 
 def test_sample_indices_count_pitches_from_the_first_samples_centre() -> None:

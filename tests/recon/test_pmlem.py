@@ -7,14 +7,14 @@ from itertools import islice, pairwise
 import numpy as np
 import pytest
 
-from recon.data_fit import DataFit
-from recon.errors import NotConverged
-from recon.images import Image, LikelihoodName
-from recon.operator import PlaneOperator
-from recon.penalties import Penalty
-from recon.plane import PlaneGrid
-from recon.pmlem import PmlemIterate, norm, pmlem
-from recon.solvers import smooth_start
+from faintfield.recon.errors import NotConverged
+from faintfield.recon.likelihood.images import Image, LikelihoodName
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.pmlem import PmlemIterate, norm, pmlem
+from faintfield.recon.solver.starts import smooth_start
 from tests.recon.small_problems import (
     SHAPE,
     Problem,

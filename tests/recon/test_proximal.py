@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from recon.images import Image
-from recon.penalties import Penalty
-from recon.proximal import DualField, step_sizes
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.proximal import DualField, step_sizes
 
 TV = Penalty()
 

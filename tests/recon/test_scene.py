@@ -10,15 +10,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from calib.lens import Lens
-from recon import kernels
-from recon.blocks import BLOCK_PX
-from recon.errors import GeometryMismatch
-from recon.images import ElementalImages, Image
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
-from recon.scene import SceneOperator
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.lens import Lens
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator import kernels
+from faintfield.recon.operator.blocks import BLOCK_PX
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.scene import SceneOperator
 
 # Four blocks of pixels and a rest; poses in step with the planes, turned so that they are not, and far aside
 LENS = Lens((4 * BLOCK_PX + 9, 13), 300.0, 300.0, 130.2, 6.1, (-0.08, 0.02))

@@ -5,14 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from recon.held_out import chosen_weight
-from recon.images import ElementalImages, Image, Likelihood, LikelihoodName
-from recon.operator import PlaneOperator
-from recon.penalties import Penalty
-from recon.plane import PlaneGrid
-from recon.pmlem import PmlemIterate, pmlem
-from recon.posed import PosedPlane, PosedScene
-from recon.scene import SceneOperator
+from faintfield.recon.likelihood.images import ElementalImages, Image, Likelihood, LikelihoodName
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.scene import SceneOperator
+from faintfield.recon.solver.cross_validation import chosen_weight
+from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.problem import PosedPlane, PosedScene
 from tests.recon.small_problems import problem
 
 WEIGHT = 0.8

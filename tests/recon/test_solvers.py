@@ -10,13 +10,21 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm, poisson
 
-from recon.errors import NotConverged
-from recon.images import ElementalImages, Image
-from recon.one_step_late import Iterate, Step, mlem, oscillates, pmlem_one_step_late, settled, updated_samples
-from recon.operator import PlaneOperator
-from recon.penalties import total_variation, total_variation_gradient
-from recon.plane import PlaneGrid
-from recon.solvers import back_projection, smooth_start, universal_penalty_weight
+from faintfield.recon.errors import NotConverged
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.one_step_late import (
+    Iterate,
+    Step,
+    mlem,
+    oscillates,
+    pmlem_one_step_late,
+    settled,
+    updated_samples,
+)
+from faintfield.recon.solver.penalties import total_variation, total_variation_gradient
+from faintfield.recon.solver.starts import back_projection, smooth_start, universal_penalty_weight
 
 SHAPE = (9, 12)
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from pipelines.planes import Objective, Settings, certified, solve
-from recon.images import ElementalImages, Image
-from recon.penalties import Penalty, PenaltyName
-from recon.posed import PosedScene
-from recon.smoothing import blurred
-from recon.uncertainty import standard_deviation
+from faintfield.pipelines.reconstruction.planes import Objective, Settings, certified, solve
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.penalties import Penalty, PenaltyName
+from faintfield.recon.solver.problem import PosedScene
+from faintfield.recon.solver.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_held_out import dark_views
 from tests.recon.test_held_out import scene as pieces

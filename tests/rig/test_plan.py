@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.errors import KeepOutCrossed, OutsideTravel
-from rig.grid import centre_node
-from rig.plan import CapturePlan, Grid, Step
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.protocol import Box, MotionLimits, Point
-from rig.stages.workspace import Workspace
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
+from faintfield.rig.grid import centre_node
+from faintfield.rig.plan import CapturePlan, Grid, Step
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.protocol import Box, MotionLimits, Point
+from faintfield.rig.stages.workspace import Workspace
 
 GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
 STEPS = (

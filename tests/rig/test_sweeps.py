@@ -2,10 +2,10 @@
 
 import pytest
 
-from rig.plan import CapturePlan, Grid, Step
-from rig.session.frames import planned_frames
-from rig.stages.protocol import Point
-from rig.sweeps import board_doubts
+from faintfield.rig.capture.sweeps import board_doubts
+from faintfield.rig.plan import CapturePlan, Grid, Step
+from faintfield.rig.session.frames import planned_frames
+from faintfield.rig.stages.protocol import Point
 
 _GRID = Grid(3, 3, 50.0, Point(0.0, 0.0))
 _PLAN = CapturePlan.of(_GRID, [Step("charuco", (0.1,)), Step("charuco", (0.1,))], approach_mm=1.0, frame_bytes=1)

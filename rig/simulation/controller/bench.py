@@ -2,16 +2,16 @@
 
 from collections.abc import Callable
 
-from rig.simulation.controller.clock import SimulatedClock
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.link import DirectLink, Link
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.simulation.controller.wire import Wire
-from rig.stages.gantry import Gantry
-from rig.stages.opening import stage_from
-from rig.stages.protocol import Point
-from rig.stages.settings import StageSettings
-from rig.stages.transport import NoTrafficLog, Port, TrafficLog
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.link import DirectLink, Link
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.transport import NoTrafficLog, Port, TrafficLog
 
 type Firmware = SimulatedGrbl | SimulatedMarlin
 

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.simulation.controller.wire import Spoil
-from rig.stages.settings import ProtocolName
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.controller.wire import Spoil
+from faintfield.rig.stages.settings import ProtocolName
 
 type Nature = Literal["wire", "controller", "mechanics"]
 

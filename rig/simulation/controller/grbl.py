@@ -10,10 +10,10 @@ import re
 from collections import deque
 from collections.abc import Callable
 
-from rig.simulation.controller.clock import Event, SimulatedClock
-from rig.simulation.controller.kinematics import Axis, Mechanics, along
-from rig.simulation.controller.wire import Wire
-from rig.stages.settings import ProtocolName
+from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
+from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.stages.settings import ProtocolName
 
 DEFAULT_SETTINGS = {
     0: "10", 1: "255", 2: "0", 3: "0", 4: "0", 5: "0", 6: "0", 10: "1", 11: "0.010", 12: "0.002", 13: "0",

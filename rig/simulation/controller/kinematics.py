@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
 
 type Vector = tuple[float, ...]
 

@@ -10,8 +10,8 @@ import tty
 from pathlib import Path
 from typing import Protocol
 
-from rig.errors import StageLost
-from rig.stages.transport import Port, SerialPort
+from faintfield.rig.errors import StageLost
+from faintfield.rig.stages.transport import Port, SerialPort
 
 _REAL_BOUND_S = 10.0
 

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from rig.simulation.controller.clock import Event, SimulatedClock
-from rig.simulation.controller.kinematics import Axis, Mechanics, along
-from rig.simulation.controller.wire import Wire
-from rig.stages.settings import ProtocolName
+from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
+from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.stages.settings import ProtocolName
 
 _PLANNER_BLOCKS = 16
 _BUSY_EVERY_S = 2.0

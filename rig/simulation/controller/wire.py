@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
 
 _SECONDS_PER_BYTE = 10.0 / 115200.0
 _LATENCY_S = 0.002

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.board import Board
-from calib.geometry import BoardObservation, Target
-from rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
-from rig.simulation.boards import SimulatedBoard, six_boards
-from rig.simulation.experiment import paper_experiment
+from faintfield.calib.board import Board
+from faintfield.calib.geometry import BoardObservation, Target
+from faintfield.rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
+from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
+from faintfield.rig.simulation.experiment import paper_experiment
 
 NOISE_PX = 0.2
 OPTICS = paper_experiment(1600, 1200).optics

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.errors import NotIdentifiable, PoorFit, TooFewViews
-from calib.geometry import (
+from faintfield.calib.errors import NotIdentifiable, PoorFit, TooFewViews
+from faintfield.calib.geometry import (
     BoardObservation,
     GeometrySettings,
     Node,
@@ -18,11 +18,11 @@ from calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from calib.geometry.bundle import Problem, solve
-from calib.geometry.observations import gather
-from calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
-from calib.lens import Lens
-from rig.simulation.boards import SimulatedBoard, six_boards
+from faintfield.calib.geometry.bundle import Problem, solve
+from faintfield.calib.geometry.observations import gather
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
+from faintfield.calib.lens import Lens
+from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from tests.calib.geometry.simulated import BOARDS, NOISE_PX, OPTICS, Simulated, centres_mm, simulated
 
 LENIENT = GeometrySettings(most_transfer_sigma_px=20.0, most_holdout_ratio=10.0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.geometry import GeometrySettings, RigGeometry, calibrate_geometry
-from calib.geometry.stage import approach_directions, stage_report
-from rig.grid import grid_nodes
+from faintfield.calib.geometry import GeometrySettings, RigGeometry, calibrate_geometry
+from faintfield.calib.geometry.stage import approach_directions, stage_report
+from faintfield.rig.grid import grid_nodes
 from tests.calib.geometry.simulated import BOARDS, OPTICS, simulated
 
 NODES = grid_nodes(5, 5)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from calib.noise.selection import Likelihood
+from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
+from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
+from faintfield.calib.noise.selection import Likelihood
 from tests.calib.noise.darkroom import Chip, Frames, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from calib.noise import Conditions, Series, calibrate, measure_series
-from calib.noise.exact import PARAMETERS, Counts, exact_likelihood
-from calib.noise.mass import DARK_LOG_WEIGHTS, DARK_NODES, mass_function
-from calib.noise.selection import Likelihood
+from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
+from faintfield.calib.noise.exact import PARAMETERS, Counts, exact_likelihood
+from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, DARK_NODES, mass_function
+from faintfield.calib.noise.selection import Likelihood
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
-from calib.noise.gaussian import dark_variances_dn2, fit_gaussian, log_likelihood
-from calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
+from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
+from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, log_likelihood
+from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

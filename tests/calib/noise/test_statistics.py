@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from calib.errors import BadFrame, LightLeak, SaturatedFlat
-from calib.noise import Conditions, measure_series
+from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
+from faintfield.calib.noise import Conditions, measure_series
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 DARK = Conditions("dark", 1.0)

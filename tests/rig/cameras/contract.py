@@ -2,8 +2,8 @@
 
 import pytest
 
-from rig.cameras.protocol import Camera
-from rig.errors import CameraError
+from faintfield.rig.cameras.protocol import Camera
+from faintfield.rig.errors import CameraError
 
 
 def check_camera(camera: Camera, exposure_s: float) -> None:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rig.cameras.bounded import call_within
-from rig.cameras.folder import FolderCamera
-from rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
-from rig.cameras.micromanager import MicroManagerCamera
-from rig.cameras.protocol import CameraReport, Exposure
-from rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
-from rig.cameras.simulated import TRUE_POSE, SimulatedCamera
-from rig.errors import CameraError, CameraTimeout, MissingExtra
-from rig.simulation.controller.clock import SimulatedClock
-from rig.simulation.lab import SimulatedLab
-from rig.stages.protocol import Point
+from faintfield.rig.cameras.bounded import call_within
+from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
+from faintfield.rig.cameras.micromanager import MicroManagerCamera
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
+from faintfield.rig.cameras.simulated import TRUE_POSE, SimulatedCamera
+from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.stages.protocol import Point
 from tests.rig.cameras.contract import check_camera
 
 SEED = b"\xff\xd8 a picture, for all that the camera knows \xff\xd9"

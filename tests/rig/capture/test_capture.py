@@ -9,28 +9,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from rig.boards import Board
-from rig.cameras.protocol import Pixels
-from rig.cameras.settings import SimulatedSettings
-from rig.capture import Capture
-from rig.checks import check_frame
-from rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
-from rig.guide import TITLES, Answer, Prompt, Status, Wish, spoken_duration, step_prompt
-from rig.opening import open_rig
-from rig.plan import Grid
-from rig.session.frames import PlannedFrame, planned_frames
-from rig.session.journal import Journal
-from rig.session.opening import opened, taken_frames
-from rig.session.session import FrozenPlan
-from rig.session.verify import verify
-from rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
-from rig.settling import measure_settling
-from rig.simulation.controller.clock import SimulatedClock
-from rig.simulation.experiment import paper_experiment
-from rig.simulation.lab import SimulatedLab
-from rig.simulation.scene import render
-from rig.stages.protocol import Point
-from rig.survey import survey
+from faintfield.rig.boards import Board
+from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.capture.checks import check_frame
+from faintfield.rig.capture.guide import TITLES, Answer, Prompt, Status, Wish, spoken_duration, step_prompt
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
+from faintfield.rig.plan import Grid
+from faintfield.rig.session.access import opened, taken_frames
+from faintfield.rig.session.frames import PlannedFrame, planned_frames
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.simulation.scene import render
+from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, SMALL_RIG
 
 

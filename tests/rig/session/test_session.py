@@ -12,17 +12,17 @@ import msgspec
 import numpy as np
 import pytest
 
-from rig.errors import PlanRefused, SessionBusy, SessionCorrupt, SessionUnwritable
-from rig.opening import open_rig
-from rig.plan import CapturePlan
-from rig.session import journal as journal_module
-from rig.session.disk import set_aside, write_new
-from rig.session.frames import planned_frames
-from rig.session.journal import Journal
-from rig.session.opening import opened, read_plan, refuse_other_rig
-from rig.session.session import FrozenPlan
-from rig.session.verify import verify
-from rig.survey import survey
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.errors import PlanRefused, SessionBusy, SessionCorrupt, SessionUnwritable
+from faintfield.rig.plan import CapturePlan
+from faintfield.rig.session import journal as journal_module
+from faintfield.rig.session.access import opened, read_plan, refuse_other_rig
+from faintfield.rig.session.disk import set_aside, write_new
+from faintfield.rig.session.frames import planned_frames
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 
 

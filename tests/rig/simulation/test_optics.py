@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rig.simulation.optics import SimulatedOptics, distort
+from faintfield.rig.simulation.optics import SimulatedOptics, distort
 
 RATIONAL = (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3, -0.05, 0.01)
 

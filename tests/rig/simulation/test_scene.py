@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.homography import plane_from_ray
-from calib.lens import Lens
-from recon.operator import PlaneOperator
-from recon.plane import PlaneGrid
-from rig.simulation.optics import SimulatedOptics
-from rig.simulation.scene import TexturedPlane, View, render
+from faintfield.calib.homography import plane_from_ray
+from faintfield.calib.lens import Lens
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.rig.simulation.optics import SimulatedOptics
+from faintfield.rig.simulation.scene import TexturedPlane, View, render
 
 PINHOLE = SimulatedOptics((41, 31), 100.0, 100.0, 20.0, 15.0, vignetting=False)
 AT_REFERENCE = np.zeros(6)

@@ -1,9 +1,9 @@
 """What the tests of drivers share: a stage that is ready, and an ear on the wire."""
 
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.stages.gantry import Gantry
-from rig.stages.settings import StageSettings
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.settings import StageSettings
 
 
 class Traffic:

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from rig.stages.protocol import Point, Stage
+from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
+from faintfield.rig.stages.protocol import Point, Stage
 
 
 def check_stage(stage: Stage) -> None:

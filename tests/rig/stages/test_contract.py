@@ -4,14 +4,14 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rig.opening import open_stage
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.link import DirectLink, Link, PtyLink, SocketLink
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.conformance import conformance
-from rig.stages.protocol import Point
-from rig.stages.settings import StageSettings
+from faintfield.rig.devices import open_stage
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink, SocketLink
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.conformance import conformance
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.settings import StageSettings
 from tests.rig.stages.contract import check_stage
 
 type MakeBench = Callable[[], Bench]

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from rig.errors import NotHomed, PlanRefused, PositionDrifted, StageAlarm
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.drift import DriftWatch
-from rig.stages.gantry import Gantry
-from rig.stages.recovery import recover
+from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageAlarm
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.recovery import recover
 
 type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
 

@@ -5,18 +5,12 @@ from itertools import pairwise
 
 import pytest
 
-from rig.errors import (
-    OutsideTravel,
-    StageAlarm,
-    StageLost,
-    StageRejected,
-    WrongFirmware,
-)
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.stages.gantry import Gantry
-from rig.stages.protocol import Box, Point
-from rig.stages.settings import StageSettings
+from faintfield.rig.errors import OutsideTravel, StageAlarm, StageLost, StageRejected, WrongFirmware
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Box, Point
+from faintfield.rig.stages.settings import StageSettings
 from tests.rig.stages.benches import Traffic, grbl, homed
 
 

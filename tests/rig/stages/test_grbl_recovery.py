@@ -4,16 +4,10 @@ from functools import partial
 
 import pytest
 
-from rig.errors import (
-    NotHomed,
-    StageAlarm,
-    StageLost,
-    StageRejected,
-    StageTimeout,
-)
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.stages.protocol import Point
+from faintfield.rig.errors import NotHomed, StageAlarm, StageLost, StageRejected, StageTimeout
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.stages.protocol import Point
 from tests.rig.stages.benches import Traffic, grbl, homed
 
 

@@ -5,11 +5,11 @@ from functools import partial
 
 import pytest
 
-from rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.stages.protocol import Box, Point
-from rig.stages.settings import StageSettings
+from faintfield.rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.protocol import Box, Point
+from faintfield.rig.stages.settings import StageSettings
 from tests.rig.stages.benches import homed
 
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.stages import grbl_messages as grbl
-from rig.stages import marlin_messages as marlin
+from faintfield.rig.stages.grbl import messages as grbl
+from faintfield.rig.stages.marlin import messages as marlin
 
 GRBL_LINES = [
     "ok",

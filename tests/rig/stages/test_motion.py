@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.errors import KeepOutCrossed, OutsideTravel
-from rig.simulation.controller.kinematics import Profile
-from rig.stages.motion import duration_s, one_sided, path_duration_s, patience_s
-from rig.stages.protocol import Box, MotionLimits, Point
-from rig.stages.workspace import Workspace, segment_meets
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
+from faintfield.rig.simulation.controller.kinematics import Profile
+from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s, patience_s
+from faintfield.rig.stages.protocol import Box, MotionLimits, Point
+from faintfield.rig.stages.workspace import Workspace, segment_meets
 
 LIMITS = MotionLimits((100.0, 50.0), (500.0, 200.0))
 coordinates = st.floats(-300.0, 300.0).map(lambda value: round(value, 3))

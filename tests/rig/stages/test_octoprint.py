@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from rig.errors import StageAlarm, StageLost, StageTimeout
-from rig.opening import open_stage
-from rig.stages.gantry import Gantry
-from rig.stages.protocol import Point
-from rig.stages.settings import StageSettings
+from faintfield.rig.devices import open_stage
+from faintfield.rig.errors import StageAlarm, StageLost, StageTimeout
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Point
+from faintfield.rig.stages.settings import StageSettings
 from tests.rig.stages.contract import check_stage
 
 PYTHON = Path(__file__).parents[3] / "build" / "octoprint" / "bin" / "python"

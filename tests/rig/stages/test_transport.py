@@ -4,14 +4,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from rig.errors import StageLost, StageTimeout
-from rig.opening import open_stage
-from rig.simulation.controller.bench import Bench
-from rig.simulation.controller.clock import SimulatedClock
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
-from rig.stages.settings import StageSettings
-from rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
+from faintfield.rig.devices import open_stage
+from faintfield.rig.errors import StageLost, StageTimeout
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
+from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
 from tests.rig.stages.benches import Traffic
 
 

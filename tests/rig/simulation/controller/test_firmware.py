@@ -6,12 +6,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rig.simulation.controller.clock import SimulatedClock
-from rig.simulation.controller.grbl import SimulatedGrbl
-from rig.simulation.controller.marlin import SimulatedMarlin
-from rig.simulation.controller.server import serving
-from rig.simulation.controller.wire import Wire
-from rig.stages.transport import SerialPort
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.controller.server import serving
+from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.stages.transport import SerialPort
 
 
 class Terminal:

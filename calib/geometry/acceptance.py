@@ -1,0 +1,112 @@
+"""What the corners cannot carry is refused, by the transfer that they predict, with the reason and what to add."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.errors import LensNotInvertible, NotIdentifiable
+from faintfield.calib.geometry.observations import Observations
+from faintfield.calib.geometry.rig_geometry import RigGeometry
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, transfer_sigma_px
+
+_FEWEST_BOARDS = 3
+_FEWEST_NODES = 9
+_LEAST_TILT_RAD = np.radians(15)
+_LEAST_COVERAGE = 0.5
+_FARTHEST_OVER_DEPTH = 2.0
+_COVERAGE_CELLS = 6
+_MORE = "show more boards, nearer and tilted about both axes, or raise --limit-px"
+
+
+def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.float64]:
+    """Return σ in pixels (node, point) of the transfer by the plane across the axis at a depth.
+
+    It is NaN where a view does not see the point, and for the reference view, whose transfer to itself is exact.
+    """
+    covariances = [geometry.lens_and_pose_covariance(node) for node in range(len(geometry.nodes))]
+    rt_ref_plane = fronto_parallel_rt_ref_plane(depth_mm)
+    sigma_px = transfer_sigma_px(geometry.lens, geometry.rt_cam_ref, covariances, rt_ref_plane)
+    sigma_px[geometry.reference] = np.nan
+    return sigma_px
+
+
+def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
+    """Return the rms of σ over all nodes and points that are seen; infinite where it is no number."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = float(np.nanmean(np.square(sigma_px))) if np.isfinite(sigma_px).any() else np.inf
+    return float(np.sqrt(mean))
+
+
+def require_determined(
+    geometry: RigGeometry, observations: Observations, depths_mm: Sequence[float], limit_px: float
+) -> None:
+    """Refuse a geometry whose plane homographies are not known to the limit at some depth.
+
+    Raises
+    ------
+    NotIdentifiable
+        With the σ found, the limit, and what the boards lack.
+    """
+    for depth_mm in depths_mm:
+        try:
+            of_views_px = transfer_sigma_at(geometry, depth_mm)
+        except LensNotInvertible:  # a lens that nothing determines folds over itself
+            of_views_px = np.full((len(geometry.nodes), 1), np.inf)
+        _require_seen(of_views_px, depth_mm)
+        sigma_px = rms_over_views(of_views_px)
+        if not sigma_px <= limit_px:
+            raise NotIdentifiable(
+                f"plane at {depth_mm:g} mm: its transfer between views is known to {sigma_px:.3g} px only, "
+                f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
+                f"{'; '.join(lacks(geometry, observations, depth_mm) or [_MORE])}"
+            )
+
+
+def _require_seen(sigma_px: NDArray[np.float64], depth_mm: float) -> None:
+    """Refuse a plane that less than half of the views see anything of."""
+    seen, others = int((~np.isnan(sigma_px)).any(axis=1).sum()), len(sigma_px) - 1
+    if 2 * seen < others:
+        raise NotIdentifiable(
+            f"plane at {depth_mm:g} mm: {seen} of the {others} views beside the centre's see anything of it, limit "
+            "half; give --depth-mm in mm from the camera, or nodes that lie nearer to one another"
+        )
+
+
+def lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
+    """Return what the set lacks, each with what to add."""
+    found = []
+    boards = geometry.boards
+    if len(boards) < _FEWEST_BOARDS:
+        found.append(
+            f"{len(boards)} board pose(s) only: show at least {_FEWEST_BOARDS}, better 6, tilted by 20 to 40 degrees"
+        )
+    tilt_rad = max(_tilt_rad(board.rt_ref_board) for board in boards)
+    if tilt_rad < _LEAST_TILT_RAD:
+        found.append(
+            f"no board is tilted by more than {np.degrees(tilt_rad):.0f} degrees: "
+            "tilt some by 20 to 40 degrees, about both axes"
+        )
+    nearest_mm = min(float(board.rt_ref_board[5]) for board in boards)
+    if nearest_mm > _FARTHEST_OVER_DEPTH * depth_mm:
+        found.append(f"the nearest board stands at {nearest_mm:.0f} mm: bring some to about {depth_mm:g} mm")
+    if len(geometry.nodes) < _FEWEST_NODES:
+        found.append(f"{len(geometry.nodes)} node(s) only: take at least {_FEWEST_NODES}")
+    coverage = _coverage(observations, geometry.lens.size_px)
+    if coverage < _LEAST_COVERAGE:
+        found.append(f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones")
+    return found
+
+
+def _tilt_rad(rt_ref_board: NDArray[np.float64]) -> float:
+    """Return the angle between a board and the detector."""
+    rotation = np.asarray(cv2.Rodrigues(np.ascontiguousarray(rt_ref_board[:3]))[0])
+    return float(np.arccos(min(abs(rotation[2, 2]), 1.0)))
+
+
+def _coverage(observations: Observations, size_px: tuple[int, int]) -> float:
+    """Return the share of the image's cells, 6 x 6, in which some corner was seen."""
+    pixels = observations.pixels[observations.weights > 0]
+    cells = np.clip((pixels / np.array(size_px) * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
+    return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2

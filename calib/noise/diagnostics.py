@@ -1,0 +1,118 @@
+"""What is wrong with the frames: refused where nothing can be told, a warning in the result where something can."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import stats
+
+from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
+from faintfield.calib.noise.fitting import Fitted
+from faintfield.calib.noise.result import TransferPoint
+from faintfield.calib.noise.selection import Likelihood
+from faintfield.calib.noise.statistics import Series
+
+# Fewer pixels leave the spreads over pixels, and so everything, to chance.
+_LEAST_PIXELS = 256
+
+# A model that the series contradict this improbably is wrong; by less than this fraction it does not matter.
+_CONTRADICTION, _CONTRADICTION_SIGMA, _NEGLIGIBLE = 1e-4, 6.0, 0.02
+
+
+def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
+    """Refuse series from which nothing can be told.
+
+    Raises
+    ------
+    NotIdentifiable
+        There is no dark.
+    TooFewFrames
+        No exposure has two frames, a light level has one, or the frames are too small.
+    CopiedFrame
+        Two frames are the same.
+    """
+    if not darks:
+        raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
+    seen: dict[bytes, str] = {}
+    for one in (*darks, *flats):
+        for digest, name in zip(one.digests, one.names, strict=True):
+            if digest in seen:
+                raise CopiedFrame(
+                    f"{name} and {seen[digest]}: the same frame twice, pixel for pixel; noise never repeats: record "
+                    "it again, or leave one out"
+                )
+            seen[digest] = name
+    if all(one.frames < 2 for one in darks):
+        raise TooFewFrames(
+            f"{darks[0].names[0]}: the only one of the {darks[0].conditions}, and no exposure has two dark frames, so "
+            "that noise and pattern cannot be told apart; record at least 2 of one exposure, better 10 of each"
+        )
+    for one in flats:
+        if one.frames < 2:
+            raise TooFewFrames(
+                f"{one.names[0]}: the only one of the {one.conditions}; photon transfer needs 2 frames at least of "
+                "each light level: record another or leave it out"
+            )
+    pixels = darks[0].pattern_dn.size
+    if pixels < _LEAST_PIXELS or min(darks[0].pattern_dn.shape) < 8:
+        raise TooFewFrames(
+            f"frames of {pixels} pixels: {_LEAST_PIXELS} and 8 rows and columns are the least; "
+            "record larger frames, or widen the region"
+        )
+
+
+def frame_doubts(fitted: Fitted) -> list[str]:
+    """Return what is doubtful about the darks."""
+    warnings = [
+        f"{one.names[0]}: the only one of the {one.conditions}; it tells the mean but no noise: record at least 2"
+        for one in fitted.darks
+        if one.frames < 2
+    ]
+    if fitted.likelihood is Likelihood.CENSORED:
+        warnings.append(
+            "values are cut off at the black level: offset and dark current are given for the sensor, not per pixel; "
+            "raise the camera's black offset if it has one"
+        )
+    return warnings
+
+
+def level_doubt(fitted: Fitted) -> str | None:
+    """Return a warning where the dark levels do not lie on a straight line over exposure time."""
+    moments, values = fitted.moments, fitted.fit.values
+    darks = moments.darks
+    within = float((darks.frames - 1).sum())
+    free = np.unique(darks.exposure_s).size - 2
+    if fitted.likelihood is Likelihood.CENSORED or free < 1 or within < 1:
+        return None
+    noise = np.array(fitted.dark_noise_dn2) / moments.pixels
+    jitter = max(float(darks.level_scatter_dn2.sum()) / within - float(noise.mean()), 0.0)
+    weight = darks.frames / (jitter + noise)
+    slope, offset = np.polyfit(darks.exposure_s, darks.mean_dn, 1, w=np.sqrt(weight))
+    residual = darks.mean_dn - offset - slope * darks.exposure_s
+    chance = float(stats.f.sf(float(weight @ residual**2) / free, free, within))
+    worst = int(np.abs(residual).argmax())
+    span = abs(slope) * float(np.ptp(darks.exposure_s)) + np.sqrt(np.exp(values["log_read_dn2"]))
+    if chance > _CONTRADICTION or abs(residual[worst]) < _NEGLIGIBLE * span:
+        return None
+    return (
+        f"the dark level against exposure time is no straight line: that at {darks.exposure_s[worst]:g} s is "
+        f"{residual[worst]:+.2f} DN off it (probability {chance:.1g}); the temperature or the black level drifted, or "
+        "light leaked in: let the camera settle and record the exposures in turn"
+    )
+
+
+def noise_doubt(fitted: Fitted, points: Sequence[TransferPoint]) -> str | None:
+    """Return a warning where a series is noisier or quieter than eq. (1) allows."""
+    if fitted.likelihood is Likelihood.CENSORED:
+        return None
+    measured = [point for point in points if point.frames > 1]
+    excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point in measured]
+    worst = int(np.abs(excess).argmax())
+    point = measured[worst]
+    sigmas = abs(point.variance_dn2 - point.model_variance_dn2) / point.variance_se_dn2
+    if abs(excess[worst]) < _NEGLIGIBLE or sigmas < _CONTRADICTION_SIGMA:
+        return None
+    return (
+        f"the noise of the {point.kind}s of {point.exposure_s:g} s is {100 * excess[worst]:+.1f} % off the model's in "
+        f"variance ({sigmas:.0f} standard errors): the noise of the camera changed between series, or the light was "
+        "not steady; record them again in one go"
+    )

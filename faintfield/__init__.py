@@ -1,0 +1,1 @@
+"""See in the dark: photon-starved integral imaging, calibrated and reconstructed in 3D."""

@@ -1,0 +1,1 @@
+"""From frames to what is known of the camera: its noise, its lens and poses."""

@@ -1,0 +1,1 @@
+"""`faintfield export`: sets and results become files of other people's programs."""

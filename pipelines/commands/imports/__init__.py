@@ -1,0 +1,1 @@
+"""`faintfield import`: other people's files become a set."""

@@ -1,0 +1,228 @@
+"""`faintfield stage`: bring up a stage by hand, with the driver that captures with it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+from cyclopts import App, Parameter
+from rich.table import Table
+
+from faintfield.pipelines.console import console, say
+from faintfield.pipelines.errors import BadValue, WrongUsage
+from faintfield.pipelines.formats.toml_files import read_toml
+from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
+from faintfield.rig.errors import StageUnfit
+from faintfield.rig.simulation.controller.server import serving
+from faintfield.rig.stages.conformance import Check, conformance
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Identity, Point, Position
+from faintfield.rig.stages.settings import StageSettings
+
+app = App(
+    name="stage",
+    help="Bring up a stage: ask it, home it, move it, try it.",
+    help_epilogue="Example: faintfield stage test --port simulated:grbl",
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Connection:
+    """Which stage to talk to: a port, or the stage of a rig.toml.
+
+    Parameters
+    ----------
+    port
+        Serial device, pyserial URL, or simulated:grbl, simulated:marlin.
+    protocol
+        What the controller at the port speaks; grbl by default.
+    baud
+        Bits per second; 115200 by default.
+    rig
+        Take the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
+    """
+
+    port: str | None = None
+    protocol: Literal["grbl", "marlin"] | None = None
+    baud: int | None = None
+    rig: Path | None = None
+
+    def settings(self) -> StageSettings:
+        """Return the settings of the stage that is meant."""
+        stated = [name for name in ("port", "protocol", "baud") if getattr(self, name) is not None]
+        if self.rig is not None:
+            if stated:
+                raise WrongUsage(f"--rig says all there is to say of the stage; leave out --{stated[0]}, or --rig")
+            return stage_table(self.rig)
+        if self.port is None:
+            raise WrongUsage(
+                "no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml"
+            )
+        if self.port.startswith(SIMULATED):
+            if self.protocol is not None:
+                raise WrongUsage(f"--port {self.port} says what it speaks; leave out --protocol")
+            if self.port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
+                raise WrongUsage(
+                    f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
+                )
+        return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
+
+
+class _RigFile(msgspec.Struct):
+    """The part of a rig.toml that a stage needs; the rest is for others to read."""
+
+    stage: StageSettings
+
+
+def stage_table(path: Path) -> StageSettings:
+    """Return the `[stage]` table of a rig.toml.
+
+    Raises
+    ------
+    MissingFile, BadValue, UnknownKey
+        With the file's name and what is wrong in it.
+    """
+    return read_toml(path, _RigFile).stage
+
+
+@app.command(sort_key=1)
+def info(connection: Connection = Connection()) -> Identity:
+    """Say who the controller is and how it is set; nothing moves."""
+    with _connected(connection) as stage:
+        identity = stage.identify()
+        say(f"{identity.firmware}, travel {stage.travel()}")
+        rates = " and ".join(f"{60.0 * rate:g}" for rate in identity.motion.rate_mm_per_s)
+        say(f"rates {rates} mm/min; a position counts as reached within {max(identity.tolerance_mm):.4f} mm")
+        return identity
+
+
+@app.command(sort_key=3)
+def home(connection: Connection = Connection()) -> Position:
+    """Find the switches."""
+    with _connected(connection) as stage:
+        homing = stage.home()
+        say(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
+        return homing.position
+
+
+@app.command(sort_key=4)
+def goto(
+    x_mm: float,
+    y_mm: float,
+    *,
+    home: Annotated[bool, Parameter(negative=())] = False,
+    connection: Connection = Connection(),
+) -> Position:
+    """Go to a position in machine coordinates, and verify it.
+
+    Parameters
+    ----------
+    x_mm
+        Position along the first axis.
+    y_mm
+        Position along the second axis.
+    home
+        Home first. Needed, since opening the port restarts most controllers.
+    """
+    with _connected(connection) as stage:
+        stage.workspace().check_path([Point(x_mm, y_mm)])
+        if home:
+            stage.home()
+        position = stage.move_to(x_mm, y_mm)
+        say(f"arrived at {position.point}")
+        return position
+
+
+@app.command(sort_key=2)
+def jog(
+    dx_mm: float,
+    dy_mm: float,
+    *,
+    unlock: Annotated[bool, Parameter(negative=())] = False,
+    connection: Connection = Connection(),
+) -> Position:
+    """Move by at most 10 mm without homing, to find out which way the axes go.
+
+    Parameters
+    ----------
+    dx_mm
+        Distance along the first axis.
+    dy_mm
+        Distance along the second axis.
+    unlock
+        Clear the lock that GRBL keeps until it is homed.
+    """
+    with _connected(connection) as stage:
+        position = stage.jog(dx_mm, dy_mm, unlock=unlock)
+        say(f"reported at {position.point}; not homed, so this says nothing of where it is")
+        return position
+
+
+@app.command(name="test", sort_key=5)
+def conform(connection: Connection = Connection()) -> list[Check]:
+    """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves.
+
+    Raises
+    ------
+    StageUnfit
+        Something was not as it must be; the table says what.
+    """
+    with _connected(connection) as stage:
+        checks = []
+        for check in conformance(stage):
+            say(f"tried: {check.name}")
+            checks.append(check)
+    console.print(_table(checks))
+    failed = [check for check in checks if not check.passed]
+    if failed:
+        raise StageUnfit(
+            "; ".join(f"{check.name}: {check.measured}, and {check.limit} is asked for" for check in failed)
+            + "; mend that before a capture (docs/stage.md)"
+        )
+    return checks
+
+
+@app.command(sort_key=6)
+def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
+    """Serve a simulated controller on a port, for other programs, until Ctrl-C ends it.
+
+    Parameters
+    ----------
+    protocol
+        What it speaks.
+    speed
+        How many simulated seconds pass in a real one.
+    """
+    with serving(SIMULATED_FIRMWARE[protocol]) as server:
+        say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
+        with suppress(KeyboardInterrupt):
+            server.run(speed)
+
+
+@contextmanager
+def _connected(connection: Connection) -> Iterator[Gantry]:
+    """Connect to a stage, say what should be changed in it, and give the port back in the end."""
+    try:
+        settings = connection.settings()
+    except ValueError as failure:
+        raise BadValue(f"{failure}") from failure
+    stage = open_stage(settings)
+    stage.connect()
+    try:
+        for warning in stage.identify().warnings:
+            say(f"warning: {warning}")
+        yield stage
+    finally:
+        stage.close()
+
+
+def _table(checks: list[Check]) -> Table:
+    """Return the checks as a table for people."""
+    table = Table("", "check", "measured", "limit")
+    for check in checks:
+        mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
+        table.add_row(mark, check.name, check.measured, check.limit)
+    return table

@@ -1,0 +1,1 @@
+"""Everything that is read or written and has a format."""

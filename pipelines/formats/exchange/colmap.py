@@ -1,0 +1,211 @@
+"""COLMAP's sparse models, text and binary: cameras and images; their points are not read.
+
+COLMAP puts the first pixel's centre at (0.5, 0.5), this project at (0, 0); the principal points returned and taken here
+are this project's. Poses are `x_cam = R(q) x_world + t` with q = (w, x, y, z), in the model's own unit.
+"""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import write_whole
+
+# Name, number of parameters, by COLMAP's number of the model.
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
+    6: ("FULL_OPENCV", 12),
+}
+_NUMBERS = {name: number for number, (name, _) in _MODELS.items()}
+_HALF_PX = 0.5
+
+# All that a model is written to.
+MODEL_FILES = [f"{part}{suffix}" for part in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")]
+
+
+@dataclass(frozen=True)
+class ColmapImage:
+    """One image: its file's name, its camera's number, and its pose (6,), Rodrigues rad and the model's unit."""
+
+    name: str
+    camera: int
+    rt_cam_world: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A sparse model without its points."""
+
+    lenses: dict[int, Lens]
+    images: list[ColmapImage]
+
+
+def read_model(folder: Path) -> ColmapModel:
+    """Read cameras and images, binary where there are both.
+
+    Raises
+    ------
+    MissingFile
+        The folder holds neither cameras.bin nor cameras.txt, or no images beside them.
+    BadValue
+        A file is damaged, an image's camera is missing, or a camera's model has no counterpart here.
+    """
+    cameras, images = model_files(folder)
+    read_cameras, read_images = _READERS[cameras.suffix]
+    try:
+        model = ColmapModel(read_cameras(cameras), read_images(images))
+    except (struct.error, ValueError, LookupError, OverflowError, OSError) as failure:
+        raise BadValue(f"{folder}: is not a COLMAP model that can be read ({failure}); export it again") from failure
+    for image in model.images:
+        if image.camera not in model.lenses:
+            raise BadValue(
+                f"{images}: {image.name} was taken with camera {image.camera}, and {cameras.name} has "
+                f"{', '.join(map(str, model.lenses)) or 'none'}; export the whole model"
+            )
+    return model
+
+
+def model_files(folder: Path) -> tuple[Path, Path]:
+    """Return the files of a model that are read, its cameras and its images: binary where there are both."""
+    for suffix in (".bin", ".txt"):
+        cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
+        if cameras.is_file():
+            if not images.is_file():
+                raise MissingFile(f"{images}: no such file; export the whole model")
+            return cameras, images
+    raise MissingFile(f"{folder}: holds no cameras.bin or cameras.txt; name the folder of a COLMAP sparse model")
+
+
+def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
+    """Write cameras, images and an empty list of points, in text or binary."""
+    images = [(number, image, _quaternion(image)) for number, image in enumerate(model.images, start=1)]
+    if not binary:
+        spaced = [image.name for image in model.images if len(image.name.split()) > 1]
+        if spaced:
+            raise BadValue(f"'{spaced[0]}': of a name in a text model COLMAP reads what precedes a space; use --binary")
+        lines = [
+            f"{n} {name} {w} {h} {' '.join(map(repr, p))}" for n, name, w, h, p in map(_camera, model.lenses.items())
+        ]
+        write_whole(folder / "cameras.txt", "\n".join(lines) + "\n")
+        lines = []
+        for number, image, quaternion in images:
+            numbers = " ".join(map(repr, [*quaternion, *image.rt_cam_world[3:].tolist()]))
+            lines += [f"{number} {numbers} {image.camera} {image.name}", ""]
+        write_whole(folder / "images.txt", "\n".join(lines) + "\n")
+        write_whole(folder / "points3D.txt", "")
+        return
+    content = struct.pack("<Q", len(model.lenses))
+    for number, name, width, height, parameters in map(_camera, model.lenses.items()):
+        content += struct.pack(f"<iiQQ{len(parameters)}d", number, _NUMBERS[name], width, height, *parameters)
+    write_whole(folder / "cameras.bin", content)
+    content = struct.pack("<Q", len(images))
+    for number, image, quaternion in images:
+        content += struct.pack("<i7di", number, *quaternion, *image.rt_cam_world[3:], image.camera)
+        content += image.name.encode() + b"\0" + struct.pack("<Q", 0)
+    write_whole(folder / "images.bin", content)
+    write_whole(folder / "points3D.bin", struct.pack("<Q", 0))
+
+
+def _lens(model: str, width: int, height: int, numbers: list[float]) -> Lens:
+    """Return a camera of COLMAP as a lens."""
+    if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
+        numbers = [numbers[0], *numbers]  # one focal length for both axes
+    fx_px, fy_px, cx_px, cy_px, *distortion = numbers
+    if model in ("SIMPLE_RADIAL", "RADIAL"):
+        distortion = [*distortion, 0.0][:2]
+    return Lens((width, height), fx_px, fy_px, cx_px - _HALF_PX, cy_px - _HALF_PX, tuple(distortion))
+
+
+def _camera(numbered: tuple[int, Lens]) -> tuple[int, str, int, int, list[float]]:
+    """Return a lens as a camera of COLMAP: number, model, width, height, parameters."""
+    number, lens = numbered
+    distortion = [*lens.distortion, *[0.0] * (8 - len(lens.distortion))]
+    core = [lens.fx_px, lens.fy_px, lens.cx_px + _HALF_PX, lens.cy_px + _HALF_PX]
+    name = "FULL_OPENCV" if any(distortion[4:]) else "OPENCV" if any(distortion) else "PINHOLE"
+    return number, name, *lens.size_px, [*core, *distortion][: _MODELS[_NUMBERS[name]][1]]
+
+
+def _pose(quaternion: tuple[float, ...], translation: tuple[float, ...]) -> NDArray[np.float64]:
+    w, x, y, z = quaternion
+    return np.append(Rotation.from_quat([x, y, z, w]).as_rotvec(), translation)
+
+
+def _quaternion(image: ColmapImage) -> list[float]:
+    x, y, z, w = Rotation.from_rotvec(image.rt_cam_world[:3]).as_quat().tolist()
+    return [w, x, y, z]
+
+
+def _model_name(path: Path, model: str | int) -> str:
+    """Return the name of a camera model of which we know the name or COLMAP's number."""
+    number = _NUMBERS.get(model) if isinstance(model, str) else model
+    if number not in _MODELS:
+        raise BadValue(
+            f"{path}: camera model {model} has no counterpart here; let COLMAP undistort the images "
+            f"(image_undistorter), or fit {', '.join(_NUMBERS)}"
+        )
+    return _MODELS[number][0]
+
+
+def _lines(path: Path) -> list[str]:
+    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+
+
+def _cameras_text(path: Path) -> dict[int, Lens]:
+    lenses = {}
+    for line in filter(str.strip, _lines(path)):
+        number, model, width, height, *numbers = line.split()
+        name = _model_name(path, model)
+        lenses[int(number)] = _lens(name, int(width), int(height), [float(text) for text in numbers])
+    return lenses
+
+
+def _images_text(path: Path) -> list[ColmapImage]:
+    images = []
+    for line in _lines(path)[::2]:  # every other line lists points, and may be empty
+        if line.strip():
+            _, *numbers, camera, name = line.split(maxsplit=9)
+            values = tuple(float(text) for text in numbers)
+            images.append(ColmapImage(name, int(camera), _pose(values[:4], values[4:])))
+    return images
+
+
+def _cameras_binary(path: Path) -> dict[int, Lens]:
+    lenses = {}
+    with path.open("rb") as file:
+        for _ in range(int(_take(file, "Q")[0])):
+            number, model, width, height = _take(file, "iiQQ")
+            name = _model_name(path, int(model))
+            numbers = _take(file, f"{_MODELS[int(model)][1]}d")
+            lenses[int(number)] = _lens(name, int(width), int(height), list(numbers))
+    return lenses
+
+
+def _images_binary(path: Path) -> list[ColmapImage]:
+    images = []
+    with path.open("rb") as file:
+        for _ in range(int(_take(file, "Q")[0])):
+            _, *numbers, camera = _take(file, "i7di")
+            name = b""
+            while (letter := file.read(1)) not in (b"\0", b""):
+                name += letter
+            points = int(_take(file, "Q")[0])
+            file.seek(points * struct.calcsize("<ddq"), 1)
+            images.append(ColmapImage(name.decode(), int(camera), _pose(tuple(numbers[:4]), tuple(numbers[4:]))))
+    return images
+
+
+def _take(file: BinaryIO, layout: str) -> tuple[float, ...]:
+    return struct.unpack(f"<{layout}", file.read(struct.calcsize(f"<{layout}")))
+
+
+_READERS = {".bin": (_cameras_binary, _images_binary), ".txt": (_cameras_text, _images_text)}

@@ -1,0 +1,152 @@
+"""An elemental set made of pictures that lie elsewhere: copied, with the lens and the poses that others found."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.errors import BadValue, WrongBitDepth, WrongSize
+from faintfield.pipelines.formats.files import building_folder, sha256, write_json
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME, Camera, ElementalSet, Noise, View, write_set
+
+
+@dataclass(frozen=True)
+class PosedImage:
+    """An image, its lens, and the camera's pose in a world of any origin, (6,), Rodrigues rad and mm."""
+
+    path: Path
+    lens: Lens
+    rt_cam_world: NDArray[np.float64]
+    node: tuple[int, int] | None = None
+
+
+def write_imported_set(
+    out: Path,
+    images: Sequence[PosedImage],
+    *,
+    reference: int,
+    noise: Noise,
+    exposure_s: float | None,
+    command: str,
+    options: dict[str, Any],
+    models: Sequence[Path] = (),
+    overwrite: bool,
+) -> None:
+    """Copy images into an elemental set whose frame is that of one of them.
+
+    Parameters
+    ----------
+    reference : int
+        Index of the image whose frame is the set's.
+    noise : Noise
+        What is known of the sensor; what pictures say of themselves (saturation, black level) is filled in.
+    exposure_s : float, optional
+        Of each image; where it is None, what the first one states.
+    models : sequence of Path
+        The files that lens and poses were read from, for the record; nothing that is read is overwritten.
+
+    Raises
+    ------
+    BadValue
+        The lenses differ in more than their principal points, or two images would have one name.
+    WrongSize, WrongBitDepth
+        The images are not alike, or not of the size of their lens.
+    """
+    lens = images[reference].lens
+    first = read_picture(images[0].path)
+    _check_lenses([image.lens for image in images], images[0].path, first)
+    exposure_s = exposure_s or first.exposure_s
+    if exposure_s is None:
+        say("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
+        exposure_s = 1.0
+    noise = msgspec.structs.replace(
+        noise,
+        offset_dn=0.0 if noise.offset_dn is None and first.black_dn is None else noise.offset_dn,
+        saturation_dn=first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max),
+    )
+    inputs = [*models, *(image.path for image in images)]
+    with building_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
+        views = [
+            _view(_copy(image.path, folder, first), image, images[reference])
+            for image in progress(images, "copying pictures")
+        ]
+        camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+        write_set(folder, ElementalSet(1, exposure_s, reference, camera, noise, views))
+        hashes = {path.name: sha256(path) for path in inputs}
+        write_json(folder / "provenance.json", provenance(command, options, hashes))
+
+
+def read_picture(path: Path) -> Frame:
+    """Read a picture whose pixels are what a camera's are."""
+    frame = read_frame(path)
+    if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
+        raise BadValue(
+            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted; convert it"
+        )
+    return frame
+
+
+def relative(rt_cam_world: NDArray[np.float64], rt_ref_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rt_cam_ref (6,): a camera's pose relative to another's."""
+    cam, ref = (np.asarray(cv2.Rodrigues(np.asarray(rt[:3], np.float64))[0]) for rt in (rt_cam_world, rt_ref_world))
+    rotation = cam @ ref.T
+    return np.append(cv2.Rodrigues(rotation)[0].ravel(), rt_cam_world[3:] - rotation @ rt_ref_world[3:])
+
+
+def _check_lenses(lenses: Sequence[Lens], path: Path, first: Frame) -> None:
+    """Refuse several lenses, and a lens of another size than the first picture."""
+    count = len({replace(lens, cx_px=0.0, cy_px=0.0) for lens in lenses})
+    if count > 1:
+        raise BadValue(
+            f"{path}: it and the others have {count} lenses; one camera on a gantry is one lens, of which only the "
+            "principal point may differ; calibrate all images as one camera (COLMAP: ImageReader.single_camera)"
+        )
+    height, width = first.pixels_dn.shape[:2]
+    if (width, height) != lenses[0].size_px:
+        raise WrongSize(
+            f"{path}: is {width} x {height} px, its lens {lenses[0].size_px[0]} x {lenses[0].size_px[1]} px; "
+            "name the folder of the images that were calibrated"
+        )
+
+
+def _view(name: str, image: PosedImage, reference: PosedImage) -> View:
+    """Return an image as a view; a principal point that is the camera's is not said again."""
+    rx, ry, rz, x, y, z = relative(image.rt_cam_world, reference.rt_cam_world).tolist()
+    own = {key: getattr(image.lens, key) for key in ("cx_px", "cy_px")}
+    own = {key: value for key, value in own.items() if value != getattr(reference.lens, key)}
+    return View(name, (rx, ry, rz, x, y, z), image.node, **own)
+
+
+def _copy(path: Path, folder: Path, first: Frame) -> str:
+    """Copy a picture as it is, or as 16-bit TIFF when it has 8 bits; return its name in the set."""
+    pixels = read_picture(path).pixels_dn
+    if pixels.shape != first.pixels_dn.shape:
+        raise WrongSize(
+            f"{path}: is {pixels.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "
+            "all must be alike; take it again or leave it out"
+        )
+    if pixels.dtype != first.pixels_dn.dtype:
+        raise WrongBitDepth(
+            f"{path}: has {8 * pixels.itemsize} bits per pixel, the first picture {8 * first.pixels_dn.itemsize}; "
+            "they are full at one value in a set; export all of them alike"
+        )
+    as_it_is = path.suffix.lower() in RAW_SUFFIXES or pixels.dtype == np.uint16
+    name = path.name if as_it_is else f"{path.stem}.tiff"
+    if (folder / name).exists():
+        raise BadValue(f"{path}: would become {name} like another picture; give it another name")
+    if as_it_is:
+        shutil.copyfile(path, folder / name)
+    else:
+        write_frame(folder / name, pixels.astype(np.uint16))
+    return name

@@ -1,0 +1,87 @@
+"""What other programs' models have in common: images posed in a world of their own, in a unit of their own."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.console import say
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
+from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, Noise
+
+
+def import_posed(
+    out: Path,
+    models: Sequence[Path],
+    images: Sequence[PosedImage],
+    *,
+    mm_per_unit: float,
+    reference: str | None,
+    exposure_s: float | None,
+    command: str,
+    overwrite: bool,
+) -> dict[str, Any]:
+    """Make an elemental set of images posed in units of `mm_per_unit` by the files `models`; return what is said of it.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        An image is missing, a pose is not finite, or the reference is none of the images.
+    """
+    for image in images:
+        if not image.path.is_file():
+            raise MissingFile(
+                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
+            )
+        if not np.isfinite(image.rt_cam_world).all():
+            raise BadValue(
+                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
+            )
+    scale = np.repeat([1.0, mm_per_unit], 3)
+    images = [
+        replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
+        for image, node in zip(images, _nodes(images), strict=True)
+    ]
+    index = _reference(images, reference)
+    write_imported_set(
+        out,
+        images,
+        reference=index,
+        noise=Noise(gain_dn_per_e=1.0, read_noise_e=0.0),
+        exposure_s=exposure_s,
+        command=command,
+        options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
+        models=models,
+        overwrite=overwrite,
+    )
+    say(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
+    return {"out": str(out), "views": len(images), "reference": images[index].path.name}
+
+
+def lens_of_each_view(loaded: LoadedSet) -> list[Lens]:
+    """Return the lens of each view: the camera's, with the principal point of the view."""
+    return [replace(loaded.lens, cx_px=cx_px, cy_px=cy_px) for cx_px, cy_px in loaded.principal_points_px().tolist()]
+
+
+def _reference(images: Sequence[PosedImage], name: str | None) -> int:
+    """Return the image asked for, or that nearest to the middle of all cameras."""
+    if name is not None:
+        found = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
+        if not found:
+            raise BadValue(f"--reference {name}: is none of the {len(images)} images with a pose; name one of them")
+        return found[0]
+    centres = np.array([-cv2.Rodrigues(i.rt_cam_world[:3])[0].T @ i.rt_cam_world[3:] for i in images])
+    return int(np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
+
+
+def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
+    """Return the rows and columns in names such as view_r3_c12.tiff; names that are not of a grid say nothing."""
+    found = [re.search(r"r(\d+)_c(\d+)$", image.path.stem) for image in images]
+    nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
+    return nodes if len(set(nodes)) == len(images) else [None] * len(images)

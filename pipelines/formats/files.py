@@ -1,0 +1,238 @@
+"""Files written whole or not at all, and the fingerprints by which results name their inputs."""
+
+import errno
+import fcntl
+import hashlib
+import os
+import secrets
+import shutil
+import tempfile
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+
+from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
+
+# A short write of an array comes without a number: it, too, means that the disk is full.
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
+
+# How temporary names end; what still has one when nobody writes was left by a process that was killed.
+UNFINISHED = ".unfinished"
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[BinaryIO]:
+    """Open `path` for writing such that it appears whole, on disk, or not at all.
+
+    The bytes go to a temporary name in the same folder, are flushed to the disk, and take their name in one step.
+
+    Raises
+    ------
+    DiskFull, CannotWrite
+        In words, with the path; the temporary file is gone and what stood at `path` before still stands.
+    """
+    with reported_as_cannot_write(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # The name is known before the file is there: an interrupt at any moment finds what to remove
+        unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}{UNFINISHED}")
+        try:
+            with unfinished.open("xb") as file:
+                yield file
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(unfinished, path)
+        except BaseException:
+            unfinished.unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+
+
+def write_whole(path: Path, content: bytes | str) -> None:
+    """Write `content` to `path`, whole or not at all."""
+    with writing(path) as file:
+        file.write(content.encode() if isinstance(content, str) else content)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON-able value or msgspec Struct, indented for people, whole or not at all."""
+    write_whole(path, msgspec.json.format(msgspec.json.encode(value)) + b"\n")
+
+
+@contextmanager
+def building_folder(
+    out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = (), reads: Iterable[Path] = ()
+) -> Iterator[Path]:
+    """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
+
+    Parameters
+    ----------
+    out : Path
+        Where the folder will stand. It may exist when it is empty.
+    replace_if : str, optional
+        A file name by which a folder made earlier by the same command is known: such a folder is replaced, any other
+        is left alone.
+    replace_only : collection of str
+        Patterns of all the names that an earlier folder may hold to be replaced, where no one file is in each of them.
+    reads : paths
+        What the block reads: it must not be replaced.
+
+    Raises
+    ------
+    OutputExists
+        `out` holds something that would be lost.
+    """
+    out = out.resolve()
+    check_free(out, replace_if=replace_if, replace_only=replace_only)
+    for path in reads:
+        # A link counts both where it leads and where it lies
+        if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
+            raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
+    with reported_as_cannot_write(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        # The name is known before the folder is there: an interrupt at any moment finds what to remove
+        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
+        try:
+            building.mkdir(mode=0o700)
+            yield building
+            os.chmod(building, 0o777 & ~_umask())
+            _put_in_place(building, out)
+        except BaseException:
+            shutil.rmtree(building, ignore_errors=True)
+            raise
+        _sync_folder(out.parent)
+
+
+def _put_in_place(building: Path, out: Path) -> None:
+    """Give a folder its name; what had the name goes in one step, so that nobody sees it half removed."""
+    if not out.exists():
+        os.replace(building, out)
+        return
+    replaced = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    os.replace(out, replaced)
+    try:
+        os.replace(building, out)
+    except BaseException:
+        os.replace(replaced, out)
+        raise
+    shutil.rmtree(replaced, ignore_errors=True)
+
+
+def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = ()) -> None:
+    """Refuse `out` when it holds something, unless it holds the file `replace_if`, or only names of `replace_only`."""
+    if not out.exists() or (replace_if is not None and (out / replace_if).is_file()):
+        return
+    if not out.is_dir():
+        raise OutputExists(f"{out}: is a file, and a folder is to be written there; name another place")
+    held = sorted(path.name for path in out.iterdir())
+    kept = [name for name in held if not any(fnmatchcase(name, pattern) for pattern in replace_only)]
+    if kept:
+        named = ", ".join(kept[:3]) + (f" and {len(kept) - 3} more" if len(kept) > 3 else "")
+        raise OutputExists(f"{out}: holds files already ({named}) that are not overwritten; name a new or empty folder")
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Have a folder of results to oneself, made if need be; it goes again if nothing was put into it.
+
+    Raises
+    ------
+    OutputBusy
+        Another command is writing there.
+    """
+    with reported_as_cannot_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as failure:
+        os.close(descriptor)
+        raise OutputBusy(
+            f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
+        ) from failure
+    except OSError:
+        pass  # some network file systems lock no folders
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            folder.rmdir()
+        os.close(descriptor)
+
+
+def remove(path: Path) -> None:
+    """Remove a result that others will replace, if it is there."""
+    with reported_as_cannot_write(path):
+        path.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what a process that was killed has left half-written in a folder; nobody may be writing there."""
+    for path in folder.glob(f".*{UNFINISHED}"):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def require_room(path: Path, needed_bytes: int) -> None:
+    """Refuse to begin what would not fit on the disk of `path`.
+
+    Raises
+    ------
+    DiskFull
+        Fewer than `needed_bytes` are free.
+    """
+    free = _free_bytes(path)
+    if free < needed_bytes:
+        raise DiskFull(
+            f"{path}: {needed_bytes / 1e6:.1f} MB are needed, {free / 1e6:.1f} MB are free; make room or use another"
+        )
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file's bytes, in hexadecimal; MissingFile where it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as failure:
+        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
+
+
+@contextmanager
+def reported_as_cannot_write(path: Path) -> Iterator[None]:
+    """Turn what the system says about a failed write into a named failure with the path in it."""
+    try:
+        yield
+    except OSError as failure:
+        place = failure.filename or path
+        if failure.errno in _NO_ROOM:
+            raise DiskFull(
+                f"{path}: no space left on the disk ({_free_bytes(path) / 1e6:.1f} MB free); make room or use another"
+            ) from failure
+        raise CannotWrite(f"{place}: {failure.strerror}; name a place that can be written") from failure
+
+
+def _free_bytes(path: Path) -> int:
+    """Return the room on the disk where `path` is or would be."""
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    return shutil.disk_usage(existing).free
+
+
+def _umask() -> int:
+    """Return the permission bits that this process withholds from new files."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _sync_folder(folder: Path) -> None:
+    """Flush a folder's entries, so that a rename survives a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,194 @@
+"""Image files as the sensor gave them: 16-bit TIFF or PNG, photographs, and raw files with their mosaic."""
+
+import contextlib
+import logging
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines.errors import MissingFile, UnreadableImage
+
+TIFF_SUFFIXES = {".tif", ".tiff"}
+PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
+RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
+IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
+
+# What tifffile is known to raise on files that are damaged or end early; what it logs besides is said in one line here.
+_TIFF_FAILURES = (
+    *(tifffile.TiffFileError, zlib.error, struct.error, OSError, LookupError, RuntimeError, TypeError, ValueError),
+    *(ArithmeticError, MemoryError),
+)
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+# OpenCV fills the rest of a truncated photograph with grey and says nothing; a whole one ends with these bytes.
+_END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
+
+# The pixels next to the edge of the active area catch a little of its light.
+_MASKED_GUARD_PX = 4
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One exposure.
+
+    Attributes
+    ----------
+    pixels_dn : array
+        (row, column), or (row, column, colour) in the order red, green, blue.
+    mosaic : tuple of str, optional
+        Rows of the colour filter array's smallest period, such as ("RG", "GB"); None without filters.
+    black_dn : array, optional
+        Black level of each phase of the mosaic (row, column of the period): from the sensor's masked pixels where it
+        has any, else as the camera states it; None where the file says nothing.
+    saturation_dn : float, optional
+        The camera's stated white level, None where the file says nothing.
+    exposure_s : float, optional
+        From EXIF; None where it is missing or zero, never a default.
+    """
+
+    pixels_dn: NDArray[Any]
+    mosaic: tuple[str, ...] | None = None
+    black_dn: NDArray[np.float64] | None = None
+    saturation_dn: float | None = None
+    exposure_s: float | None = None
+
+
+def read_frame(path: Path) -> Frame:
+    """Read one image file.
+
+    Raises
+    ------
+    MissingFile
+        There is no such file.
+    UnreadableImage
+        The file cannot be decoded, is truncated, or has no pixels.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such image; put it there or correct the name")
+    suffix = path.suffix.lower()
+    if suffix in RAW_SUFFIXES:
+        return _read_raw(path)
+    if suffix not in IMAGE_SUFFIXES:
+        readable = ", ".join(sorted(IMAGE_SUFFIXES))
+        raise UnreadableImage(f"{path}: '{suffix}' is not a format that is read; use one of {readable}")
+    pixels = _read_tiff(path) if suffix in TIFF_SUFFIXES else _read_with_opencv(path)
+    if pixels.ndim == 3 and pixels.shape[2] == 4:
+        pixels = pixels[:, :, :3]
+    if pixels.size == 0:
+        raise UnreadableImage(_cannot_decode(path, "no pixels"))
+    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise UnreadableImage(
+            f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted; export it as such"
+        )
+    return Frame(pixels)
+
+
+def _read_tiff(path: Path) -> NDArray[Any]:
+    """Read a TIFF; the compressions that tifffile leaves to extra packages are read by OpenCV."""
+    try:
+        return np.asarray(tifffile.imread(path))
+    except _TIFF_FAILURES as failure:
+        if "imagecodecs" in str(failure):
+            return _read_with_opencv(path)
+        raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+
+
+def _read_with_opencv(path: Path) -> NDArray[Any]:
+    """Read what OpenCV decodes, as (row, column) or (row, column, RGB), bit depth and orientation untouched."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
+    try:
+        content = path.read_bytes()
+        whole = _END_MARKS.get(path.suffix.lower(), b"") in content[-1024:] and _sound_png(content)
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content and whole else None
+    except (OSError, cv2.error) as failure:
+        raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+    if pixels is None:
+        raise UnreadableImage(_cannot_decode(path, "not an image, or truncated"))
+    if pixels.ndim == 3 and pixels.shape[2] >= 3:
+        pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
+    return np.asarray(pixels)
+
+
+def _sound_png(content: bytes) -> bool:
+    """Return whether every chunk of a PNG has its checksum, true of other files; the decoder would print, not say."""
+    start = 8
+    while content.startswith(b"\x89PNG") and start < len(content):
+        end = start + 8 + int.from_bytes(content[start : start + 4])
+        if zlib.crc32(content[start + 4 : end]) != int.from_bytes(content[end : end + 4]) or end + 4 > len(content):
+            return False
+        if content[start + 4 : start + 8] == b"IEND":
+            break
+        start = end + 4
+    return True
+
+
+def _read_raw(path: Path) -> Frame:
+    """Read the mosaic of a raw file, with its black level from the masked pixels."""
+    import rawpy  # only sessions with raw files pay for loading it
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            if raw.raw_image.ndim != 2:
+                raise UnreadableImage(f"{path}: holds demosaiced colour; record raw files with their mosaic")
+            pixels = raw.raw_image_visible.copy()
+            mosaic = _mosaic_of(raw)
+            period = (1, 1) if mosaic is None else (len(mosaic), len(mosaic[0]))
+            black_dn = _masked_black_dn(raw, period)
+            saturation_dn = float(raw.white_level)
+    except rawpy.LibRawError as failure:
+        reason = failure.args[0].decode() if isinstance(failure.args[0], bytes) else str(failure)
+        raise UnreadableImage(_cannot_decode(path, reason)) from failure
+    return Frame(pixels, mosaic, black_dn, saturation_dn, exif_exposure_s(path))
+
+
+def _mosaic_of(raw: Any) -> tuple[str, ...] | None:
+    """Return the colours of one period of the visible area, as rows of letters."""
+    if raw.raw_pattern is None or raw.raw_pattern.shape == (1, 1):
+        return None
+    rows, columns = raw.raw_pattern.shape
+    letters = raw.color_desc.decode()
+    return tuple("".join(letters[colour] for colour in row) for row in raw.raw_colors_visible[:rows, :columns])
+
+
+def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the black level per phase: the masked pixels' mean without outliers, else the level the file states."""
+    top, left = raw.sizes.top_margin, raw.sizes.left_margin
+    masked = np.zeros(raw.raw_image.shape, bool)
+    masked[:, : max(left - _MASKED_GUARD_PX, 0)] = True
+    masked[: max(top - _MASKED_GUARD_PX, 0), :] = True
+    black_dn = np.empty(period)
+    for row, column in np.ndindex(*period):
+        rows = slice((top + row) % period[0], None, period[0])
+        columns = slice((left + column) % period[1], None, period[1])
+        levels = raw.raw_image[rows, columns][masked[rows, columns]].astype(float)
+        if levels.size < 100:
+            black_dn[row, column] = raw.black_level_per_channel[int(raw.raw_colors_visible[row, column])]
+            continue
+        centre = np.median(levels)
+        spread = 1.4826 * np.median(np.abs(levels - centre)) + 0.5
+        black_dn[row, column] = levels[np.abs(levels - centre) <= 5 * spread].mean()
+    return black_dn
+
+
+def exif_exposure_s(path: Path) -> float | None:
+    """Return the exposure that EXIF states, None where it states none (rawpy would say 1 s)."""
+    import exifread  # only sessions with raw files pay for loading it
+
+    with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
+        tag = exifread.process_file(file, details=False, stop_tag="EXIF ExposureTime").get("EXIF ExposureTime")
+        if tag is not None and tag.values and float(tag.values[0]) > 0:
+            return float(tag.values[0])
+    return None
+
+
+def _cannot_decode(path: Path, reason: str) -> str:
+    """Return the message for a file that no decoder accepts."""
+    reason = " ".join(reason.split())
+    return f"{path}: cannot be decoded ({reason}; {path.stat().st_size} bytes); take or copy the image again"

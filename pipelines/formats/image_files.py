@@ -1,0 +1,84 @@
+"""Pictures and planes written: 16-bit frames, float planes with their scale, and previews for the eye."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines.formats.files import write_whole, writing
+
+type Picture = NDArray[np.uint8]
+
+
+def write_frame(path: Path, pixels: NDArray[Any]) -> None:
+    """Write a frame (row, column[, colour]) as TIFF in its own type, losslessly compressed."""
+    with writing(path) as file:
+        photometric = "rgb" if pixels.ndim == 3 else "minisblack"
+        tifffile.imwrite(file, pixels, compression="zlib", predictor=True, photometric=photometric)
+
+
+def write_plane(path: Path, plane: NDArray[np.floating], pitch_mm: float) -> None:
+    """Write a plane (row, column[, colour]) as float32 TIFF whose resolution tags give its pitch."""
+    per_cm = 10.0 / pitch_mm
+    with writing(path) as file:
+        tifffile.imwrite(
+            file,
+            plane.astype(np.float32),
+            photometric="rgb" if plane.ndim == 3 else "minisblack",
+            resolution=(per_cm, per_cm),
+            resolutionunit="CENTIMETER",
+        )
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write a picture (row, column[, RGB])."""
+    write_whole(path, encoded(picture, ".png"))
+
+
+def encoded(picture: Picture, suffix: str) -> bytes:
+    """Return a picture (row, column[, RGB]) as the bytes of a file of that kind."""
+    ordered = picture if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, ::-1])
+    done, content = cv2.imencode(suffix, ordered)
+    if not done:
+        raise ValueError(f"no picture of shape {picture.shape} can be encoded as {suffix}")
+    return content.tobytes()
+
+
+def grey_levels(plane: NDArray[np.floating], white: float, black: float = 0.0) -> Picture:
+    """Return a plane as 8-bit levels on a linear scale from black to white."""
+    scaled = (np.asarray(plane, np.float32) - black) * (255.0 / max(white - black, 1e-30))
+    return np.asarray(np.rint(np.clip(scaled, 0, 255)), np.uint8)
+
+
+def mask_picture(mask: NDArray[np.bool_]) -> Picture:
+    """Return a mask as a picture, white where it is true."""
+    return np.where(mask, np.uint8(255), np.uint8(0))
+
+
+def white_level(plane: NDArray[np.floating]) -> float:
+    """Return the white of a scale that shows a plane well: its 99.8 % quantile."""
+    return float(np.quantile(plane, 0.998))
+
+
+def contact_sheet(views: list[Picture], columns: int) -> Picture:
+    """Return small pictures of one size (row, column[, RGB]) laid out in rows with a thin line between them."""
+    gap = 3  # thinner lines get lost when a page is shown smaller
+    height, width = views[0].shape[:2]
+    rows = -(-len(views) // columns)
+    sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, *views[0].shape[2:]), 40, np.uint8)
+    for index, view in enumerate(views):
+        top, left = (index // columns) * (height + gap), (index % columns) * (width + gap)
+        sheet[top : top + height, left : left + width] = view
+    return sheet
+
+
+def shrunk(picture: Picture, width_px: int) -> Picture:
+    """Return a picture reduced to a width by averaging, or itself when it is no wider."""
+    height, width = picture.shape[:2]
+    if width <= width_px:
+        return picture
+    size = (width_px, max(round(height * width_px / width), 1))
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)

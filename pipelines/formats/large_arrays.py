@@ -1,0 +1,74 @@
+"""Arrays that memory has no room for: files read by memory map."""
+
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintfield.pipelines.formats.files import reported_as_cannot_write
+
+# Makes an array of a shape and a kind, its contents yet to be written.
+type Allocate = Callable[[tuple[int, ...], DTypeLike], NDArray[Any]]
+
+# Of the memory that is free, what one array may take; the rest is for planes, other programs, and other arrays.
+SHARE_OF_MEMORY = 0.5
+
+_PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+
+
+def memory_or_file(folder: Path) -> Allocate:
+    """Return what makes arrays in memory, and those of more than half of what is free of it in a file in `folder`.
+
+    The file has no name: it is gone with the array, whatever ends the process.
+    """
+
+    def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        if _bytes(shape, dtype) <= SHARE_OF_MEMORY * available_bytes():
+            return np.empty(shape, dtype)
+        with reported_as_cannot_write(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder) as file:
+                return mapped(file, shape, dtype)
+
+    return allocate
+
+
+def mapped(file: IO[bytes], shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+    """Return an array whose elements are those of a new file; the file may be closed, and even removed.
+
+    Its room is taken at once: a disk that fills up later would end the process without a word.
+    """
+    os.posix_fallocate(file.fileno(), 0, _bytes(shape, dtype))
+    return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
+
+
+def available_bytes() -> int:
+    """Return how much memory this process can take: what the system has free, as far as its control groups let it."""
+    free = re.search(r"^MemAvailable:\s+(\d+) kB", (_PROC / "meminfo").read_text(), re.MULTILINE)
+    assert free is not None
+    group = re.search(r"^0::/(.*)$", _read(_PROC / "self" / "cgroup"), re.MULTILINE)
+    own = _CGROUPS / (group[1] if group else "")
+    groups = [folder for folder in (own, *own.parents) if folder.is_relative_to(_CGROUPS)]
+    return min(int(free[1]) * 1024, *(_left_of_group(folder) for folder in groups))
+
+
+def _left_of_group(folder: Path) -> int:
+    """Return what a control group leaves to its processes; what it keeps of files it would give up."""
+    limit = _read(folder / "memory.max").strip()
+    if not limit.isdigit():
+        return 1 << 62
+    taken = re.search(r"^anon (\d+)$", _read(folder / "memory.stat"), re.MULTILINE)
+    return int(limit) - (int(taken[1]) if taken else 0)
+
+
+def _read(path: Path) -> str:
+    return path.read_text() if path.is_file() else ""
+
+
+def _bytes(shape: tuple[int, ...], dtype: DTypeLike) -> int:
+    return int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize

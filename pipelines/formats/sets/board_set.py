@@ -1,0 +1,219 @@
+"""The board set: a folder of images of ChArUco boards with `charuco.toml`, or the charuco frames of a session."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from faintfield.calib.board import Board
+from faintfield.calib.geometry import Node
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
+from faintfield.pipelines.formats.files import sha256, write_whole
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.toml_files import inside, read_toml
+from faintfield.rig.grid import centre_node
+from faintfield.rig.session.access import has_session, read_plan, taken_frames
+from faintfield.rig.session.session import PLAN
+
+FILE_NAME = "charuco.toml"
+
+
+class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One `[[board]]`."""
+
+    name: str
+    columns: int
+    rows: int
+    square_mm: float
+    marker_mm: float
+    dictionary: str
+    first_marker_id: int = 0
+
+    def board(self) -> Board:
+        """Return the board described (ValueError where it cannot be)."""
+        return Board(**msgspec.structs.asdict(self))
+
+
+class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One `[[image]]`; several of the same node and sweep are repeated frames and are averaged."""
+
+    file: str
+    node: tuple[int, int]
+    sweep: int = 0
+
+
+class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The whole of `charuco.toml`; `pitch_mm`, what the stage was told, is needed for its scale only."""
+
+    format: Literal[1]
+    board: list[BoardEntry]
+    image: list[ImageEntry]
+    pitch_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class BoardView:
+    """What was seen at a node in a sweep: the files of its repeated frames, and the filters on their pixels."""
+
+    node: Node
+    sweep: int
+    paths: tuple[Path, ...]
+    mosaic: tuple[str, ...] | None = None
+
+    def image(self) -> NDArray[np.float32]:
+        """Return the mean of the frames (row, column), the colours of RGB frames averaged.
+
+        Raises
+        ------
+        WrongSize
+            The frames are not of one size.
+        """
+        total: NDArray[Any] | None = None
+        for path in self.paths:
+            frame = read_frame(path)
+            pixels = frame.pixels_dn.astype(np.float32)
+            grey = pixels.mean(axis=2) if pixels.ndim == 3 else _without_filters(pixels, self.mosaic or frame.mosaic)
+            if total is not None and grey.shape != total.shape:
+                raise WrongSize(f"{path}: is {grey.shape[::-1]} px, its repeats {total.shape[::-1]}; take it again")
+            total = grey if total is None else total + grey
+        assert total is not None
+        return np.asarray(total / len(self.paths), np.float32)
+
+
+@dataclass(frozen=True)
+class BoardSet:
+    """A board set that has been checked, without its pixels.
+
+    Attributes
+    ----------
+    source : Path
+        The file that describes it.
+    boards : dict of name to Board
+        All boards.
+    views : list of BoardView
+        In the order in which they were taken.
+    reference : (int, int)
+        The node whose camera is the reference: the centre of the grid.
+    pitch_mm : float, optional
+        Distance of neighbouring nodes as the stage was told.
+    one_sided : bool
+        The stage approached every node from the same side, whatever the order.
+    """
+
+    source: Path
+    boards: dict[str, Board]
+    views: list[BoardView]
+    reference: Node
+    pitch_mm: float | None
+    one_sided: bool = False
+
+    def input_hashes(self) -> Iterator[tuple[str, str]]:
+        """Yield name and SHA-256 of every file that was read."""
+        folder = self.source.parent
+        for path in (self.source, *(path for view in self.views for path in view.paths)):
+            yield str(path.relative_to(folder)), sha256(path)
+
+
+def load_board_set(folder: Path) -> BoardSet:
+    """Read and check `charuco.toml`, or the charuco frames of a session, and that the files named exist.
+
+    Raises
+    ------
+    InputError
+        A file is missing, a key unknown, or a value cannot be; the message names it.
+    """
+    if has_session(folder) and not (folder / FILE_NAME).is_file():
+        return _of_session(folder)
+    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    settings = read_toml(path, BoardSetFile)
+    boards = _boards(path, settings.board)
+    if not settings.image:
+        raise BadValue(f"{path}: names no [[image]]; give each its file, node and sweep")
+    files: dict[tuple[Node, int], list[Path]] = {}
+    for index, entry in enumerate(settings.image):
+        file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
+        if not file.is_file():
+            raise MissingFile(f"{path}: {entry.file} is named but missing; put it there or remove its entry")
+        if min(entry.node) < 0:
+            raise BadValue(f"{path}: image[{index}].node = {list(entry.node)}; rows and columns count from 0")
+        files.setdefault((entry.node, entry.sweep), []).append(file)
+    if settings.pitch_mm is not None and not settings.pitch_mm > 0:
+        raise BadValue(f"{path}: pitch_mm = {settings.pitch_mm}; it must be positive")
+    rows, columns = (1 + max(node[axis] for node, _ in files) for axis in (0, 1))
+    return BoardSet(path, boards, _views(files), centre_node(rows, columns), settings.pitch_mm)
+
+
+def _of_session(folder: Path) -> BoardSet:
+    """Return the charuco frames of a session; each charuco step is a sweep, during which the boards stand still."""
+    frozen = read_plan(folder)
+    files: dict[tuple[Node, int], list[Path]] = {}
+    for planned, _, path in taken_frames(folder):
+        if planned.kind == "charuco":
+            if not path.is_file():
+                raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
+            files.setdefault((planned.stop.node, planned.sweep), []).append(path)
+    if not files:
+        raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
+    boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
+    views = _views(files, frozen.rig.mosaic)
+    one_sided = frozen.plan.approach_mm > 0
+    return BoardSet(folder / PLAN, boards, views, frozen.plan.centre.node, frozen.rig.grid.pitch_mm, one_sided)
+
+
+def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
+    return [BoardView(node, sweep, tuple(paths), mosaic) for (node, sweep), paths in files.items()]
+
+
+def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None) -> NDArray[np.float32]:
+    """Return a frame as if it had no colour filters: black and white of each phase brought to those of the whole.
+
+    A board is grey, so that its light differs from phase to phase by a factor only, whatever the black level.
+    """
+    if mosaic is None:
+        return pixels
+    period = (len(mosaic), len(mosaic[0]))
+    ends = (0.05, 0.95)
+    black, white = np.quantile(pixels, ends)
+    grey = np.empty_like(pixels)
+    for row, column in np.ndindex(*period):
+        phase = pixels[row :: period[0], column :: period[1]]
+        low, high = np.quantile(phase, ends)
+        grey[row :: period[0], column :: period[1]] = black + (phase - low) * ((white - black) / max(high - low, 1.0))
+    return grey
+
+
+def write_board_set(folder: Path, settings: BoardSetFile) -> None:
+    """Write `charuco.toml`; the images come first, so that a folder with this file is whole."""
+    content = {name: value for name, value in msgspec.to_builtins(settings).items() if value is not None}
+    write_whole(folder / FILE_NAME, tomli_w.dumps(content))
+
+
+def _boards(path: Path, entries: Sequence[BoardEntry]) -> dict[str, Board]:
+    """Return the boards by name; two that share a name or a marker are refused."""
+    if not entries:
+        raise BadValue(f"{path}: names no [[board]]; give what `faintfield board` printed beneath the board")
+    boards: dict[str, Board] = {}
+    for entry in entries:
+        try:
+            board = entry.board()
+        except ValueError as failure:
+            raise BadValue(f"{path}: {failure}") from failure
+        for other in boards.values():
+            if board.name == other.name:
+                raise BadValue(f"{path}: two boards are named '{board.name}'; give each its own name")
+            shared = set(board.marker_ids) & set(other.marker_ids)
+            if board.dictionary == other.dictionary and shared:
+                raise BadValue(
+                    f"{path}: boards '{other.name}' and '{board.name}' share markers {min(shared)} to {max(shared)}; "
+                    "give each its own first_marker_id, as printed"
+                )
+        boards[board.name] = board
+    sizes = {board.square_mm for board in boards.values()}
+    if len(sizes) > 1:
+        raise BadValue(f"{path}: square_mm differs between boards ({sorted(sizes)}); print all in one size")
+    return boards

@@ -1,0 +1,60 @@
+"""What only a simulator knows of a set, and how far a reconstruction is from it."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.frames import read_frame
+
+TRUTH_FILE = "truth.json"
+
+# Planes this close to an object's depth are compared with it.
+_SAME_DEPTH_MM = 0.05
+
+
+class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One object: its texture in expected electrons on the default grid of its depth, and where it is visible."""
+
+    name: str
+    depth_mm: float
+    texture: str
+    visible: str
+
+
+class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole of `truth.json`; file names are relative to the set."""
+
+    snr: float
+    photons_linear: float
+    photons_from_moments: float
+    photons_on_object: float
+    noise_free: str
+    poses: str
+    true_rt_cam_ref: list[tuple[float, float, float, float, float, float]]
+    planes: list[TruePlane]
+
+
+def read_truth(folder: Path) -> Truth | None:
+    """Return the ground truth of a simulated set, None for any other."""
+    path = folder / TRUTH_FILE
+    if not path.is_file():
+        return None
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Truth)
+    except msgspec.DecodeError as failure:
+        raise BadValue(f"{path}: {failure}; simulate the set again, or remove the file") from failure
+
+
+def true_plane(truth: Truth | None, depth_mm: float) -> TruePlane | None:
+    """Return the object that stands at a depth, None where there is none."""
+    planes = [] if truth is None else truth.planes
+    return next((plane for plane in planes if abs(plane.depth_mm - depth_mm) < _SAME_DEPTH_MM), None)
+
+
+def texture_and_region(folder: Path, plane: TruePlane) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Return the object's texture (row, column[, colour]) and the region (row, column) where it is visible."""
+    return read_frame(folder / plane.texture).pixels_dn, read_frame(folder / plane.visible).pixels_dn > 127

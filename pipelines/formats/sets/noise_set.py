@@ -1,0 +1,154 @@
+"""The noise set: a folder of dark and flat frames with `noise.toml`, when they were not taken by `capture`."""
+
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from faintfield.calib.noise import Conditions
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
+from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+from faintfield.rig.session.access import has_session, read_plan, taken_frames
+
+FILE_NAME = "noise.toml"
+
+
+class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The `[region]` table: pixels that see light and dark alike, as [first, end) of rows and columns."""
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+
+class NoiseFrame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One `[[frame]]`; a raw file's exposure may come from its EXIF instead."""
+
+    file: str
+    kind: Literal["dark", "flat"]
+    exposure_s: float | None = None
+    temperature_c: float | None = None
+    level: int = 0
+    photons: float | None = None
+
+
+class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The whole of `noise.toml`. `saturation_dn`, `mosaic` and `region` are for what image files do not say."""
+
+    format: Literal[1]
+    frame: list[NoiseFrame]
+    saturation_dn: float | None = None
+    mosaic: tuple[str, ...] | None = None
+    region: Region | None = None
+
+
+def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
+    """Return a noise set and the folder that its file names are relative to: `noise.toml`, or a session's frames.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        The file is missing, is not what it should be, or names a frame that is not there.
+    """
+    if has_session(folder) and not (folder / FILE_NAME).is_file():
+        return folder, _of_session(folder)
+    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    settings = read_toml(path, NoiseSet)
+    folder = path.parent
+    if not settings.frame:
+        raise BadValue(f"{path}: names no frame; give a [[frame]] with file, kind and exposure_s for each")
+    seen: set[Path] = set()
+    for index, frame in enumerate(settings.frame):
+        image = inside(folder, frame.file, f"{path}: frame[{index}].file")
+        if not image.is_file():
+            raise MissingFile(f"{image}: is named by {path} but missing; put it there or remove its entry")
+        if image in seen:
+            raise BadValue(f"{path}: {frame.file} is named twice; remove one of the entries")
+        seen.add(image)
+        _check_numbers(path, frame)
+    mosaic = settings.mosaic
+    if mosaic is not None and (not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1):
+        raise BadValue(f'{path}: mosaic = {list(mosaic)}; give rows of equal length, such as ["RG", "GB"]')
+    return folder, settings
+
+
+def _of_session(folder: Path) -> NoiseSet:
+    """Return the dark and flat frames of a session; each step of flats is a light level."""
+    rig = read_plan(folder).rig
+    light = [step.photons_per_s for step in rig.step]
+    frames = [
+        NoiseFrame(
+            file=str(path.relative_to(folder)),
+            kind=planned.kind,
+            exposure_s=planned.exposure_s,
+            temperature_c=taken.detail.get("camera", {}).get("temperature_c"),
+            level=planned.sweep if planned.kind == "flat" else 0,
+            photons=None if (photons_per_s := light[planned.step]) is None else photons_per_s * planned.exposure_s,
+        )
+        for planned, taken, path in taken_frames(folder)
+        if planned.kind in ("dark", "flat")
+    ]
+    if not frames:
+        raise BadValue(f"{folder}: the session has no dark frame yet; capture its dark and flat steps first")
+    return NoiseSet(1, frames, saturation_dn=rig.checks.saturation_dn, mosaic=rig.mosaic)
+
+
+def write_noise_set(folder: Path, settings: NoiseSet) -> None:
+    """Write `noise.toml`; the images come first, so that a folder with this file is whole."""
+    write_toml(folder / FILE_NAME, settings)
+
+
+def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path]]:
+    """Return the frames by what they have in common, darks first, each kind by exposure.
+
+    Raises
+    ------
+    BadValue
+        A frame's exposure is neither stated nor in its EXIF.
+    """
+    groups: dict[Conditions, list[Path]] = {}
+    for frame in settings.frame:
+        path = folder / frame.file
+        exposure_s = frame.exposure_s
+        if exposure_s is None and path.suffix.lower() in RAW_SUFFIXES:
+            exposure_s = exif_exposure_s(path)
+        if exposure_s is None:
+            raise BadValue(
+                f"{path}: its exposure is neither stated nor in its EXIF, and is never guessed; add exposure_s to its "
+                f"entry in {folder / FILE_NAME}"
+            )
+        # EXIF states exposures as ratios; the same setting must not differ in its last digit.
+        level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)
+        conditions = Conditions(frame.kind, float(f"{exposure_s:.6g}"), level, photons)
+        groups.setdefault(conditions, []).append(path)
+    return dict(sorted(groups.items(), key=lambda item: (item[0].kind, item[0].exposure_s, item[0].level)))
+
+
+def temperature_notes(settings: NoiseSet) -> tuple[dict[str, float] | None, list[str]]:
+    """Return the range of temperatures, None without any, and what is doubtful about them."""
+    missing = [frame.file for frame in settings.frame if frame.temperature_c is None]
+    known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
+    warnings = []
+    if missing:
+        warnings.append(
+            f"{missing[0]}: no temperature is stated (nor for {len(missing) - 1} others); dark current changes by "
+            "10 % per kelvin, so that the result holds only at the temperature of these frames"
+        )
+    if not known:
+        return None, warnings
+    if np.ptp(known) > 0.5:
+        warnings.append(
+            f"the temperature ran from {min(known):g} to {max(known):g} °C, which moves the dark current by "
+            f"{10 * np.ptp(known):.0f} %; let the camera settle before recording"
+        )
+    return {"mean": float(np.mean(known)), "min": min(known), "max": max(known)}, warnings
+
+
+def _check_numbers(path: Path, frame: NoiseFrame) -> None:
+    """Refuse exposures, temperatures and photons that cannot be."""
+    for key, value in (("exposure_s", frame.exposure_s), ("photons", frame.photons)):
+        if value is not None and value < 0:
+            raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must not be negative")
+    if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
+        raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")

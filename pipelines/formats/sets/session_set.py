@@ -1,0 +1,132 @@
+"""The frames of one kind of a session as an elemental set: what a reconstruction takes, in the session's own files."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.console import say
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
+from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, LoadedSet, View, load_set
+from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
+from faintfield.rig.plan import CapturePlan, StepKind, Stop
+from faintfield.rig.session.access import has_session, read_plan, taken_frames
+from faintfield.rig.session.frames import planned_frames
+from faintfield.rig.session.session import PLAN
+
+RECONSTRUCTIONS = "reconstructions"
+
+type SceneKind = Literal["dark_scene", "bright"]
+
+_CALLED: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
+
+
+def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
+    """Return a session's views of the scene, in electrons by its noise.json, from where its geometry.json says.
+
+    All frames of a node are one view: they are added up, whatever their exposures.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the session.
+    kind : str
+        Which set.
+    geometry : Path, optional
+        Another geometry.json than the session's own, or its folder.
+
+    Raises
+    ------
+    RigError, InputError
+        Frames are missing, or the noise or the geometry has not been measured; the message says what to run.
+    """
+    return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
+
+
+def load_set_or_session(folder: Path) -> LoadedSet:
+    """Return an elemental set, or the dark scene of a session."""
+    return load_session(folder) if has_session(folder) else load_set(folder)
+
+
+def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
+    """Return the same with the measured lens, but the camera where the stage was told to take it."""
+    plan = read_plan(folder).plan
+    exposure_s, frames = _frames_of_views(folder, plan, kind)
+    measured_in = geometry or folder / GEOMETRY_FILE
+    for path, command in ((measured_in, "geometry"), (folder / NOISE_FILE, "noise")):
+        if not path.exists():
+            raise MissingFile(
+                f"{path}: no such file; run `faintfield {command} {folder}` first, or `faintfield run {folder}` for all"
+            )
+    lens = read_geometry(measured_in).camera_lens()
+    noise = read_fitted_noise(folder / NOISE_FILE, lens.size_px)
+    camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
+    views = [_view(stop, plan.centre, names) for stop, names in frames]
+    reference = [view.node for view in views].index(plan.centre.node)
+    return LoadedSet(
+        folder,
+        ElementalSet(1, exposure_s, reference, camera, NOISE_FILE, views),
+        lens,
+        noise.model,
+        offset_from_files=False,
+        flat=None if noise.response is None else _relative_to_axis(noise.response, noise.unusable, lens),
+        unusable=noise.unusable,
+        measured_in=measured_in / GEOMETRY_FILE if measured_in.is_dir() else measured_in,
+        poses="nominal",
+        described_in=PLAN,
+        noise_reference=tuple(path for path, _ in _at_centre(folder, "noise_reference")),
+        bright_view=next(iter(_at_centre(folder, "bright")), None),
+    )
+
+
+def files_of_scene(folder: Path, kind: SceneKind = "dark_scene") -> list[str]:
+    """Return the names of all files that a reconstruction of a session reads."""
+    _, frames = _frames_of_views(folder, read_plan(folder).plan, kind)
+    return [PLAN, NOISE_FILE, NOISE_MAPS, GEOMETRY_FILE, *(name for _, names in frames for name in names)]
+
+
+def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[float, list[tuple[Stop, list[str]]]]:
+    """Return the exposure of a view, and its frames' names at every node that has all of them, in raster order."""
+    planned = [frame for frame in planned_frames(plan) if frame.kind == kind]
+    at_centre = [frame.exposure_s for frame in planned if frame.stop == plan.centre]
+    taken: dict[tuple[int, int], tuple[Stop, list[str]]] = {}
+    for frame, _, path in taken_frames(folder):
+        if frame.kind == kind:
+            if not path.is_file():
+                raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
+            taken.setdefault(frame.stop.node, (frame.stop, []))[1].append(str(path.relative_to(folder)))
+    whole = [taken[node] for node in sorted(taken) if len(taken[node][1]) == len(at_centre)]
+    if not at_centre or plan.centre not in [stop for stop, _ in whole]:
+        raise BadValue(
+            f"{folder}: has no {_CALLED[kind]} frame of the centre node {list(plan.centre.node)}, whose camera is the "
+            f"reference; take it by a {kind} step of the rig.toml"
+        )
+    if lacking := len({frame.stop.node for frame in planned}) - len(whole):
+        say(f"{folder}: {lacking} nodes are left out, which miss {_CALLED[kind]} frames; capture again to take them")
+    return sum(at_centre), whole
+
+
+def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
+    """Return the frames of a kind at the centre node, each with its exposure in s."""
+    centre = read_plan(folder).plan.centre
+    taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == kind and frame.stop == centre]
+    return [(path, frame.exposure_s) for frame, path in taken if path.is_file()]
+
+
+def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:
+    """Return the response (row, column) relative to pixels about the lens's axis, in whose electrons planes are."""
+    near = max(lens.size_px) // 20 + 1
+    row, column = round(lens.cy_px), round(lens.cx_px)
+    window = (slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near))
+    about_axis = response[window][~unusable[window]]
+    level = float(about_axis.mean(dtype=np.float64)) if about_axis.size else 0.0
+    return (response / np.float32(level)) if level > 0 else response
+
+
+def _view(stop: Stop, centre: Stop, names: list[str]) -> View:
+    """Return the view of a node, with the pose of a camera that the stage takes where it is told."""
+    right_mm, down_mm = stop.target.x_mm - centre.target.x_mm, stop.target.y_mm - centre.target.y_mm
+    return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]))

@@ -1,0 +1,128 @@
+"""Settings read from TOML: every key known, every value of its type, every complaint with its path."""
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import tomli_w
+
+from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
+from faintfield.pipelines.formats.files import write_whole
+
+# No quantity is larger, and what is computed of numbers up to it overflows nowhere.
+_MOST = 1e12
+
+
+def read_toml[T](path: Path, kind: type[T]) -> T:
+    """Read a TOML file into `kind`, a msgspec Struct that forbids unknown fields.
+
+    Raises
+    ------
+    MissingFile
+        There is no such file.
+    UnknownKey
+        A key that nothing reads, with its path and the nearest key that is read, or whose it is.
+    BadValue
+        The file is not TOML, a key is missing, a value has the wrong type or is none of its choices, or a number is not
+        finite.
+    """
+    if not path.is_file():
+        raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
+    try:
+        content = msgspec.toml.decode(path.read_bytes())
+        _require_finite(path, content)
+        return msgspec.convert(content, kind)
+    except OSError as failure:
+        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
+    except msgspec.ValidationError as failure:
+        raise _in_words(path, str(failure), kind) from None
+    except (tomllib.TOMLDecodeError, msgspec.DecodeError, UnicodeDecodeError) as failure:
+        raise BadValue(f"{path}: is not TOML ({failure}); correct the line") from failure
+
+
+def write_toml(path: Path, settings: msgspec.Struct) -> None:
+    """Write what `read_toml` reads, whole or not at all; keys without a value are left out, for TOML has no null."""
+    write_whole(path, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
+
+
+def inside(folder: Path, name: str, key: str) -> Path:
+    """Return the path of a file that a settings file names, which must lie in its own folder.
+
+    Raises
+    ------
+    BadValue
+        The name is absolute, or climbs out of the folder.
+    """
+    path = folder / name
+    if not name or Path(name).is_absolute() or not path.resolve().is_relative_to(folder.resolve()):
+        raise BadValue(f"{key} = '{name}' leaves the folder {folder}; name a file inside it")
+    return path
+
+
+def _require_finite(path: Path, value: Any, place: str = "") -> None:
+    """Refuse numbers that are none, or that no rig has, wherever they stand."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            _require_finite(path, part, f"{place}.{key}" if place else key)
+    elif isinstance(value, list):
+        for index, part in enumerate(value):
+            _require_finite(path, part, f"{place}[{index}]")
+    elif isinstance(value, int | float) and not abs(value) <= _MOST:
+        raise BadValue(
+            f"{path}: {place} = {value!s:.24}; numbers are finite, and at most {_MOST:g} in size: correct it"
+        )
+
+
+def _in_words(path: Path, complaint: str, kind: type) -> InputError:
+    """Return what msgspec complains of, in the words of this project."""
+    reason, _, place = complaint.partition(" - at ")
+    place = place.strip("`").removeprefix("$").removeprefix(".")
+    if unknown := re.search(r"unknown field `(.+?)`", reason):
+        key = f"{place}.{unknown[1]}" if place else unknown[1]
+        return UnknownKey(f"{path}: '{key}' is not a key that is read; {_better_key(kind, place, unknown[1])}")
+    if none_of_them := re.fullmatch(r"Invalid (?:enum )?value (.+)", reason):
+        value = none_of_them[1]
+        return BadValue(f"{path}: {place} = {value}; {_better_value(kind, place, value)}")
+    return BadValue(f"{path}: {place or 'the file'}: {reason}; correct it")
+
+
+def _better_key(kind: type, place: str, key: str) -> str:
+    """Return what to do about a key that the table at `place` does not have."""
+    tables = _tables(kind)
+    known = {name for table in tables.values() for name in table}
+    if key not in known:
+        near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+        return f"did you mean '{near[0]}'?" if near else "remove it"
+    for table in tables.values():
+        kinds = table.get(_name(place), {}).get("discriminator", {"mapping": {}})
+        if owners := [repr(tag) for tag, reference in kinds["mapping"].items() if key in tables[reference]]:
+            return f"it is for {kinds['propertyName']} = {' or '.join(owners)} alone: remove it"
+    return "it belongs in another table: move it there, or remove it"
+
+
+def _better_value(kind: type, place: str, value: str) -> str:
+    """Return what may stand at `place`, and which of these is most like `value`."""
+    choices = [repr(it) for table in _tables(kind).values() for it in table.get(_name(place), {}).get("enum", [])]
+    near = difflib.get_close_matches(value, choices, n=1, cutoff=0.5)
+    return f"choose from {', '.join(choices)}" + (f"; did you mean {near[0]}?" if near else "")
+
+
+def _tables(kind: type) -> dict[str, dict[str, Any]]:
+    """Return what the JSON schema of `kind` says of each key of each Struct in it, by its references."""
+    parts = msgspec.json.schema(kind)["$defs"]
+    return {f"#/$defs/{name}": part.get("properties", {}) for name, part in parts.items()}
+
+
+def _name(place: str) -> str:
+    """Return the last key of a place such as `step[2].kind`."""
+    return re.sub(r"\[.*?\]", "", place).rpartition(".")[2]
+
+
+def _without_none(value: Any) -> Any:
+    """Drop the keys that say nothing."""
+    if isinstance(value, dict):
+        return {key: _without_none(part) for key, part in value.items() if part is not None}
+    return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value

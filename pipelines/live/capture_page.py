@@ -1,0 +1,133 @@
+"""The capture as a local web page: what the terminal shows, and its keys as buttons, dim red on black.
+
+Served to this computer alone, at an address that nobody can guess: its first part is a random token.
+"""
+
+import secrets
+import socket
+import threading
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager
+from importlib.resources import files
+from typing import Any
+
+import msgspec
+import numpy as np
+import uvicorn
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import Route
+
+from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.live.panel import WISHES, Panel, Shown
+from faintfield.pipelines.live.terminal import MEANINGS, levels
+from faintfield.rig.capture.guide import spoken_duration
+
+_HOST = "127.0.0.1"
+_PICTURE_PX = 960
+_BINS = 64
+_LONGEST_PRESS_BYTES = 1000
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; img-src 'self' data:; connect-src 'self'; "
+    "style-src 'unsafe-inline'; script-src 'unsafe-inline'; frame-ancestors 'none'",
+}
+
+
+class _Press(msgspec.Struct, forbid_unknown_fields=True):
+    """What the page sends when a button is pressed."""
+
+    word: str
+    prompt: int | None = None
+
+
+@contextmanager
+def serving_page(panel: Panel) -> Iterator[str]:
+    """Serve the page of `panel` while the block runs, and yield its address."""
+    token = secrets.token_urlsafe(24)
+    listener = socket.create_server((_HOST, 0))
+    config = uvicorn.Config(page_of(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
+    thread.start()
+    try:
+        yield f"http://{_HOST}:{listener.getsockname()[1]}/{token}/"
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def page_of(panel: Panel, token: str) -> Starlette:
+    """Return the page as an application; without the token there is nothing to be found."""
+    html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
+
+    async def index(_: Request) -> Response:
+        return HTMLResponse(html, headers=_HEADERS)
+
+    async def state(_: Request) -> Response:
+        return JSONResponse(state_of(panel), headers=_HEADERS)
+
+    async def picture(_: Request) -> Response:
+        if panel.shown is None:
+            return Response(status_code=404, headers=_HEADERS)
+        return Response(picture_of(panel.shown), media_type="image/png", headers=_HEADERS)
+
+    async def press(request: Request) -> Response:
+        try:
+            body = await request.body()
+            pressed = msgspec.json.decode(body[:_LONGEST_PRESS_BYTES], type=_Press)
+        except msgspec.DecodeError as failure:
+            return JSONResponse({"error": str(failure)}, status_code=400, headers=_HEADERS)
+        if pressed.word not in MEANINGS:
+            return JSONResponse({"error": "no such button"}, status_code=400, headers=_HEADERS)
+        panel.press(pressed.word, pressed.prompt)
+        return JSONResponse({}, headers=_HEADERS)
+
+    handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
+        ("", index, "GET"),
+        ("state", state, "GET"),
+        ("frame.png", picture, "GET"),
+        ("press", press, "POST"),
+    ]
+    return Starlette(
+        routes=[Route(f"/{token}/{path}", handler, methods=[method]) for path, handler, method in handlers],
+        # A page elsewhere whose name is made to point here is turned away
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST])],
+    )
+
+
+def state_of(panel: Panel) -> dict[str, Any]:
+    """Return all that the page shows, except the picture."""
+    asked, status, shown = panel.asked, panel.status, panel.shown
+    words = list(WISHES) if asked is None else list(asked.prompt.answers)
+    return {
+        "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
+        "status": None if status is None else msgspec.to_builtins(status),
+        "to_go": "" if status is None else spoken_duration(status.to_go_s),
+        "buttons": [{"word": word, "label": MEANINGS[word]} for word in words],
+        "frame": None if shown is None else _frame_state(shown),
+    }
+
+
+def picture_of(shown: Shown) -> bytes:
+    """Return a frame as PNG, in red alone."""
+    grey = levels(shown.pixels, _PICTURE_PX)
+    zero = np.zeros_like(grey)
+    return encoded(np.dstack([grey, zero, zero]), ".png")
+
+
+def _frame_state(shown: Shown) -> dict[str, Any]:
+    """Return name, figures and histogram of a frame."""
+    counts, edges = np.histogram(shown.pixels, bins=_BINS)
+    return {
+        "name": shown.frame.name,
+        "values": dict(shown.values),
+        "histogram": np.log1p(counts).tolist(),
+        "range_dn": [float(edges[0]), float(edges[-1])],
+    }

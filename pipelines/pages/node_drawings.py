@@ -1,0 +1,131 @@
+"""Drawings of a measured geometry: real against nominal nodes, and how well each is known."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.pages.page import INK, inked, svg
+
+_MOST_MAGNIFIED_SHARE = 0.35
+
+# From here on rotations are in mrad, below in µrad.
+_COARSE_RAD = 1e-4
+
+# More nodes than this have no number written into their cell.
+_MOST_WRITTEN = 121
+
+
+def node_drawing(geometry: dict[str, Any]) -> str | None:
+    """Return real against nominal nodes as SVG, deviations magnified; None where there is no regular grid to compare.
+
+    Parameters
+    ----------
+    geometry : dict
+        The contents of geometry.json.
+    """
+    from matplotlib.figure import Figure  # loading it costs most of a second
+
+    stage = geometry["stage"]
+    pitch = np.array([stage[name]["value"] for name in ("pitch_x_mm", "pitch_y_mm")], float)
+    residuals = np.array(stage["residuals_mm"] or [], float)
+    if not len(residuals) or np.isnan(pitch).any():
+        return None
+    nodes = np.array([entry["node"] for entry in geometry["nodes"]], float)
+    nominal = (nodes - geometry["reference_node"])[:, ::-1] * pitch
+    factor = _magnification(residuals, float(pitch.min()))
+    real = nominal + factor * residuals[:, :2]
+    across_mm = np.ptp(nominal, axis=0) + 2 * pitch
+    height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
+    figure = Figure(figsize=(5.4, height), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(
+        *nominal.T, "+", color=INK, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
+    )
+    limit = 1e3 * (float(np.abs(residuals[:, 2]).max()) or 1e-6)
+    look: dict[str, Any] = {"cmap": "coolwarm", "vmin": -limit, "vmax": limit, "edgecolors": INK, "linewidths": 0.6}
+    dots = axes.scatter(real[:, 0], real[:, 1], s=60, zorder=3, c=1e3 * residuals[:, 2], **look)
+    dots.set_label(f"camera, deviation × {factor:g}")
+    for start, end in zip(nominal, real, strict=True):
+        axes.plot(*np.array([start, end]).T, color=INK, linewidth=0.8, alpha=0.7, zorder=2)
+    _colour_bar(figure, dots, axes, "along the normal (µm)")
+    axes.set_aspect("equal")
+    axes.margins(0.1)
+    axes.invert_yaxis()
+    axes.set_xlabel("x (mm)")
+    axes.set_ylabel("y, downwards (mm)")
+    inked(axes)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
+    return svg(figure)
+
+
+def sigma_maps(geometry: dict[str, Any]) -> list[str]:
+    """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each.
+
+    Parameters
+    ----------
+    geometry : dict
+        The contents of geometry.json.
+    """
+    largest_rad = max(node["sigma_rad"] for node in geometry["nodes"])
+    per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
+    return [
+        _sigma_map(geometry["nodes"], "sigma_mm", 1e3, "σ of position, √ of the variances' sum (µm)"),
+        _sigma_map(geometry["nodes"], "sigma_rad", per_rad, f"σ of rotation, √ of the variances' sum ({unit})"),
+    ]
+
+
+def _sigma_map(nodes: list[dict[str, Any]], key: str, factor: float, words: str) -> str:
+    """Return the map of one number of the nodes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.8, 4.0), layout="constrained")
+    axes = figure.subplots()
+    first, values = _map_of_nodes(nodes, key, factor)
+    rows, columns = values.shape
+    extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
+    image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
+    _colour_bar(figure, image, axes, words)
+    if values.size <= _MOST_WRITTEN:
+        _write_values(axes, first, values)
+    axes.set_xlabel("column of the grid")
+    axes.set_ylabel("row of the grid")
+    axes.locator_params(integer=True)
+    inked(axes)
+    return svg(figure)
+
+
+def _map_of_nodes(nodes: list[dict[str, Any]], key: str, factor: float) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    """Return the first row and column, and a number of each node at its place, NaN where there is no node."""
+    places = np.array([entry["node"] for entry in nodes])
+    first = places.min(axis=0)
+    values = np.full(np.ptp(places, axis=0) + 1, np.nan)
+    values[tuple((places - first).T)] = [factor * entry[key] for entry in nodes]
+    return (int(first[0]), int(first[1])), values
+
+
+def _write_values(axes: Any, first: tuple[int, int], values: NDArray[np.float64]) -> None:
+    """Write each number into its cell, dark on light and light on dark."""
+    for (row, column), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            colour = "black" if value > 0.6 * np.nanmax(values) else "white"
+            words = f"{value:.0f}" if np.nanmax(values) >= 10 else f"{value:.2g}"
+            axes.text(column + first[1], row + first[0], words, ha="center", va="center", fontsize=7, color=colour)
+
+
+def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:
+    """Draw a colour bar in the page's ink."""
+    bar = figure.colorbar(image, ax=axes, shrink=0.8)
+    bar.set_label(words, color=INK)
+    bar.ax.tick_params(colors=INK)
+    bar.outline.set_edgecolor(INK)
+
+
+def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
+    """Return by how much deviations are drawn larger: a round number that keeps the largest within its cell."""
+    largest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
+    if largest <= 0:
+        return 1.0
+    wanted = _MOST_MAGNIFIED_SHARE * pitch_mm / largest
+    power = 10 ** np.floor(np.log10(wanted))
+    return float(max(next(step for step in (5, 2, 1) if step * power <= wanted) * power, 1.0))

@@ -1,0 +1,230 @@
+"""A page of plots by which a noise calibration can be judged, in the names and units of EMVA 1288."""
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from faintfield.calib.noise import Estimate, NoiseCalibration, TransferPoint
+from faintfield.pipelines.formats.results.noise import STANDARD
+
+_INK, _MODEL, _SECOND = "#1b1b1b", "#c23b22", "#2b6ca3"
+
+_ROWS = (
+    ("gain_dn_per_e", "$K$", "DN/e⁻"),
+    ("offset_dn", r"$\mu_{y.\mathrm{dark}}(0)$", "DN"),
+    ("read_noise_e", r"$\sigma_d$", "e⁻"),
+    ("read_noise_dn", r"$K\sigma_d$", "DN"),
+    ("dark_current_e_per_s", r"$\mu_I$", "e⁻/s"),
+    ("dsnu_e", "DSNU (pixel)", "e⁻"),
+    ("dcnu_e_per_s", "DCNU", "e⁻/s"),
+    ("prnu", "PRNU (pixel)", ""),
+    ("quantum_efficiency", r"$\eta$", "e⁻/photon"),
+    ("frame_jitter_dn", "frame jitter", "DN"),
+    ("row_noise_dn", "row noise", "DN"),
+    ("column_noise_dn", "column noise", "DN"),
+)
+
+
+_ACROSS = 3
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One plot of the page; `missing` says why it would have nothing to show, None where it has."""
+
+    title: str
+    draw: Callable[[Axes, NoiseCalibration], None]
+    missing: str | None = None
+
+
+def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
+    """Return the page as a PNG: the panels that have something to show, and below them what is left out and why."""
+    panels = page_panels(calibration)
+    shown = [panel for panel in panels if panel.missing is None]
+    down = -(-len(shown) // _ACROSS)
+    figure = Figure(figsize=(15.5, 0.4 + 4.7 * down), layout="constrained")
+    FigureCanvasAgg(figure)
+    # Half panels as the unit, so that a last row of fewer panels can stand in the middle.
+    grid = figure.add_gridspec(down, 2 * _ACROSS)
+    for index, panel in enumerate(shown):
+        row, column = divmod(index, _ACROSS)
+        first = 2 * column + (down * _ACROSS - len(shown) if row == down - 1 else 0)
+        axes = figure.add_subplot(grid[row, first : first + 2])
+        axes.set_title(panel.title)
+        panel.draw(axes, calibration)
+    how = f"{STANDARD}; likelihood: {calibration.likelihood}"
+    figure.suptitle(f"Noise calibration: {title.strip()}    ({how})", fontsize=13)
+    left_out = "; ".join(f"{panel.title} ({panel.missing})" for panel in panels if panel.missing)
+    if left_out:
+        figure.supxlabel(f"Not shown: {left_out}", fontsize=9, color="0.4")
+    page = io.BytesIO()
+    figure.savefig(page, format="png", dpi=110)
+    return page.getvalue()
+
+
+def page_panels(calibration: NoiseCalibration) -> tuple[Panel, ...]:
+    """Return every panel of the page, in order."""
+    maps = calibration.maps
+    offset = calibration.estimates["offset_dn"].value or 0.0
+    cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
+    no_mass = None if calibration.histograms else "no gain, or values too wide apart"
+    return (
+        Panel("Photon transfer" + cut_off, _photon_transfer),
+        Panel("Dark signal against exposure time", _dark_signal),
+        Panel("Results, 95 % intervals", _table),
+        _map("Offset less its mean (DSNU) [DN]", maps.offset_dn - offset, maps.unusable),
+        _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
+        # Even, unless something is missing from the model.
+        _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
+        Panel("Dark values and the fitted mass function", _histograms, no_mass),
+        Panel("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        _map("Relative response to light", maps.relative_response, maps.unusable),
+    )
+
+
+def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
+    """Variance against mean, less the dark's, with the line of the model."""
+    offset = calibration.estimates["offset_dn"].value or 0.0
+    measured = [point for point in calibration.points if point.frames > 1]
+    flats = any(point.kind == "flat" for point in measured)
+    for kind, colour in (("dark", _SECOND), ("flat", _INK)):
+        points = [point for point in measured if point.kind == kind]
+        if not points:
+            continue
+        mean = np.array([point.mean_dn - offset for point in points])
+        variance, error = _column(points, "variance_dn2"), _column(points, "variance_se_dn2")
+        axes.errorbar(mean, variance, 2 * error, fmt="o", ms=4, color=colour, capsize=2, label=f"{kind}s, ±2 s.e.")
+    order = sorted(measured, key=lambda point: point.model_mean_dn)
+    at = np.array([point.model_mean_dn - offset for point in order])
+    x = np.unique(np.concatenate([np.linspace(at[0], at[-1], 200), np.geomspace(0.1, max(at[-1], 1), 200)]))
+    axes.plot(x, np.interp(x, at, _column(order, "model_variance_dn2")), color=_MODEL, lw=1, label="model, eq. (1)")
+    if flats:
+        axes.set_xscale("symlog", linthresh=10)
+        axes.set_yscale("log")
+    axes.set_xlabel(r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]")
+    axes.set_ylabel(r"$\sigma_y^2$ [DN²]")
+    axes.legend(fontsize=8)
+
+
+def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
+    """Mean dark signal against exposure time, with what remains once the line is taken off."""
+    points = [point for point in calibration.points if point.kind == "dark"]
+    t = _column(points, "exposure_s")
+    axes.plot(t, _column(points, "mean_dn"), "o", ms=4, color=_SECOND, label="mean of a series")
+    order = np.argsort(t)
+    model = _column(points, "model_mean_dn")
+    axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
+    axes.set_xlabel("exposure time [s]")
+    axes.set_ylabel(r"$\mu_{y.\mathrm{dark}}$ [DN]")
+    # Both out of the way of a line that rises, or falls.
+    falls = model[order[-1]] < model[order[0]]
+    axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
+    below = axes.inset_axes((0.1, 0.1, 0.34, 0.26) if falls else (0.56, 0.12, 0.42, 0.3))
+    below.axhline(0, color=_MODEL, lw=1)
+    below.plot(t, _column(points, "mean_dn") - model, "o", ms=3, color=_SECOND)
+    below.set_title("measured − model [DN]", fontsize=7)
+    below.tick_params(labelsize=7)
+
+
+def _table(axes: Axes, calibration: NoiseCalibration) -> None:
+    """List the numbers with their intervals."""
+    axes.axis("off")
+    cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
+    table = axes.table(
+        cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
+    )
+    table.auto_set_font_size(False)
+    table.set_fontsize(8.5)
+    table.scale(1, 1.35)
+    counts = {kind: int(getattr(calibration, kind).sum()) for kind in ("hot", "noisy", "dead")}
+    words = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    axes.text(0.5, 0.0, f"{words} pixels", ha="center", fontsize=9, transform=axes.transAxes)
+
+
+def _words(estimate: Estimate) -> tuple[str, str]:
+    """Return value and interval, as precise as they are known."""
+    if estimate.value is None or estimate.ci95 is None:
+        return "—", "not identifiable"
+    digits = int(np.clip(np.ceil(-np.log10(estimate.se)), 0, 6)) if estimate.se else 3
+    low, high = estimate.ci95
+    return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
+
+
+def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> Panel:
+    """Return the panel of one map, with a scale that spans the usable pixels."""
+
+    def draw(axes: Axes, _: NoiseCalibration) -> None:
+        assert values is not None
+        low, high = np.quantile(values[~unusable], [0.005, 0.995])
+        image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
+        axes.set_xlabel("column [px]")
+        axes.set_ylabel("row [px]")
+        axes.figure.colorbar(image, ax=axes, shrink=0.8)
+
+    return Panel(title, draw, _sameness(values, unusable))
+
+
+def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+    """Return why a map shows nothing, None where it shows something."""
+    if values is None:
+        return "not identifiable from these frames"
+    if unusable.all():
+        return "no usable pixel"
+    return None if np.ptp(values[~unusable]) else "the same for all pixels"
+
+
+def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
+    """Values of the shortest and the longest darks, and how often each should occur."""
+    for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
+        seen = histogram.count > 0
+        label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"
+        axes.plot(histogram.value_dn[seen], histogram.count[seen], ".", ms=4, color=colour, label=label)
+        axes.plot(histogram.value_dn, np.maximum(histogram.expected, 1e-3), color=_MODEL, lw=1)
+    axes.plot([], [], color=_MODEL, lw=1, label="fitted")
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.5)
+    low, high = _span(calibration)
+    axes.set_xlim(low, high)
+    axes.locator_params(axis="x", nbins=6)
+    axes.set_xlabel("$y$ [DN]")
+    axes.set_ylabel("count")
+    axes.legend(fontsize=8)
+
+
+def _span(calibration: NoiseCalibration) -> tuple[float, float]:
+    """Return the range of values in which all but one in ten thousand lie."""
+    low, high = np.inf, -np.inf
+    for histogram in calibration.histograms:
+        share = np.cumsum(histogram.count) / histogram.count.sum()
+        inner = histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)]
+        low, high = min(low, float(inner.min())), max(high, float(inner.max()))
+    return low - 3, high + 3
+
+
+def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
+    """Amplitude spectrum of the rows and of the columns of the offset map: a peak is a fixed pattern with a period."""
+    offset = np.asarray(calibration.maps.offset_dn, np.float64)
+    usable = ~calibration.maps.unusable
+    mean = float(offset.mean(where=usable))
+    deviation = np.where(usable, offset - mean, 0.0)
+    for axis, label, colour in ((1, "along rows (horizontal)", _SECOND), (0, "along columns (vertical)", _INK)):
+        length = offset.shape[axis]
+        power = (np.abs(np.fft.rfft(deviation, axis=axis)) ** 2 / length).mean(1 - axis)
+        axes.plot(np.fft.rfftfreq(length)[1:], np.sqrt(power[1:]), lw=0.8, color=colour, label=label)
+    white = float(np.sqrt((deviation**2).mean()))
+    axes.axhline(white, color=_MODEL, lw=1, ls="--", label="same variance, no pattern")
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("spatial frequency [cycles/px]")
+    axes.set_ylabel("amplitude [DN]")
+    axes.legend(fontsize=8)
+
+
+def _column(points: list[TransferPoint], name: str) -> NDArray[np.float64]:
+    """Return one number of each point."""
+    return np.array([getattr(point, name) for point in points], np.float64)

@@ -1,0 +1,75 @@
+"""What all pages share: their template, pictures within them, and drawings in the page's own ink."""
+
+import base64
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from jinja2 import Template
+    from matplotlib.figure import Figure
+
+# Drawn with this, and replaced by the page's own colour, light or dark.
+INK = "#010203"
+
+
+def template(name: str) -> "Template":
+    """Return a page's template, with `figure` to write a number to three digits."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when all images are out of memory
+
+    environment = Environment(
+        loader=PackageLoader("faintfield.pipelines.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["figure"] = figure
+    return environment.get_template(name)
+
+
+def figure(value: float | None, digits: int = 3) -> str:
+    """Return a number to so many digits, zeros at its end among them, a dash where there is none."""
+    if value is None:
+        return "–"
+    rounded = float(f"{value:.{digits}g}")
+    if rounded == 0 or 1e-4 <= abs(rounded) < 1e6:
+        decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
+        return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
+    return f"{rounded:.{digits - 1}e}".replace("-", "−")
+
+
+def data_uri(content: bytes, suffix: str) -> str:
+    """Return a picture's file as an address that holds it."""
+    kind = {".png": "png", ".jpg": "jpeg"}[suffix]
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+
+
+def svg(figure: "Figure") -> str:
+    """Return a drawing as SVG that takes its colour from the page; the same drawing gives the same text."""
+    from matplotlib import rc_context
+
+    text = io.StringIO()
+    with rc_context({"svg.hashsalt": "faintfield"}):
+        figure.savefig(
+            text,
+            format="svg",
+            transparent=True,
+            bbox_inches="tight",
+            pad_inches=0.05,
+            metadata={"Date": None, "Creator": None},
+        )
+    drawn = text.getvalue()
+    return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
+
+
+def inked(*axes: Any) -> None:
+    """Draw axes in the page's ink, without a frame above and to the right."""
+    for one in axes:
+        one.tick_params(which="both", colors=INK)
+        one.spines[:].set_color(INK)
+        one.spines[["top", "right"]].set_visible(False)
+        one.yaxis.get_offset_text().set_color(INK)
+        for label in (one.xaxis.label, one.yaxis.label, one.title):
+            label.set_color(INK)

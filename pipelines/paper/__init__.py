@@ -1,0 +1,1 @@
+"""The paper's experiment: its figures, and the demo's rig and truth."""

@@ -1,0 +1,133 @@
+"""What only the simulated world knows of a session, and how far off its results are."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise_model import NoiseModel
+from faintfield.pipelines.commands.reconstruct import folder_of_method
+from faintfield.pipelines.commands.simulate import NOISE_FREE, write_ground_truth
+from faintfield.pipelines.formats.exchange.imported_set import relative
+from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE
+from faintfield.pipelines.formats.results.plane_files import plane_name
+from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
+from faintfield.pipelines.formats.sets.measured_poses import read_geometry
+from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
+from faintfield.pipelines.reconstruction.accuracy import assess
+from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.cameras.simulated import TRUE_POSE
+from faintfield.rig.session.access import read_plan, taken_frames
+from faintfield.rig.simulation.experiment import SimulatedExperiment
+from faintfield.rig.simulation.lab import lab_experiment
+
+type Node = tuple[int, int]
+
+
+def write_truth(out: Path, session: Path, snr: float) -> Path:
+    """Write the noise-free views, the textures and the true poses of a session of the simulated lab; return `out`."""
+    frozen = read_plan(session)
+    camera, grid = _simulated(frozen.rig.camera), frozen.rig.grid
+    poses = true_poses(session)
+    exposures = {frame.exposure_s for frame, _, _ in taken_frames(session) if frame.kind == "dark_scene"}
+    lab = lab_experiment(camera)
+    experiment = SimulatedExperiment(
+        lab.planes, lab.optics, lab.sensor, grid.rows, grid.columns, grid.pitch_mm, sum(exposures)
+    )
+    white_e = camera.unlit_photons_per_s * sum(exposures) * lab.sensor.quantum_efficiency
+    out.mkdir(parents=True)
+    write_ground_truth(out, experiment, np.stack([poses[node] for node in sorted(poses)]), white_e, snr, camera.mosaic)
+    return out
+
+
+def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
+    """Return rt_cam_ref (6,) of every node's dark-scene frame, as the simulated world has recorded it."""
+    recorded = {
+        frame.stop.node: np.array(taken.detail["camera"][TRUE_POSE])
+        for frame, taken, _ in taken_frames(session)
+        if frame.kind == "dark_scene"
+    }
+    reference = recorded[read_plan(session).plan.centre.node]
+    return {node: relative(pose, reference) for node, pose in recorded.items()}
+
+
+def true_set(session: Path, truth: Path) -> LoadedSet:
+    """Return a session's dark-scene views with the lens, the poses, the response and the noise that they really had."""
+    loaded, free = nominal_session(session), load_set(truth / NOISE_FREE)
+    poses = {view.node: view.rt_cam_ref for view in free.settings.view}
+    views = [msgspec.structs.replace(view, rt_cam_ref=poses[view.node]) for view in loaded.settings.view]
+    camera = msgspec.structs.replace(free.settings.camera, flat=None, mosaic=loaded.settings.camera.mosaic)
+    sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
+    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "quantum_efficiency")
+    noise = NoiseModel(**{name: getattr(sensor, name) for name in names}, saturation_dn=float(sensor.saturation_dn))
+    return replace(
+        loaded,
+        settings=msgspec.structs.replace(loaded.settings, camera=camera, view=views),
+        lens=free.lens,
+        noise=noise,
+        flat=free.flat,
+        unusable=np.zeros_like(loaded.unusable),
+        poses="true",
+    )
+
+
+def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method], compared: Method) -> dict[str, Any]:
+    """Return the contents of metrics.json: geometry, noise and planes against the truth."""
+    depths = read_plan(session).rig.scene.depth_mm
+    results = session / RECONSTRUCTIONS
+    measured = {
+        (method, depth): folder_of_method(results, method, list(methods)) / f"{plane_name(depth)}.tiff"
+        for method in methods
+        for depth in depths
+    }
+    metrics = assess(load_session(session), measured, truth)
+    assert metrics is not None
+    for loaded in (nominal_session(session), true_set(session, truth)):
+        planes = {(compared, depth): out / loaded.poses / f"{plane_name(depth)}.tiff" for depth in depths}
+        assessed = assess(loaded, planes, truth)
+        assert assessed is not None
+        metrics["planes"] += assessed["planes"]
+    return {"geometry": _geometry_errors(session), "noise": _noise_errors(session), **metrics}
+
+
+def _geometry_errors(session: Path) -> dict[str, Any]:
+    """Return by how much the measured camera centres, and directions, are off in the reference frame."""
+    poses = true_poses(session)
+    measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session).nodes}
+    shared = sorted(measured.keys() & poses.keys())
+    off_mm = np.array([_centre_mm(measured[node]) - _centre_mm(poses[node]) for node in shared])
+    turned_rad = np.array([relative(measured[node], poses[node])[:3] for node in shared])
+    return {
+        "nodes": len(shared),
+        "centre_rms_mm": float(np.sqrt(np.mean(np.sum(np.square(off_mm), axis=1)))),
+        "centre_rms_axes_mm": np.sqrt(np.mean(np.square(off_mm), axis=0)).tolist(),
+        "rotation_rms_mdeg": float(1e3 * np.degrees(np.sqrt(np.mean(np.sum(np.square(turned_rad), axis=1))))),
+    }
+
+
+def _noise_errors(session: Path) -> dict[str, Any]:
+    """Return what was measured of the sensor beside what is true."""
+    sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
+    measured = json.loads((session / NOISE_FILE).read_bytes())
+    names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
+    return {
+        name: {"value": measured[name]["value"], "se": measured[name].get("se"), "truth": getattr(sensor, name)}
+        for name in names
+    }
+
+
+def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return where a camera is, (3,), in the reference frame."""
+    return np.asarray(-cv2.Rodrigues(rt_cam_ref[:3])[0].T @ rt_cam_ref[3:], np.float64)
+
+
+def _simulated(camera: object) -> SimulatedSettings:
+    assert isinstance(camera, SimulatedSettings)
+    return camera

@@ -1,0 +1,262 @@
+"""Figure 4 of the paper: the error of the reconstruction against the SNR, for four objects."""
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.console import progress
+from faintfield.pipelines.paper.figure_methods import METHODS, FigureMethod
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.starts import back_projection
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck
+from faintfield.rig.simulation.scene import TexturedPlane, render
+
+SNRS = tuple(round(0.16 + 0.01 * step, 2) for step in range(8))
+PAPERS_AXIS = (0.0, 0.12)
+
+_DEPTH_MM = 600.0
+
+# A plane goes beyond its object by this part of its width, where there is nothing to see.
+_MARGIN = 16
+
+_POSITION_SD_MM, _ROTATION_SD_RAD = 0.3, 3.5e-3
+
+
+@dataclass(frozen=True)
+class Error:
+    """One point of the figure, of one draw of the noise.
+
+    Attributes
+    ----------
+    mse : float
+        Against the back-projection of the views without noise, over the object, which is scaled to 0…1.
+    mse_texture : float
+        The same against the object itself.
+    weight : float, optional
+        The weight that was best for this object and SNR, where the method was given the best one.
+    """
+
+    object: str
+    snr: float
+    method: str
+    mse: float
+    seed: int
+    mse_texture: float
+    weight: float | None
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One object alone before the camera, and what it should give.
+
+    Attributes
+    ----------
+    light : float32 array (view, row, column)
+        Relative to that of a white object.
+    region : bool array (row, column)
+        Where the reference view shows the object.
+    window : (slice, slice)
+        Rows and columns of the reference view that the plane's samples overlay: those about the object.
+    bright, texture : float array (row, column)
+        The back-projection of `light`, and the object, at the plane's samples.
+    """
+
+    name: str
+    experiment: SimulatedExperiment
+    operator: PlaneOperator
+    light: NDArray[np.float32]
+    region: NDArray[np.bool_]
+    window: tuple[slice, slice]
+    bright: Image
+    texture: Image
+
+    def exposures(self, seed: int) -> Iterator[tuple[float, ElementalImages, float]]:
+        """Yield SNR, images, and the electrons of a white object, from the darkest exposure to the brightest.
+
+        Each exposure is the one before with more photons and the same read noise. Each has the statistics of an
+        exposure of its own; what differs from one to the next is their light alone, not their luck.
+        """
+        sensor, exposure_s = self.experiment.sensor, self.experiment.exposure_s
+        dark_e = sensor.dark_current_e_per_s * exposure_s
+        in_region = self.light[self.experiment.reference_view][self.region]
+        generator = np.random.default_rng(seed)
+        read_noise_e = generator.normal(0.0, sensor.read_noise_e, self.light.shape)
+        counts = generator.poisson(dark_e, self.light.shape)
+        last_e = 0.0
+        for snr in SNRS:
+            scale_e = signal_scale_for_snr(in_region, snr, dark_e, sensor.read_noise_e)
+            counts += generator.poisson(self.light * (scale_e - last_e))
+            frames_dn = sensor.digitise(counts + read_noise_e)
+            electrons = (frames_dn - np.float32(sensor.offset_dn)) / np.float32(sensor.gain_dn_per_e)
+            yield snr, ElementalImages(electrons, dark_e, sensor.read_noise_e**2), scale_e
+            last_e = scale_e
+
+    def errors(self, plane: Image, scale_e: float) -> tuple[float, float]:
+        """Return the mean square errors of a plane against the bright one and against the texture."""
+        scaled, region = plane / scale_e, self.region[self.window]
+        return mean_square_error(scaled, self.bright, region), mean_square_error(scaled, self.texture, region)
+
+
+# By method and SNR.
+type _Weights = dict[tuple[str, float], float | None]
+type _Case = tuple[Stage, _Weights, int, tuple[float, ElementalImages, float]]
+
+
+def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
+    """Return the errors of all objects, SNRs, methods and draws of the noise.
+
+    Parameters
+    ----------
+    size_px : (int, int)
+        Width and height of the detector, of the paper's field of view.
+    seeds : int
+        Draws of the noise per object and SNR.
+    """
+    makers = (toy_truck, toy_airplane, sailing_boat, shaded_ball)
+    cases = progress(_exposures(makers, size_px, seeds), "figure 4: exposures", len(makers) * seeds * len(SNRS))
+    return [error for stage, weights, seed, exposure in cases for error in _errors(stage, weights, seed, *exposure)]
+
+
+def _exposures(
+    makers: Sequence[Callable[[float, float, float], TexturedPlane]], size_px: tuple[int, int], seeds: int
+) -> Iterator[_Case]:
+    """Yield every object at every SNR with every draw; an object's draws share the best weights."""
+    for make in makers:
+        stage = staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
+        weights: _Weights = {}
+        for seed in range(1, seeds + 1):
+            for exposure in stage.exposures(seed):
+                yield stage, weights, seed, exposure
+
+
+def _errors(
+    stage: Stage,
+    weights: _Weights,
+    seed: int,
+    snr: float,
+    images: ElementalImages,
+    scale_e: float,
+) -> Iterator[Error]:
+    """Yield the errors of all methods on one exposure; best weights are those of the first draw, kept in `weights`."""
+    for method in METHODS:
+        if seed > (method.draws or seed):
+            continue
+        if (method.name, snr) not in weights:
+            weights[method.name, snr] = _best_weight(stage, method, images, scale_e)
+        weight = weights[method.name, snr]
+        given = () if weight is None else (weight,)
+        mse, mse_texture = stage.errors(method.plane(stage.operator, images, *given), scale_e)
+        yield Error(stage.name, snr, method.name, mse, seed, mse_texture, weight)
+
+
+def _best_weight(stage: Stage, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
+    """Return the weight whose plane is nearest to the bright one, None for a method that finds its own."""
+    tried = {
+        weight: stage.errors(method.plane(stage.operator, images, weight), scale_e)[0] for weight in method.weights
+    }
+    return min(tried, key=tried.__getitem__) if tried else None
+
+
+def staged(shown: TexturedPlane, size_px: tuple[int, int]) -> Stage:
+    """Render an object from all nodes, and without noise, and make the operator of its plane."""
+    paper = paper_experiment(*size_px)
+    experiment = SimulatedExperiment((shown,), paper.optics, paper.sensor)
+    poses = experiment.poses_rt_cam_ref(_POSITION_SD_MM, _ROTATION_SD_RAD, np.random.default_rng(0))
+    optics = experiment.optics
+    light = np.stack([view.light for view in render([shown], optics, poses)])
+    ideal = next(render([shown], optics.ideal(), np.zeros((1, 6))))
+    lens = Lens(size_px, optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, optics.distortion)
+    region = ideal.visible[shown.name] > 0.5
+    window = _window(region)
+    operator = PlaneOperator(
+        plane_from_ray(poses, fronto_parallel_rt_ref_plane(shown.depth_mm)),
+        lens.rays().astype(np.float32),
+        _grid(experiment, window),
+        flat=optics.relative_illumination(),
+    )
+    bright = back_projection(operator, ElementalImages(light))
+    return Stage(shown.name, experiment, operator, light, region, window, bright, ideal.light[window])
+
+
+def _window(region: NDArray[np.bool_]) -> tuple[slice, slice]:
+    """Return the rows and columns of a region with a margin: a plane of these costs a fraction of a whole one."""
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    margin = -(-len(columns) // _MARGIN)
+    first_row, first_column = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
+    return slice(first_row, rows[-1] + 1 + margin), slice(first_column, columns[-1] + 1 + margin)
+
+
+def _grid(experiment: SimulatedExperiment, window: tuple[slice, slice]) -> PlaneGrid:
+    """Return the samples that overlay a window of the reference view pixel for pixel."""
+    optics = experiment.optics
+    pitch_mm = _DEPTH_MM / optics.fx_px
+    width, height = optics.size_px
+    (top, bottom, _), (left, right, _) = window[0].indices(height), window[1].indices(width)
+    origin_mm = ((left - optics.cx_px) * pitch_mm, (top - optics.cy_px) * pitch_mm)
+    return PlaneGrid((bottom - top, right - left), pitch_mm, origin_mm)
+
+
+def curves(errors: Sequence[Error]) -> list[dict[str, Any]]:
+    """Return the mean over the draws, and its standard error, for each object, method and SNR."""
+    groups: dict[tuple[str, str, float], list[Error]] = {}
+    for error in errors:
+        groups.setdefault((error.object, error.method, error.snr), []).append(error)
+    return [
+        {
+            "object": name,
+            "method": method,
+            "snr": snr,
+            "draws": len(group),
+            "mse": float(np.mean([error.mse for error in group])),
+            "standard_error": float(np.std([e.mse for e in group], ddof=1) / np.sqrt(len(group)))
+            if len(group) > 1
+            else None,
+            "mse_texture": float(np.mean([error.mse_texture for error in group])),
+        }
+        for (name, method, snr), group in groups.items()
+    ]
+
+
+def is_monotone(points: Sequence[dict[str, Any]], method: str) -> bool:
+    """Return whether every object's mean error by a method falls from each SNR to the next."""
+    falls = True
+    for name in {point["object"] for point in points}:
+        curve = sorted((p["snr"], p["mse"]) for p in points if (p["object"], p["method"]) == (name, method))
+        falls &= all(after[1] < before[1] for before, after in pairwise(curve))
+    return falls
+
+
+def over_best(points: Sequence[dict[str, Any]], method: str, best: str) -> dict[str, float]:
+    """Return for each object how many times its error with the best weight a method's is at most, of all SNRs."""
+    of = {(point["object"], point["method"], point["snr"]): float(point["mse"]) for point in points}
+    ratios: dict[str, float] = {}
+    for (name, of_method, snr), mse in of.items():
+        if of_method == method:
+            ratios[name] = max(ratios.get(name, 0.0), mse / of[name, best, snr])
+    return ratios
+
+
+def as_csv(rows: Sequence[dict[str, Any]]) -> str:
+    """Return rows of equal keys as CSV."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def as_rows(errors: Sequence[Error]) -> list[dict[str, Any]]:
+    """Return the errors as JSON-able rows."""
+    return [asdict(error) for error in errors]

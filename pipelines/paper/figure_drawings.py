@@ -1,0 +1,142 @@
+"""Figures 2, 3 and 4 as pictures for print."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, SNRS
+from faintfield.pipelines.paper.figure_methods import METHODS, OURS
+
+# Colours that stay apart for colour-blind readers (Okabe and Ito), with marks and dashes that tell them without colour.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_MARKS, _DASHES = "os^Dv<>", ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
+_STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "savefig.dpi": 200,
+    "axes.axisbelow": True,
+}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A plane (row, column) in electrons with what its axes need."""
+
+    pixels: NDArray[Any]
+    depth_mm: float
+    pitch_mm: float
+    origin_mm: tuple[float, float]
+
+
+def draw_figure2(integral: NDArray[Any], planes: Sequence[Shown]) -> bytes:
+    """Return figure 2 as PNG: the bright integral image, and back-projections on one grey scale."""
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(10.5, 3.1), layout="constrained")
+        first, *others = figure.subplots(1, 1 + len(planes))
+        first.imshow(integral, cmap="gray", vmin=0, vmax=255, interpolation="none")
+        first.set_title("(a) integral image, one view per node")
+        first.set_axis_off()
+        _draw_planes(figure, others, planes, "bc", "back-projection")
+        return _png(figure)
+
+
+def draw_figure3(
+    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[Shown]
+) -> bytes:
+    """Return figure 3 as PNG: one dark view and the noise reference on one scale, and the planes on another."""
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(10.5, 7.4), layout="constrained")
+        above, below = figure.subplots(2, 2)
+        for axes, frame, title in (
+            (above[0], dark, f"(a) one elemental image, SNR {snr:.2f}"),
+            (above[1], reference, "(b) noise reference"),
+        ):
+            image = axes.imshow(frame, cmap="gray", vmin=scale_dn[0], vmax=scale_dn[1], interpolation="none")
+            axes.set_title(title)
+            axes.set_xlabel("column (px)")
+            axes.set_ylabel("row (px)")
+        figure.colorbar(image, ax=above.tolist(), shrink=0.85, label="DN")
+        _draw_planes(figure, below.tolist(), planes, "cd", "TV-PMLEM")
+        return _png(figure)
+
+
+def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[Shown], letters: str, what: str) -> None:
+    """Draw planes on one grey scale, with axes in millimetres."""
+    white = max(float(np.quantile(plane.pixels, 0.998)) for plane in planes)
+    for one, plane, letter in zip(axes, planes, letters, strict=True):
+        rows, columns = plane.pixels.shape[:2]
+        left, top = (start - plane.pitch_mm / 2 for start in plane.origin_mm)
+        extent = (left, left + columns * plane.pitch_mm, top + rows * plane.pitch_mm, top)
+        image = one.imshow(plane.pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
+        one.set_title(f"({letter}) {what} at {plane.depth_mm:g} mm")
+        one.set_xlabel("x (mm)")
+        one.set_ylabel("y, downwards (mm)")
+    figure.colorbar(image, ax=list(axes), shrink=0.85, label="expected e⁻ per pixel")
+
+
+def draw_figure4(points: Sequence[dict[str, Any]]) -> bytes:
+    """Return figure 4 as PNG: as in the paper above, and below every method for each object."""
+    objects = list(dict.fromkeys(point["object"] for point in points))
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(10.5, 7.6), layout="constrained")
+        above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))).flat
+        papers, ours = above.subplots(1, 2)
+        for axes, title in ((papers, f"(a) on the paper's axis: {_title(OURS)}"), (ours, "(b) the same, nearer")):
+            for index, name in enumerate(objects):
+                _curve(axes, _of(points, name, OURS), index, name)
+            axes.set_title(title)
+            _name_axes(axes)
+            axes.set_ylim(0, None)
+        papers.set_ylim(*PAPERS_AXIS)
+        papers.legend(frameon=False, title="object", loc="upper right")
+        panels = below.subplots(1, len(objects), sharey=True)
+        for axes, name, letter in zip(np.atleast_1d(panels), objects, "cdefgh", strict=False):
+            for index, method in enumerate(METHODS):
+                _curve(axes, _of(points, name, method.name), index, method.title)
+            axes.axhspan(*PAPERS_AXIS, color="0.93", zorder=0)
+            axes.set_yscale("log")
+            axes.set_title(f"({letter}) {name}: all methods")
+            _name_axes(axes)
+            axes.label_outer()
+        handles, labels = np.atleast_1d(panels)[0].get_legend_handles_labels()
+        below.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+        return _png(figure)
+
+
+def _of(points: Sequence[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
+    """Return one curve's points in the order of SNR."""
+    chosen = [point for point in points if (point["object"], point["method"]) == (name, method)]
+    return sorted(chosen, key=lambda point: float(point["snr"]))
+
+
+def _title(method: str) -> str:
+    return next(known.title for known in METHODS if known.name == method)
+
+
+def _curve(axes: Axes, points: Sequence[dict[str, Any]], index: int, label: str) -> None:
+    """Draw the means with twice their standard errors."""
+    look: dict[str, Any] = {"color": _COLOURS[index % 7], "marker": _MARKS[index % 7], "linestyle": _DASHES[index % 7]}
+    bars = [2 * (point["standard_error"] or 0.0) for point in points]
+    snr, mse = [point["snr"] for point in points], [point["mse"] for point in points]
+    axes.errorbar(snr, mse, bars, label=label, markersize=4, linewidth=1.3, capsize=2, **look)
+
+
+def _name_axes(axes: Axes) -> None:
+    axes.set_xlabel("SNR, eq. (4)")
+    axes.set_ylabel("mean square error, object 0…1")
+    axes.set_xticks(SNRS[::2] if axes.get_position().width < 0.3 else SNRS)
+    axes.grid(alpha=0.3, linewidth=0.5)
+
+
+def _png(figure: Figure) -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png", metadata={"Software": None})
+    return content.getvalue()

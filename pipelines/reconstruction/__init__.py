@@ -1,0 +1,1 @@
+"""From a set to its planes: channels, solving, sweeps, depth maps, accuracy."""

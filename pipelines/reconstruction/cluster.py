@@ -1,0 +1,191 @@
+"""Tasks of a sweep on dask.distributed: on processes of this machine, or on whatever a scheduler has."""
+
+import logging
+import pickle
+import tempfile
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
+from faintfield.pipelines.formats.files import UNFINISHED, reported_as_cannot_write
+from faintfield.pipelines.formats.large_arrays import mapped
+from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
+from faintfield.pipelines.reconstruction.sweep import Channel, Crew, PlaneTask, one_by_one
+from faintfield.recon.likelihood.images import ElementalImages, Image
+
+_LOST = "run the same command again, and only what is missing is done; the logs of the workers say more"
+
+
+def crew_of(workers: int | None, scheduler: str | None) -> Crew:
+    """Return who does the tasks: this process, `workers` processes of one thread, or the workers of a scheduler.
+
+    Raises
+    ------
+    WrongUsage
+        Both are given.
+    MissingPackage
+        dask.distributed is not installed.
+    """
+    if workers is None and scheduler is None:
+        return one_by_one
+    if workers is not None and scheduler is not None:
+        raise WrongUsage("--workers starts processes here, --scheduler names one that has its own; give one of them")
+    _distributed()
+
+    def crew(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+        if not tasks:
+            return
+        with _client(workers, scheduler) as client, _shared_folder(out) as shared:
+            yield from _as_done(client, loaded, shared, tasks)
+
+    return crew
+
+
+def _distributed() -> Any:
+    """Return dask.distributed, which nothing else needs."""
+    try:
+        import distributed
+    except ImportError as failure:
+        raise MissingPackage(
+            "dask.distributed is not installed; it is an extra: pip install 'faintfield[cluster]', or leave out "
+            "--workers and --scheduler"
+        ) from failure
+    return distributed
+
+
+@contextmanager
+def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
+    """Connect to the workers, having started those of this machine."""
+    distributed = _distributed()
+    if scheduler is None:
+        options = {"dashboard_address": "127.0.0.1:0", "memory_limit": 0, "silence_logs": logging.CRITICAL}
+        one_thread = {"NUMBA_NUM_THREADS": "1"}
+        with (
+            distributed.LocalCluster(workers, threads_per_worker=1, env=one_thread, **options) as cluster,
+            distributed.Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = distributed.Client(scheduler)
+    except (OSError, ValueError) as failure:
+        raise ClusterFailed(
+            f"no scheduler answers at {scheduler} ({failure}); start `dask scheduler`, or correct --scheduler"
+        ) from failure
+    with client:
+        yield client
+
+
+@contextmanager
+def _shared_folder(out: Path) -> Iterator[Path]:
+    """Make a folder in `out` for what the workers read, and remove it in the end."""
+    with reported_as_cannot_write(out):
+        out.mkdir(parents=True, exist_ok=True)
+        folder = tempfile.TemporaryDirectory(
+            prefix=".shared.", suffix=UNFINISHED, dir=out.resolve(), ignore_cleanup_errors=True
+        )
+    with folder as name:
+        yield Path(name)
+
+
+def _as_done(
+    client: Any, loaded: LoadedSet, shared: Path, tasks: Sequence[PlaneTask]
+) -> Generator[tuple[PlaneTask, list[str]]]:
+    """Hand out the tasks, and yield each when it is done; those of a worker that dies are done by another."""
+    distributed = _distributed()
+    channels: dict[str, Path] = {}
+    pending: dict[Any, PlaneTask] = {}
+    try:
+        for task in tasks:
+            name = task.layout.name
+            if name not in channels:
+                channels[name] = _share(loaded, task.layout, shared)
+            elsewhere = replace(
+                task, files=tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
+            )
+            pending[client.submit(_do, channels[name], elsewhere, pure=False)] = task
+        for future in distributed.as_completed(list(pending)):
+            words = future.result()
+            future.release()  # or what a worker has done would be done again when it dies
+            yield pending.pop(future), words
+    except distributed.KilledWorker as failure:
+        raise ClusterFailed(f"{failure.allowed_failures + 1} workers died of the same plane; {_LOST}") from failure
+    except FileNotFoundError as failure:
+        raise ClusterFailed(
+            f"a worker does not find {failure.filename}; give --out a folder that all workers see under the same path"
+        ) from failure
+    except CancelledError as failure:
+        raise ClusterFailed(f"the scheduler went away with {len(pending)} tasks to be done; {_LOST}") from failure
+    finally:
+        client.cancel(list(pending))
+        if client.status == "running":
+            client.run(_opened.cache_clear)
+
+
+@dataclass(frozen=True)
+class _SharedChannel:
+    """A colour of a set as workers get it: the pixels by the files they are in, and what is small."""
+
+    loaded: LoadedSet
+    layout: ChannelLayout
+    shape: tuple[int, ...]
+    electrons: Path
+    valid: Path | None
+    background_e: float | Image
+    read_variance_e2: float | Image
+
+    def opened(self) -> Channel:
+        """Return the colour, its pixels read by memory map."""
+        images = ElementalImages(
+            np.asarray(np.memmap(self.electrons, np.float32, "r", shape=self.shape)),
+            self.background_e,
+            self.read_variance_e2,
+            None if self.valid is None else np.asarray(np.memmap(self.valid, np.bool_, "r", shape=self.shape)),
+        )
+        return Channel(self.loaded, self.layout, images)
+
+
+def _share(loaded: LoadedSet, layout: ChannelLayout, shared: Path) -> Path:
+    """Read a colour into files, and return the one that leads to them."""
+
+    def path_of(dtype: DTypeLike) -> Path:
+        return shared / f"{layout.name}.{np.dtype(dtype).name}"
+
+    def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        with reported_as_cannot_write(shared.parent), path_of(dtype).open("wb+") as file:
+            return mapped(file, shape, dtype)
+
+    images = load_channel(loaded, layout, allocate)
+    shared_channel = _SharedChannel(
+        loaded,
+        layout,
+        images.electrons.shape,
+        path_of(np.float32),
+        None if images.valid is None else path_of(np.bool_),
+        images.background_e,
+        images.read_variance_e2,
+    )
+    path = shared / layout.name
+    path.write_bytes(pickle.dumps(shared_channel))
+    return path
+
+
+@lru_cache(maxsize=1)
+def _opened(path: Path) -> Channel:
+    """Return the colour that a file of `_share` leads to; a worker keeps the last."""
+    shared: _SharedChannel = pickle.loads(path.read_bytes())
+    return shared.opened()
+
+
+def _do(path: Path, task: PlaneTask) -> list[str]:
+    """Do a task on a worker."""
+    return _opened(path).do(task)

@@ -1,0 +1,1 @@
+"""Sets whose truth is known: simulated light on a simulated sensor."""

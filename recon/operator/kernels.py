@@ -1,0 +1,174 @@
+# mypy: disable-error-code="no-untyped-def"
+# The types of compiled functions are numba's business: each call compiles them for what it is given.
+"""The sweep of the operator, compiled: gather, ratio and scatter of a block of pixels before the next is looked at.
+
+A detector row is worked through in blocks of `recon.operator.blocks.BLOCK_PX` pixels. For each block the plane coordinates of
+its pixels are computed once and used by both directions, so H and Hᵀ share their weights by construction. Nothing of
+the size views × pixels is written except by `FORWARD`.
+
+Rows of the detector are dealt out in tiles, tile `t` to worker `t mod workers`, and each worker adds into an
+accumulator of its own: sums are deterministic for a given number of workers.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.elementary import compiled
+from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
+from faintfield.recon.operator.blocks import (
+    BLOCK_PX,
+    COUNTED,
+    EXPECTED,
+    copy,
+    gather,
+    locate_on_all,
+    row_wanted_soon,
+    scatter,
+    weigh,
+    weights_of,
+)
+from faintfield.recon.pointers import advanced, index, pointer, wanted_soon
+
+TILE_ROWS = 8
+
+FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH = 0, 1, 2, 3, 4, 5
+
+
+class Geometry(NamedTuple):
+    """Where the detector pixels of every view meet the planes, as the kernels read it.
+
+    Attributes
+    ----------
+    homographies : array (plane × view × 9,)
+        From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous.
+    layout : int array (plane, 3)
+        Where each plane's samples begin in the samples of all; its rows and columns.
+    lattice_of_view : int array (view,)
+        Which lattice of detector pixels a view's image has.
+    detector : (int, int, int)
+        Rows and columns of the images, and padded columns of the maps below.
+    maps : array (3 × lattice × row × padded column,)
+        The ray of each pixel, x and y at unit depth, and its response: the flat field, zero for pixels that do not
+        count in any view. Rows are padded to whole blocks with rays of NaN, which meet nothing.
+    valid : uint8 array (view × row × column,)
+        Zero for pixels that do not count in this view; of size zero when all do.
+    transmission : array (plane × view × row × column,)
+        How much of a plane's light reaches a pixel; of size zero when all does.
+    reach : int array (view, row, 2)
+        From and up to which padded column a row's pixels meet any plane. Written by `REACH`.
+    """
+
+    homographies: NDArray[Any]
+    layout: NDArray[np.intp]
+    lattice_of_view: NDArray[np.intp]
+    detector: tuple[int, int, int]
+    maps: NDArray[Any]
+    valid: NDArray[np.uint8]
+    transmission: NDArray[Any]
+    reach: NDArray[np.intp]
+
+
+class PixelModel(NamedTuple):
+    """What is known of the numbers that pixels read, as the kernels read it.
+
+    Attributes
+    ----------
+    model : int
+        One of `recon.likelihood.pixel_models`.
+    background, variance : array (lattice × row × column,)
+        Expected electrons that are not light, and variance of the read noise.
+    level : float
+        Light level at which least squares takes the variance.
+    """
+
+    model: int
+    background: NDArray[Any]
+    variance: NDArray[Any]
+    level: float
+
+
+@compiled
+def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
+    """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
+
+    Parameters
+    ----------
+    operation : int
+        `FORWARD`: seen ← H planes, where not zero. `ADJOINT`: accumulator += Hᵀ images.
+        `RATIO`: accumulator += Hᵀ r, with the ratio r that the model of the pixels makes of images and H planes.
+        `VALUE`: only what is returned, which has no meaning unless the operation is this or the next.
+        `VALUE_AND_RATIO`: both; the logarithms of the value are a tenth of the time.
+        `REACH`: geometry.reach ← where rows meet the planes; it must go over all views, and come first.
+        What an operation does not name, it leaves alone.
+    planes, accumulator : array (sample,)
+        What is read, and what is added to: all planes, one after the other.
+    seen, images : array (image × row × column,)
+        What is written, and what is read; view v has image `image_of_view[v]`.
+    pixels : PixelModel
+        What is known of the pixels' numbers.
+    space : Workspace
+        The worker's own.
+    """
+    rows, columns, padded = geometry.detector
+    count_of_planes, count_of_views = geometry.layout.shape[0], index(geometry.lattice_of_view.size)
+    samples = accumulator.size if operation == ADJOINT else planes.size
+    scratch, blocks, layout = pointer(space.scratch), pointer(space.blocks), pointer(geometry.layout)
+    expected, models = scratch, pointer(space.models)
+    counted = advanced(scratch, index(COUNTED) if count_of_planes > 1 else weights_of(index(0)))
+    homographies, maps, layer = (
+        pointer(geometry.homographies),
+        pointer(geometry.maps),
+        index(geometry.maps.size // 3),
+    )
+    planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
+    background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
+    valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
+    masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
+    per_plane = count_of_views * index(rows * columns)
+    model, level = pixels.model, pixels.level
+    value = 0.0
+    for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
+        for view in views:
+            lattice, image = geometry.lattice_of_view[view], image_of_view[view]
+            for row in range(tile, min(tile + TILE_ROWS, rows)):
+                begin, end = geometry.reach[view, row, 0], geometry.reach[view, row, 1]
+                met_from, met_to = end, begin
+                for first in range(begin, end, BLOCK_PX):
+                    at = index((lattice * rows + row) * padded + first)
+                    if not locate_on_all(
+                        homographies, index(9 * view), count_of_views, layout, count_of_planes, samples,
+                        maps, layer, at, scratch, blocks,
+                    ):  # fmt: skip
+                        continue
+                    met_from, met_to = min(met_from, first), first + BLOCK_PX
+                    if operation == REACH:
+                        continue
+                    count = index(min(BLOCK_PX, columns - first))
+                    at = index((view * rows + row) * columns + first)
+                    if masked:
+                        wanted_soon(valid_at, at + index(columns))
+                        weigh(valid_at, at, index(0), count_of_planes, count, scratch)
+                    if occluded:
+                        weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
+                    pixel = index((image * rows + row) * columns + first)
+                    row_wanted_soon(images_at, pixel + index(columns))
+                    if operation == ADJOINT:
+                        copy(images_at, pixel, scratch, index(EXPECTED), count)
+                    else:
+                        gather(planes_at, layout, count_of_planes, scratch, blocks)
+                    if operation == FORWARD:
+                        copy(scratch, index(EXPECTED), seen_at, pixel, count)
+                        continue
+                    if operation != ADJOINT:
+                        at = index((lattice * rows + row) * columns + first)
+                        value += form_ratio_of_block(
+                            model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
+                            advanced(variance_at, at), counted, level, models, operation != RATIO,
+                        )  # fmt: skip
+                    if operation != VALUE:
+                        scatter(added_at, layout, count_of_planes, scratch, blocks)
+                if operation == REACH:
+                    geometry.reach[view, row, 0], geometry.reach[view, row, 1] = met_from, met_to
+    return value

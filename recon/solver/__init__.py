@@ -1,0 +1,1 @@
+"""Penalised maximum likelihood: problems, penalties, iterations, weights, uncertainty."""

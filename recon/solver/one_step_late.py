@@ -1,0 +1,165 @@
+"""MLEM and one-step-late PMLEM, the iterations of eq. (2) as published.
+
+They are generators of iterates; when to stop, what to show and what to save is the caller's business. None knows it has
+converged: `settled` and `oscillates` judge what the caller has seen. `recon.solver.pmlem` knows.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.errors import NotConverged
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.solver.penalties import total_variation_gradient
+from faintfield.recon.solver.starts import well_seen_samples
+
+# |P| of eq. (3) is at most 1 + 1 + √2: two differences that cannot exceed their own magnitude, and the sum of two.
+_LARGEST_PENALTY_GRADIENT = 2 + 2**0.5
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far one pass over the data moved the plane.
+
+    Attributes
+    ----------
+    passes : int
+        Passes over all views so far.
+    relative_change : float
+        ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
+    alternation : float
+        Cosine between this step and the one before: −1 when the iteration swings to and fro, 0 at the first pass.
+    """
+
+    passes: int
+    relative_change: float
+    alternation: float
+
+
+@dataclass(frozen=True)
+class Iterate:
+    """What one pass over the data made.
+
+    Attributes
+    ----------
+    plane : float array (row, column)
+        Expected electrons per detector pixel.
+    step : Step
+        How it differs from the iterate before; worth keeping when the plane is not.
+    """
+
+    plane: Image
+    step: Step
+
+
+def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
+    """Yield iterates of MLEM, eq. (2) with β = 0: maximum likelihood, which fits the noise when carried far."""
+    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
+
+
+def pmlem_one_step_late(
+    operator: PlaneOperator, images: ElementalImages, start: Image, *, penalty_weight: float, epsilon: float
+) -> Iterator[Iterate]:
+    """Yield iterates of Green's one-step-late PMLEM with total variation, eqs. (2) and (3) as published.
+
+    `f ← f / ( s + β P{f} ) · Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ]`: the shifted Poisson model adds the read noise's
+    variance to data and model, after which the data are nearly Poisson; with σ = 0 it is eq. (2) itself.
+
+    Parameters
+    ----------
+    start : float array (row, column)
+        Positive where it shall be able to change.
+    penalty_weight : float
+        β ≥ 0, in the unit of s.
+    epsilon : float
+        ε > 0 of eq. (3), in the unit of f squared.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of its range, or `start` is not positive.
+    NotConverged
+        The weight is so large that most denominators could become negative, or an iterate is not finite.
+
+    Notes
+    -----
+    The denominator is positive for every f only where `s > (2 + √2) β`. Samples seen by fewer views keep their start
+    value, see `updated_samples`; the denominator is not clamped. Iterates need not converge: with a large β they swing
+    without end, which `oscillates` tells.
+    """
+    if not (penalty_weight >= 0 and epsilon > 0):
+        raise ValueError(f"need penalty_weight >= 0 and epsilon > 0, got {penalty_weight} and {epsilon}")
+    if not (start > 0).all():
+        raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
+    sensitivity = operator.sensitivity()
+    updated = updated_samples(sensitivity, penalty_weight)
+    seen = well_seen_samples(sensitivity)
+    if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
+        limit = float(np.median(sensitivity[seen])) / _LARGEST_PENALTY_GRADIENT
+        raise NotConverged(
+            f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
+            f"must stay below {limit:.3g}: give a smaller one"
+        )
+    return _one_step_late(operator, images, start, penalty_weight, epsilon, sensitivity, updated)
+
+
+def _one_step_late(
+    operator: PlaneOperator,
+    images: ElementalImages,
+    start: Image,
+    penalty_weight: float,
+    epsilon: float,
+    sensitivity: Image,
+    updated: NDArray[np.bool_],
+) -> Iterator[Iterate]:
+    """Iterate eq. (2) for ever."""
+    plane = np.array(start, operator.dtype)
+    step = np.zeros_like(plane)
+    passes = 0
+    while True:
+        denominator = sensitivity
+        if penalty_weight > 0:
+            denominator = total_variation_gradient(plane, epsilon)
+            denominator *= plane.dtype.type(penalty_weight)
+            denominator += sensitivity
+        next_plane = operator.adjoint_of_ratio(plane, images)
+        next_plane *= plane
+        np.divide(next_plane, denominator, out=next_plane, where=updated)
+        np.copyto(next_plane, plane, where=~updated)
+        if not np.isfinite(next_plane).all():
+            raise NotConverged(f"pass {passes + 1} left the finite numbers; give a smaller penalty weight")
+        passes += 1
+        last_step, step = step, next_plane - plane
+        norms = float(np.linalg.norm(step)) * float(np.linalg.norm(last_step))
+        alternation = float(np.vdot(step, last_step)) / norms if norms > 0 else 0.0
+        change = float(np.linalg.norm(step) / np.linalg.norm(plane)) if step.any() else 0.0
+        plane = next_plane
+        yield Iterate(plane, Step(passes, change, alternation))
+
+
+def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.bool_]:
+    """Return which samples one-step-late PMLEM changes: those whose denominator is positive whatever the plane."""
+    return np.asarray(sensitivity > _LARGEST_PENALTY_GRADIENT * penalty_weight)
+
+
+def settled(steps: Sequence[Step], tolerance: float) -> bool:
+    """Return whether the last pass changed the plane by less than `tolerance`, relatively."""
+    return bool(steps) and steps[-1].relative_change < tolerance
+
+
+def oscillates(steps: Sequence[Step], tolerance: float, window: int = 10) -> bool:
+    """Return whether the iteration swings to and fro instead of settling.
+
+    True when over the last `window` passes successive steps oppose each other on the whole (mean cosine below −0.5),
+    are larger than `tolerance`, and do not shrink (the window's second half moves at least 0.8 times as far).
+    """
+    if len(steps) < window:
+        return False
+    last = steps[-window:]
+    changes = [step.relative_change for step in last]
+    early, late = np.mean(changes[: window // 2]), np.mean(changes[window // 2 :])
+    alternation = np.mean([step.alternation for step in last])
+    return bool(alternation < -0.5 and late > tolerance and late >= 0.8 * early)

@@ -1,0 +1,158 @@
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+"""Steps on the dual field of a penalised plane, compiled: several at a time on a strip of rows.
+
+The penalty of a plane x is `β Σ φ(|∇x|)`, with `(∇x)[i,j] = (x[i+1,j] − x[i,j], x[i,j+1] − x[i,j])` and no difference
+taken across an edge. Its dual field p has a vector of length at most one for each sample (of any length where φ is
+quadratic everywhere), and determines the plane: `x = ( v − β/w ∇ᵀp )₊`.
+
+A step changes a row of p by means of the rows beside it, so n steps on a strip need n rows more on each side, whose
+values become stale one after the other. Each strip works on a copy: strips need no order among themselves, and the
+result does not depend on how many there are.
+"""
+
+import numpy as np
+
+from faintfield.recon.elementary import compiled
+
+
+@compiled
+def _plane_row(row, down, right, centre, reach, values):
+    """Set `values` to a row of `v − β/w ∇ᵀp`; the fields have a row and a column of zeros before their first."""
+    for j in range(centre.shape[1]):
+        divergence = down[row + 1, j + 1] - down[row, j + 1] + right[row + 1, j + 1] - right[row + 1, j]
+        values[j] = centre[row, j] + reach[row, j] * divergence
+
+
+@compiled
+def _kept_positive(values):
+    """Clip a row at zero, and repeat its last value after it."""
+    for j in range(values.size - 1):
+        values[j] = max(values[j], values.dtype.type(0))
+    values[values.size - 1] = values[values.size - 2]
+
+
+@compiled
+def _step_row(x, below, step, smoothing, bounded, momentum, fields):
+    """Make one accelerated step on a row of the dual field; return how far it goes against the momentum."""
+    p_down, p_right, q_down, q_right = fields
+    number = x.dtype.type
+    one, against = number(1), number(0)
+    for j in range(step.size):
+        size = step[j]
+        shrink = one / (one + size * smoothing)
+        down = (q_down[j] + size * (below[j] - x[j])) * shrink
+        right = (q_right[j] + size * (x[j + 1] - x[j])) * shrink
+        length = np.sqrt(down * down + right * right)
+        inverse = one / max(length, one) if bounded else one
+        down *= inverse
+        right *= inverse
+        ahead_down, ahead_right = down - p_down[j], right - p_right[j]
+        against += (q_down[j] - down) * ahead_down + (q_right[j] - right) * ahead_right
+        p_down[j] = down
+        p_right[j] = right
+        q_down[j] = down + momentum * ahead_down
+        q_right[j] = right + momentum * ahead_right
+    return against
+
+
+@compiled
+def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, steps, smoothing, bounded, momenta):
+    """Make `momenta.size` accelerated projected gradient steps on rows `first` to `stop` of the dual field.
+
+    Parameters
+    ----------
+    dual, ahead : array (2, row, column)
+        The field p and the field extrapolated beyond it, on entry.
+    next_dual, next_ahead : array (2, row, column)
+        Receive them, in the strip's rows.
+    centre, reach, steps : array (row, column)
+        v, β/w, and the size of the step at each sample.
+    smoothing : number
+        δ of the penalty, in the unit of the plane.
+    bounded : bool
+        Whether |p| ≤ 1.
+    momenta : array (step,)
+        Extrapolation of each step.
+
+    Returns
+    -------
+    float
+        How far the last step went against its momentum: positive when it is time to drop that.
+    """
+    rows, columns = centre.shape
+    halo = momenta.size
+    top, bottom = max(first - halo, 0), min(stop + halo, rows)
+    height = bottom - top
+    local = np.zeros((4, height + 1, columns + 1), centre.dtype)
+    above = max(top - 1, 0)
+    for part in range(2):
+        local[part, 1:, 1:] = dual[part, top:bottom]
+        local[2 + part, 1:, 1:] = ahead[part, top:bottom]
+    if top > 0:
+        local[2, 0, 1:] = ahead[0, above]
+    here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
+    strip_centre, strip_reach = centre[top:bottom], reach[top:bottom]
+    smoothing = centre.dtype.type(smoothing)
+    against = 0.0
+    for n in range(momenta.size):
+        momentum = centre.dtype.type(momenta[n])
+        _plane_row(0, local[2], local[3], strip_centre, strip_reach, here)
+        _kept_positive(here)
+        against = 0.0
+        for row in range(height):
+            if row + 1 < height:
+                _plane_row(row + 1, local[2], local[3], strip_centre, strip_reach, below)
+                _kept_positive(below)
+            else:
+                below[:] = here
+            fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])
+            sums = _step_row(here, below, steps[top + row], smoothing, bounded, momentum, fields)
+            if first <= top + row < stop:
+                against += sums
+            here, below = below, here
+    for part in range(2):
+        next_dual[part, first:stop] = local[part, 1 + first - top : 1 + stop - top, 1:]
+        next_ahead[part, first:stop] = local[2 + part, 1 + first - top : 1 + stop - top, 1:]
+    return against
+
+
+@compiled
+def plane_of_dual(first, stop, dual, centre, reach, plane):
+    """Set rows of `plane` to `v − β/w ∇ᵀp`, not clipped at zero."""
+    zero = centre.dtype.type(0)
+    for row in range(first, stop):
+        for j in range(centre.shape[1]):
+            divergence = dual[0, row, j] + dual[1, row, j]
+            divergence -= dual[0, row - 1, j] if row > 0 else zero
+            divergence -= dual[1, row, j - 1] if j > 0 else zero
+            plane[row, j] = centre[row, j] + reach[row, j] * divergence
+
+
+@compiled
+def penalty_and_slack(first, stop, plane, dual, smoothing, bounded):
+    """Return Σ φ(|∇x|) over rows of max(plane, 0), and how far p is from being its subgradient: Σ φ − p·∇x + ½ δ |p|².
+
+    Each term of the second sum is at least zero, and zero where p belongs to x.
+    """
+    rows, columns = plane.shape
+    number = plane.dtype.type
+    zero, half, smoothing = number(0), number(0.5), number(smoothing)
+    penalty, slack = 0.0, 0.0
+    for row in range(first, stop):
+        below = min(row + 1, rows - 1)
+        of_row, slack_of_row = zero, zero
+        for j in range(columns):
+            x = max(plane[row, j], zero)
+            down = max(plane[below, j], zero) - x
+            right = max(plane[row, min(j + 1, columns - 1)], zero) - x
+            square = down * down + right * right
+            length = np.sqrt(square)
+            quadratic = (length < smoothing) | (not bounded)
+            value = half * square / max(smoothing, number(1e-30)) if quadratic else length - half * smoothing
+            p_down, p_right = dual[0, row, j], dual[1, row, j]
+            tie = half * smoothing * (p_down * p_down + p_right * p_right) - down * p_down - right * p_right
+            of_row += value
+            slack_of_row += max(value + tie, zero)
+        penalty += of_row
+        slack += slack_of_row
+    return penalty, slack

@@ -1,0 +1,1 @@
+"""The capture: the loop over frames, its prompts and checks."""

@@ -1,0 +1,136 @@
+"""From the configuration to the devices it names, real or simulated."""
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import msgspec
+
+from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.gphoto2 import GPhoto2Camera
+from faintfield.rig.cameras.micromanager import MicroManagerCamera
+from faintfield.rig.cameras.protocol import Camera
+from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
+from faintfield.rig.cameras.simulated import SimulatedCamera
+from faintfield.rig.clock import Clock, WallClock
+from faintfield.rig.errors import PlanRefused
+from faintfield.rig.plan import StepKind
+from faintfield.rig.settings import RigSettings
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.link import PtyLink
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
+
+# A port that begins so is a simulated stage; what follows names its controller.
+SIMULATED = "simulated:"
+SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The devices of a capture, not yet connected.
+
+    Parameters
+    ----------
+    stage, camera : Gantry, Camera
+        What moves and what sees.
+    clock : Clock
+        The time that both live in.
+    arrange : callable
+        Told at the beginning of each step, by its kind and sweep; a simulated lab then does what a person has done
+        in a real one.
+    """
+
+    stage: Gantry
+    camera: Camera
+    clock: Clock
+    arrange: Callable[[StepKind, int], None]
+
+
+def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
+    """Return the stage and the camera that a rig.toml describes.
+
+    Raises
+    ------
+    PlanRefused
+        A simulated camera needs a simulated stage: only there it is known where the camera truly is.
+    """
+    bench = _simulated_bench(settings.stage) if is_simulated(settings.stage) else None
+    stage = open_stage(settings.stage, traffic, bench)
+    match settings.camera:
+        case GPhoto2Settings():
+            camera: Camera = GPhoto2Camera(settings.camera)
+        case MicroManagerSettings():
+            camera = MicroManagerCamera(settings.camera)
+        case FolderSettings():
+            camera = FolderCamera(settings.camera, WallClock())
+        case SimulatedSettings() if bench is not None:
+            lab = _lab(settings, settings.camera, bench)
+            camera = SimulatedCamera(settings.camera, stage.clock, lab)
+            return Rig(stage, camera, stage.clock, lab.arrange)
+        case SimulatedSettings():
+            raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
+    return Rig(stage, camera, stage.clock, lambda kind, sweep: None)
+
+
+def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench: Bench | None = None) -> Gantry:
+    """Return the stage that `settings` describe, not yet connected.
+
+    Protocol `simulated`, or a port `simulated:grbl` or `simulated:marlin`, gives a simulated stage that keeps its own
+    time: nothing takes any.
+
+    Parameters
+    ----------
+    settings : StageSettings
+        The `[stage]` table.
+    traffic : TrafficLog, optional
+        Where every byte is recorded.
+    bench : Bench, optional
+        The simulated world that a simulated stage shall stand in; one of its own without it.
+
+    Raises
+    ------
+    PlanRefused
+        No such stage is simulated.
+    """
+    traffic = traffic or NoTrafficLog()
+    if is_simulated(settings):
+        bench = bench or _simulated_bench(settings)
+        port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
+        return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
+    return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
+
+
+def is_simulated(settings: StageSettings) -> bool:
+    """Return whether the stage that `settings` describe exists in the computer alone."""
+    return settings.protocol == "simulated" or settings.port.startswith(SIMULATED)
+
+
+def _simulated_bench(settings: StageSettings) -> Bench:
+    """Return the bench of the simulated stage that `settings` name, such as `simulated:grbl` or `simulated:grbl:pty`.
+
+    With the latter, every byte goes through a pseudo-terminal and pyserial.
+    """
+    name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
+    if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
+        raise PlanRefused(
+            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, each "
+            "also with :pty behind it"
+        )
+    if not cable:
+        return Bench(SIMULATED_FIRMWARE[name or "grbl"])
+    link = PtyLink()
+    bench = Bench(SIMULATED_FIRMWARE[name], link)
+    weakref.finalize(bench, link.close)
+    return bench
+
+
+def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
+    """Return the simulated lab around the simulated stage."""
+    return SimulatedLab(settings.grid.centre().target, bench.true_position, bench.still_s, settings.board, camera)
