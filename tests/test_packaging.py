@@ -1,4 +1,4 @@
-"""The distribution holds one package, all of its files and nothing else; and `import faintfield` offers the public names."""
+"""The distribution holds one package with all of its files; `import faintfield` offers the public names."""
 
 import ast
 import re
@@ -18,7 +18,7 @@ import faintfield
 _ROOT = Path(__file__).parents[1]
 _FOLDERS = ("rig", "calib", "recon", "pipelines")
 _BUILT_FROM = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "faintfield", *_FOLDERS, "tests")
-# `import faintfield` and nothing else; what it loads is compared with what Python had loaded before.
+# Prints the modules that `import faintfield` loads.
 _IMPORT = "import sys; before = set(sys.modules); import faintfield; print(*sorted(set(sys.modules) - before))"
 
 
