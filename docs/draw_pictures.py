@@ -1,6 +1,6 @@
 """Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
-Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on the
+Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on a
 simulated rig, which is started for it.
 """
 
