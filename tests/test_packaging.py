@@ -79,9 +79,15 @@ def test_a_wheel_needs_neither_mrcal_nor_a_second_opencv() -> None:
     assert {name for name in needed | offered if name.startswith("opencv")} == {"opencv-contrib-python-headless"}
 
 
+@pytest.mark.parametrize("name", ["README.md", ".ci/run", "docs/decisions/001-mrcal-is-installed-apart.md"])
+def test_the_line_that_installs_mrcal_is_the_same_everywhere(name: str) -> None:
+    assert "install --no-deps mrcal numpysane" in (_ROOT / name).read_text()
+
+
 def test_documents_state_the_version_of_the_project() -> None:
     version = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert f"\nversion: {version}\n" in (_ROOT / "CITATION.cff").read_text()
+    assert f" faintfield-{version}-py3-none-any.whl\n" in (_ROOT / "README.md").read_text()
     newest = re.findall(r"^## \[(\d[^\]]*)\]", (_ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
     assert newest[0] == version
     assert newest == sorted(newest, key=lambda it: [int(part) for part in it.split(".")], reverse=True)
