@@ -38,8 +38,8 @@ results: $(VENV)/installed ## the demo's figures and pictures, put into README.m
 lock: ## renew requirements.lock from pyproject.toml; it leaves out the extras for cameras, napari and BM3D
 	$(PYTHON) -m venv .uv
 	.uv/bin/pip --disable-pip-version-check --quiet install uv
-	.uv/bin/uv pip compile pyproject.toml --extra cluster --extra zarr --group dev --universal --upgrade --generate-hashes --no-annotate \
-	  --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
+	.uv/bin/uv pip compile pyproject.toml --extra cluster --extra zarr --group dev --universal --upgrade \
+	  --generate-hashes --no-annotate --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
 
 clean: ## remove what the tasks made
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
