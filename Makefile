@@ -1,5 +1,5 @@
-# One word per task. Needs make, python3 (3.12 or newer, with venv) and a package index; everything else is installed
-# into .venv from requirements.lock.
+# One word per task. Needs make, python3 (3.12 or newer, with venv) and a package index; installs everything else from
+# requirements.lock into .venv.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -26,7 +26,7 @@ lint: $(VENV)/installed ## style, types and import contracts
 bench: $(VENV)/compiled build/bench ## speed against peers, as ratios; docs/benchmarks.md keeps the last result
 	PYTHONPATH=build/bench $(BIN)/python -m benchmarks --keep docs/benchmarks.md
 
-# What only benchmarks compare with stays out of the environment
+# Packages that only the benchmarks compare with stay out of .venv.
 build/bench:
 	$(PIP) install --no-deps --target $@ 'pylops>=2.4' 'pyproximal>=0.10' || mkdir -p $@
 
@@ -35,15 +35,15 @@ results: $(VENV)/installed ## the demo's figures and pictures, put into README.m
 	$(BIN)/python docs/collect_results.py $(OUT)
 	PYTHONPATH=. $(BIN)/python docs/draw_pictures.py $(OUT)
 
-lock: ## renew requirements.lock from pyproject.toml; cameras are extras and not in it
+lock: ## renew requirements.lock from pyproject.toml; it leaves out the extras for cameras, napari and BM3D
 	$(PYTHON) -m venv .uv
 	.uv/bin/pip --disable-pip-version-check --quiet install uv
-	.uv/bin/uv pip compile pyproject.toml --extra dev --universal --upgrade --generate-hashes --no-annotate \
-	  --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
+	.uv/bin/uv pip compile pyproject.toml --extra cluster --extra zarr --group dev --universal --upgrade \
+	  --generate-hashes --no-annotate --no-header --no-emit-index-url --override overrides.txt --quiet -o requirements.lock
 
 clean: ## remove what the tasks made
 	find . -name __pycache__ -not -path './$(VENV)/*' -prune -exec rm -rf {} +
-	rm -rf $(VENV) .uv build demo *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) .uv build dist demo *.egg-info .ruff_cache .mypy_cache .pytest_cache .hypothesis .import_linter_cache
 
 $(VENV)/installed: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \
@@ -54,7 +54,7 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	$(PIP) install --no-deps --no-build-isolation -e .
 	@touch $@
 
-# numba notices a change of the file that it compiled, not of those whose functions that file calls
+# numba compiles a file again when that file changes, but not when a file changes whose functions it calls.
 $(VENV)/compiled: $(VENV)/installed $(wildcard recon/*.py recon/*/*.py)
 	@echo "Compiling the kernels ..."
 	find recon -name '*.nb[ci]' -delete

@@ -1,6 +1,6 @@
-"""Put the figures of a finished demo into docs/results.json and README.md: `python docs/collect_results.py demo`.
+"""Put the numbers of a finished demo into docs/results.json and README.md: `python docs/collect_results.py demo`.
 
-README's table is made from results.json by `filled`, and a test holds the two together: no figure is typed.
+`filled` makes README's table from results.json, and a test compares the two, so that no number is typed by hand.
 """
 
 import json
@@ -20,7 +20,6 @@ _METHODS = {
     "pmlem-osl": "PMLEM, the paper's one-step-late iteration",
     "pmlem": "PMLEM, to its optimum",
 }
-
 _NOISE = {
     "gain_dn_per_e": ("gain", "DN/e⁻"),
     "read_noise_e": ("read noise", "e⁻"),
@@ -29,7 +28,7 @@ _NOISE = {
 
 
 def collect(demo: Path) -> dict[str, Any]:
-    """Return what README says of the demo in a folder, rounded as it deserves."""
+    """Return the numbers of the demo in a folder that README states, rounded to their precision."""
     metrics = json.loads((demo / "metrics.json").read_text())
     made = json.loads(next(demo.rglob("reconstruction.json")).read_text())
     planes = [
@@ -53,7 +52,7 @@ def collect(demo: Path) -> dict[str, Any]:
 
 
 def table(results: dict[str, Any]) -> str:
-    """Return the results in Markdown."""
+    """Return the results as a Markdown table and a sentence."""
     depths = sorted({row["depth_mm"] for row in results["planes"]})
     lines = [
         f"| mean square error at SNR {results['snr']:g}, {results['photons_per_px']:g} photons per pixel | "
@@ -70,21 +69,21 @@ def table(results: dict[str, Any]) -> str:
         }
         cells = " | ".join(of_depth.get(depth, "–") for depth in depths)
         lines.append(f"| {_METHODS[method]}, {poses} poses | {cells} |")
-    said = [
+    measured = [
         f"{words} {known['value']:g} ± {known['se']:.1g} {unit} (true: {known['truth']:g})"
         for name, (words, unit) in _NOISE.items()
         if (known := results.get("noise", {}).get(name))
     ]
     if "centre_rms_mm" in results:
-        said.insert(0, f"camera centres {results['centre_rms_mm']:g} mm rms off the true ones")
-    return "\n".join([*lines, *(["", f"Measured on the way: {'; '.join(said)}."] if said else [])]) + "\n"
+        measured.insert(0, f"camera centres {results['centre_rms_mm']:g} mm rms off the true ones")
+    return "\n".join([*lines, *(["", f"Measured on the way: {'; '.join(measured)}."] if measured else [])]) + "\n"
 
 
 def filled(readme: str, results: dict[str, Any]) -> str:
-    """Return the text of README.md with its marked block made anew."""
+    """Return the text of README.md with its marked block replaced."""
     made, count = _BLOCK.subn(lambda _: table(results), readme)
     if count != 1:
-        raise ValueError(f"README.md has {count} marked blocks of results; one is wanted")
+        raise ValueError(f"README.md has {count} marked blocks of results; leave exactly one")
     return made
 
 

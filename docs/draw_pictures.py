@@ -1,7 +1,7 @@
 """Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
-Run it from the repository's root. Pages are taken by a real Chromium; that of a capture shows one on the simulated
-rig, begun for the purpose.
+Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on a
+simulated rig, which is started for it.
 """
 
 import base64
@@ -30,7 +30,7 @@ _PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
 
 
 def draw_planes(demo: Path) -> None:
-    """Draw one dark view beside both planes, as the mean of all views and by PMLEM, on one grey scale."""
+    """Draw one dark view next to both planes, as the mean of all views and by PMLEM, on one grey scale."""
     view = read_frame(_first(demo, "*_dark_scene_*_r3_c3_*.tiff")).pixels_dn
     black, white = np.quantile(view, (0.001, 0.999))
     penalised = next(method for method in _PENALISED if _found(demo, f"{method}/{_TRUCK}"))
@@ -46,12 +46,12 @@ def draw_planes(demo: Path) -> None:
 
 
 def draw_noise_page(demo: Path) -> None:
-    """Copy the page of a noise result, reduced."""
+    """Copy the page of a noise result at the width of the other pictures."""
     _keep(_first(demo, "noise_page.png").read_bytes(), "noise")
 
 
 def draw_pages(demo: Path) -> None:
-    """Take the pages of a reconstruction and of a stage as a browser shows them, and the one of a capture."""
+    """Take pictures of the pages of a reconstruction, a stage and a capture as a browser shows them."""
     with TemporaryDirectory() as scratch, browsing(Path(scratch) / "browser") as tab:
         tab.call("Emulation.setScrollbarsHidden", hidden=True)
         for name, page, height_px in _PAGES:
@@ -94,39 +94,39 @@ def _capturing(folder: Path) -> Iterator[str]:
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, env=os.environ)
     try:
         assert process.stderr is not None
-        said = next(line for line in process.stderr if line.startswith("page: "))
-        yield said.removeprefix("page: ").strip()
+        address = next(line for line in process.stderr if line.startswith("page: "))
+        yield address.removeprefix("page: ").strip()
     finally:
         process.kill()
         process.wait()
 
 
 def _resize(tab: Tab, height_px: int) -> None:
-    """Give the page so much room."""
+    """Set the height of the browser window; its width is that of all pictures."""
     size = {"width": 1100, "height": height_px}
     tab.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=False)
 
 
 def _take(tab: Tab, name: str) -> None:
-    """Keep what the browser shows."""
+    """Save what the browser shows as a picture of that name."""
     _keep(base64.b64decode(tab.call("Page.captureScreenshot", format="png")["data"]), name)
 
 
 def _keep(content: bytes, name: str) -> None:
-    """Write a PNG into the folder of pictures, reduced and in 256 colours: it is looked at, not measured."""
+    """Write a PNG into the folder of pictures, smaller and in 256 colours, which is enough to look at."""
     with Image.open(io.BytesIO(content)) as picture:
         picture.thumbnail((_WIDTH_PX, 4 * _WIDTH_PX))
-        few = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-        few.save(_PICTURES / f"{name}.png", optimize=True)
+        reduced = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        reduced.save(_PICTURES / f"{name}.png", optimize=True)
 
 
 def _found(demo: Path, name: str) -> list[Path]:
-    """Return the files of that name, those that lie less deep before others."""
+    """Return the files of that name, those in shallower folders first."""
     return sorted(demo.rglob(name), key=lambda path: len(path.parts))
 
 
 def _first(demo: Path, name: str) -> Path:
-    """Return the first of them."""
+    """Return the first file of that name."""
     if found := _found(demo, name):
         return found[0]
     raise FileNotFoundError(f"no {name} in {demo}; run `faintfield demo {demo}` to its end")

@@ -1,1 +1,113 @@
-"""See in the dark: photon-starved integral imaging, calibrated and reconstructed in 3D."""
+"""Photon-starved integral imaging: calibrate a camera on a grid of nodes, and reconstruct what it saw in the dark.
+
+`__all__` lists the public names, and docs/api.md shows them in use. A name is loaded from its module at its first use,
+so `import faintfield` is quick.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+# Public name: its module below faintfield, and after a colon its name there if that differs.
+_MODULES = {
+    "Board": "calib.board",
+    "BoardObservation": "calib.geometry",
+    "CalibrationError": "calib.errors",
+    "CapturePlan": "rig.plan",
+    "Conditions": "calib.noise",
+    "DataFit": "recon.solver.data_fit",
+    "ElementalImages": "recon.likelihood.images",
+    "Grid": "rig.plan",
+    "InputError": "pipelines.errors",
+    "Lens": "calib.lens",
+    "MotionLimits": "rig.stages.protocol",
+    "OutsideTravel": "rig.errors",
+    "PlaneGrid": "recon.operator.grid",
+    "PlaneOperator": "recon.operator.plane",
+    "Point": "rig.stages.protocol",
+    "ReconstructionError": "recon.errors",
+    "RigError": "rig.errors",
+    "RigSettings": "rig.settings",
+    "StageSettings": "rig.stages.settings",
+    "Step": "rig.plan",
+    "Target": "calib.geometry",
+    "back_projection": "recon.solver.starts",
+    "calibrate_geometry": "calib.geometry",
+    "calibrate_noise": "calib.noise:calibrate",
+    "channel_layouts": "pipelines.reconstruction.channels",
+    "detect_all": "calib.detection",
+    "fronto_parallel_rt_ref_plane": "calib.homography",
+    "load_channel": "pipelines.reconstruction.channels",
+    "load_set": "pipelines.formats.sets.elemental_set",
+    "measure_series": "calib.noise",
+    "open_rig": "rig.devices",
+    "open_stage": "rig.devices",
+    "plane_from_ray": "calib.homography",
+    "pmlem": "recon.solver.pmlem",
+    "read_frame": "pipelines.formats.frames",
+    "simulate": "pipelines.commands.simulate",
+    "smooth_start": "recon.solver.starts",
+    "taken_frames": "rig.session.access",
+    "universal_penalty_weight": "recon.solver.starts",
+}
+__all__ = list(_MODULES)
+
+if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares them with the table
+    from faintfield.calib.board import Board as Board
+    from faintfield.calib.detection import detect_all as detect_all
+    from faintfield.calib.errors import CalibrationError as CalibrationError
+    from faintfield.calib.geometry import BoardObservation as BoardObservation
+    from faintfield.calib.geometry import Target as Target
+    from faintfield.calib.geometry import calibrate_geometry as calibrate_geometry
+    from faintfield.calib.homography import fronto_parallel_rt_ref_plane as fronto_parallel_rt_ref_plane
+    from faintfield.calib.homography import plane_from_ray as plane_from_ray
+    from faintfield.calib.lens import Lens as Lens
+    from faintfield.calib.noise import Conditions as Conditions
+    from faintfield.calib.noise import calibrate
+    from faintfield.calib.noise import measure_series as measure_series
+    from faintfield.pipelines.commands.simulate import simulate as simulate
+    from faintfield.pipelines.errors import InputError as InputError
+    from faintfield.pipelines.formats.frames import read_frame as read_frame
+    from faintfield.pipelines.formats.sets.elemental_set import load_set as load_set
+    from faintfield.pipelines.reconstruction.channels import channel_layouts as channel_layouts
+    from faintfield.pipelines.reconstruction.channels import load_channel as load_channel
+    from faintfield.recon.errors import ReconstructionError as ReconstructionError
+    from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
+    from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
+    from faintfield.recon.operator.plane import PlaneOperator as PlaneOperator
+    from faintfield.recon.solver.data_fit import DataFit as DataFit
+    from faintfield.recon.solver.pmlem import pmlem as pmlem
+    from faintfield.recon.solver.starts import back_projection as back_projection
+    from faintfield.recon.solver.starts import smooth_start as smooth_start
+    from faintfield.recon.solver.starts import universal_penalty_weight as universal_penalty_weight
+    from faintfield.rig.devices import open_rig as open_rig
+    from faintfield.rig.devices import open_stage as open_stage
+    from faintfield.rig.errors import OutsideTravel as OutsideTravel
+    from faintfield.rig.errors import RigError as RigError
+    from faintfield.rig.plan import CapturePlan as CapturePlan
+    from faintfield.rig.plan import Grid as Grid
+    from faintfield.rig.plan import Step as Step
+    from faintfield.rig.session.access import taken_frames as taken_frames
+    from faintfield.rig.settings import RigSettings as RigSettings
+    from faintfield.rig.stages.protocol import MotionLimits as MotionLimits
+    from faintfield.rig.stages.protocol import Point as Point
+    from faintfield.rig.stages.settings import StageSettings as StageSettings
+
+    __version__: str
+    calibrate_noise = calibrate
+else:
+
+    def __getattr__(name: str) -> object:
+        """Load a public name, or the version of the installed package, when it is first asked for."""
+        if name == "__version__":
+            return import_module("importlib.metadata").version("faintfield")
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module, _, name_there = _MODULES[name].partition(":")
+        value: object = getattr(import_module(f"{__name__}.{module}"), name_there or name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    """List the public names besides those of every module."""
+    return sorted({*globals(), *__all__, "__version__"})

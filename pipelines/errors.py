@@ -8,8 +8,10 @@ InputError
 ├── BadValue
 │   └── UnknownKey
 ├── OutputExists
+├── OutputBusy
 ├── MissingPackage
 ├── ClusterFailed
+├── MemoryShort
 └── CannotWrite
     └── DiskFull
 

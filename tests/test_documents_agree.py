@@ -1,4 +1,4 @@
-"""What documents say of the code, and of one another, is so."""
+"""The documents agree with the code and with each other."""
 
 import importlib.util
 import inspect
@@ -15,8 +15,9 @@ import faintfield.recon.errors
 import faintfield.rig.errors
 
 _ROOT = Path(__file__).parents[1]
-_DOCUMENTS = [_ROOT / "README.md", *sorted((_ROOT / "docs").glob("*.md"))]
-# What a person meets under the name of a more special failure, or never by itself.
+_DOCUMENTS = [*sorted(_ROOT.glob("*.md")), *sorted((_ROOT / "docs").rglob("*.md"))]
+_INDEXED = ("rig", "calib", "recon", "pipelines", "benchmarks")
+# Base classes: a person meets only the failures derived from them.
 _NEVER_BY_ITSELF = {"RigError", "StageError", "SessionError", "CalibrationError", "ReconstructionError", "InputError"}
 
 
@@ -72,7 +73,7 @@ def test_the_guide_says_what_to_do_for_every_named_failure(tree: ModuleType) -> 
     assert {name for name in named - _NEVER_BY_ITSELF if f"`{name}`" not in table} == set()
 
 
-@pytest.mark.parametrize("document", _DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", _DOCUMENTS, ids=lambda path: path.relative_to(_ROOT).as_posix())
 def test_links_lead_somewhere(document: Path) -> None:
     for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text()):
         if not target.startswith("http"):
@@ -89,12 +90,51 @@ def _anchors(document: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def test_the_index_of_the_code_names_every_file() -> None:
-    index = (_ROOT / "docs" / "architecture.md").read_text()
-    for package in ("rig", "calib", "recon", "pipelines", "benchmarks"):
-        for path in sorted((_ROOT / package).rglob("*.py")):
+def _index() -> dict[str, set[str]]:
+    """Return the files that architecture.md lists, by folder; a row without a folder belongs to that of the row above.
+
+    The index is every table that begins `| folder | files |`, with folders and the stems of files in backticks.
+    """
+    found: dict[str, set[str]] = {}
+    folder, inside = "", False
+    for line in (_ROOT / "docs" / "architecture.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip().split("|")[1:-1]]
+        inside = bool(cells) and (inside or cells[:2] == ["folder", "files"])
+        if inside and len(cells) > 1:
+            folder = cells[0].strip("`") or folder
+            found.setdefault(folder, set()).update(re.findall(r"`([^`]+)`", cells[1]))
+    return found
+
+
+def test_the_index_of_the_code_lists_every_file_in_its_folder_and_no_other() -> None:
+    files: dict[str, set[str]] = {}
+    for package in _INDEXED:
+        for path in (_ROOT / package).rglob("*.py"):
             if path.name not in ("__init__.py", "__main__.py"):
-                assert re.search(rf"\b{path.stem}\b", index), f"{path.relative_to(_ROOT)} is not in the index"
+                files.setdefault(path.parent.relative_to(_ROOT).as_posix(), set()).add(path.stem)
+    listed = {folder: stems for folder, stems in _index().items() if folder.split("/")[0] in _INDEXED}
+    missing = {f"{folder}/{stem}" for folder, stems in files.items() for stem in stems - listed.get(folder, set())}
+    gone = {f"{folder}/{stem}" for folder, stems in listed.items() for stem in stems - files.get(folder, set())}
+    assert (sorted(missing), sorted(gone)) == ([], [])
+
+
+def test_decisions_are_numbered_without_gaps_and_each_has_a_status() -> None:
+    decisions = sorted((_ROOT / "docs" / "decisions").glob("*.md"))
+    assert decisions
+    for number, path in enumerate(decisions, start=1):
+        title, blank, status, *_ = path.read_text().splitlines()
+        assert path.name.startswith(f"{number:03d}-")
+        assert title.startswith(f"# {number:03d}: ")
+        assert blank == ""
+        assert status.startswith("Status: "), path.name
+
+
+def test_the_hooks_of_pre_commit_are_the_lines_of_make_lint() -> None:
+    makefile = (_ROOT / "Makefile").read_text()
+    (recipe,) = re.findall(r"^lint:.*\n((?:\t.*\n)+)", makefile, flags=re.MULTILINE)
+    lines = [line.strip().replace("$(BIN)", ".venv/bin") for line in recipe.splitlines()]
+    hooks = re.findall(r"^ *entry: (.*)$", (_ROOT / ".pre-commit-config.yaml").read_text(), flags=re.MULTILINE)
+    assert hooks == lines
 
 
 def test_every_document_is_two_hops_from_the_readme() -> None:

@@ -1,7 +1,8 @@
 """What every artefact records of itself (command, options, inputs' hashes, versions), and whether it still holds."""
 
 import platform
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import msgspec
@@ -30,8 +31,12 @@ def provenance(command: str, options: dict[str, Any], inputs: dict[str, str]) ->
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what computes results, by name."""
-    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+    """Return the versions of the packages that compute results, by name; one that is not installed is left out."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):  # mrcal is installed apart
+            found[name] = version(name)
+    return found
 
 
 def first_difference(origin: dict[str, Any], now: dict[str, Any]) -> str | None:

@@ -1,4 +1,4 @@
-"""What documents show runs as it stands: shell and Python examples of each, one after the other, in one folder."""
+"""The shell and Python examples of each document run as they stand, one after the other, in one folder."""
 
 import os
 import re

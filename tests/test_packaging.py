@@ -1,0 +1,131 @@
+"""The distribution holds one package with all of its files; `import faintfield` offers the public names."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+import faintfield
+
+_ROOT = Path(__file__).parents[1]
+_FOLDERS = ("rig", "calib", "recon", "pipelines")
+_BUILT_FROM = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "faintfield", *_FOLDERS, "tests")
+# Prints the modules that `import faintfield` loads.
+_IMPORT = "import sys; before = set(sys.modules); import faintfield; print(*sorted(set(sys.modules) - before))"
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of what the distribution is built from, so that nothing is written into the repository."""
+    copy = tmp_path_factory.mktemp("source")
+    for name in _BUILT_FROM:
+        if (_ROOT / name).is_dir():
+            shutil.copytree(_ROOT / name, copy / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(_ROOT / name, copy)
+    return copy
+
+
+def _expected_files() -> set[str]:
+    """Return every file of the package as it should be installed, symbolic links followed."""
+    found = {"faintfield/__init__.py", "faintfield/py.typed"}
+    for folder in _FOLDERS:
+        for path in (_ROOT / folder).rglob("*"):
+            if path.is_file() and "__pycache__" not in path.parts:
+                found.add(f"faintfield/{path.relative_to(_ROOT).as_posix()}")
+    return found
+
+
+def _build(call: str, source: Path, out: Path) -> Path:
+    """Call one of setuptools' build hooks in the folder, without network, and return the file that it made."""
+    out.mkdir(exist_ok=True)
+    program = f"from setuptools import build_meta; build_meta.{call}({str(out)!r})"
+    subprocess.run([sys.executable, "-c", program], cwd=source, check=True, capture_output=True)
+    (made,) = out.iterdir()
+    return made
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(source: Path, tmp_path: Path) -> None:
+    names = zipfile.ZipFile(_build("build_wheel", source, tmp_path / "wheel")).namelist()
+    installed = {name for name in names if ".dist-info/" not in name}
+    assert installed == _expected_files()
+    assert {"faintfield/py.typed", "faintfield/pipelines/formats/rig_template.toml"} < installed
+    assert {"faintfield/pipelines/live/capture.html", "faintfield/pipelines/pages/templates/base.html"} < installed
+
+
+def test_the_sdist_holds_the_package_without_links_and_no_tests(source: Path, tmp_path: Path) -> None:
+    with tarfile.open(_build("build_sdist", source, tmp_path / "sdist")) as archive:
+        members = {member.name.partition("/")[2]: member for member in archive.getmembers()}
+    files = {name for name, member in members.items() if member.isfile()}
+    assert {name for name in files if name.startswith("faintfield/")} == _expected_files()
+    assert {"pyproject.toml", "README.md", "LICENSE"} < files
+    assert not any(name.startswith("tests") for name in members)
+    assert not any(member.issym() for member in members.values())
+
+
+def test_a_wheel_needs_neither_mrcal_nor_a_second_opencv() -> None:
+    project = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]
+    needed = {re.split(r"[^\w-]", line)[0] for line in project["dependencies"]}
+    offered = {re.split(r"[^\w-]", line)[0] for lines in project["optional-dependencies"].values() for line in lines}
+    assert "mrcal" not in needed | offered
+    assert {name for name in needed | offered if name.startswith("opencv")} == {"opencv-contrib-python-headless"}
+
+
+@pytest.mark.parametrize("name", ["README.md", ".ci/run", "docs/decisions/001-mrcal-is-installed-apart.md"])
+def test_the_line_that_installs_mrcal_is_the_same_everywhere(name: str) -> None:
+    assert "install --no-deps mrcal numpysane" in (_ROOT / name).read_text()
+
+
+def test_documents_state_the_version_of_the_project() -> None:
+    version = tomllib.loads((_ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (_ROOT / "CITATION.cff").read_text()
+    assert f" faintfield-{version}-py3-none-any.whl\n" in (_ROOT / "README.md").read_text()
+    newest = re.findall(r"^## \[(\d[^\]]*)\]", (_ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    assert newest[0] == version
+    assert newest == sorted(newest, key=lambda it: [int(part) for part in it.split(".")], reverse=True)
+
+
+def test_importing_faintfield_loads_none_of_its_folders() -> None:
+    ended = subprocess.run([sys.executable, "-c", _IMPORT], cwd=_ROOT, capture_output=True, text=True, check=True)
+    loaded = ended.stdout.split()
+    assert "faintfield" in loaded
+    assert not [name for name in loaded if name.startswith(("faintfield.", "numpy", "numba", "cv2", "mrcal"))]
+
+
+def test_every_public_name_loads() -> None:
+    for name in faintfield.__all__:
+        assert getattr(faintfield, name) is not None
+        assert name in dir(faintfield)
+    assert re.fullmatch(r"\d+\.\d+\.\d+\S*", faintfield.__version__)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        vars(faintfield)["__getattr__"]("nonsense")
+
+
+def test_type_checkers_see_the_public_names_of_the_table() -> None:
+    """The imports under TYPE_CHECKING give each name the object that `__getattr__` loads."""
+    tree = ast.parse(Path(faintfield.__file__).read_text())
+    (checked,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen: dict[str, object] = {}
+    for statement in checked.body:
+        if isinstance(statement, ast.ImportFrom) and statement.module:
+            module = import_module(statement.module)
+            seen |= {alias.name: getattr(module, alias.name) for alias in statement.names}
+        elif isinstance(statement, ast.Assign):
+            assert isinstance(statement.targets[0], ast.Name)
+            assert isinstance(statement.value, ast.Name)
+            seen[statement.targets[0].id] = seen.pop(statement.value.id)
+    assert seen == {name: getattr(faintfield, name) for name in faintfield.__all__}
+
+
+def test_the_page_of_the_api_lists_the_public_names() -> None:
+    page = (_ROOT / "docs" / "api.md").read_text()
+    table = page[page.index("## All names") :]
+    assert sorted(re.findall(r"^\| `(\w+)` \|", table, flags=re.MULTILINE)) == sorted(faintfield.__all__)
