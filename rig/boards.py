@@ -5,7 +5,7 @@ import numpy as np
 from msgspec import Struct
 
 
-class Board(Struct, frozen=True, forbid_unknown_fields=True):
+class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """A `[[board]]` table: one printed ChArUco board.
 
     Parameters

@@ -12,17 +12,17 @@ from faintfield.rig.cameras.gphoto2 import GPhoto2Camera
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import Camera
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
-from faintfield.rig.cameras.simulated import SimulatedCamera
 from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import RigSettings
+from faintfield.rig.simulation.camera import SimulatedCamera
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.link import PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.settings import StageSettings
 from faintfield.rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
@@ -104,7 +104,7 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench
         bench = bench or _simulated_bench(settings)
         port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
         return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
-    return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
+    return make_stage(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
 
 
 def is_simulated(settings: StageSettings) -> bool:

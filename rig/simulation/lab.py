@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.plan import StepKind
 from faintfield.rig.simulation.carriage import Carriage
@@ -36,7 +36,7 @@ class SimulatedLab:
         Where the carriages really are, whatever the controller reports.
     still_s : callable
         How long ago they stopped.
-    boards : sequence of Board
+    boards : sequence of BoardSettings
         What there is to put up for charuco sweeps.
     settings : SimulatedSettings
         The camera, the light and the rails.
@@ -52,7 +52,7 @@ class SimulatedLab:
         centre: Point,
         true_position: Callable[[], Point],
         still_s: Callable[[], float],
-        boards: tuple[Board, ...],
+        boards: tuple[BoardSettings, ...],
         settings: SimulatedSettings,
     ) -> None:
         self._true_position = true_position

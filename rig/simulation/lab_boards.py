@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.simulation.boards import printed_board, six_boards
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import TexturedPlane
@@ -23,12 +23,12 @@ _SAMPLES_PER_PX, _BLUR_PX = 2.0, 0.6
 _BESIDE_MM = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 40.0])
 
 
-def standing_board(board: Board, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
+def standing_board(board: BoardSettings, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
     """Return a board as it stands in a sweep: turned and tilted differently in each, several beside one another.
 
     Parameters
     ----------
-    board : Board
+    board : BoardSettings
         What is printed.
     sweep : int
         Which sweep.

@@ -48,7 +48,7 @@ class TexturedPlane:
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """One rendered view: per pixel the light of the scene and how each plane contributes.
 
     Attributes
@@ -69,7 +69,7 @@ def render(
     poses_rt_cam_ref: NDArray[np.float64],
     *,
     samples_per_px: int = 2,
-) -> Iterator[View]:
+) -> Iterator[RenderedView]:
     """Yield the view of each pose: every detector sample's ray is cast through the planes from near to far.
 
     Parameters
@@ -95,7 +95,7 @@ def _render_view(
     illumination: NDArray[np.float32],
     rt_cam_ref: NDArray[np.float64],
     samples_per_px: int,
-) -> View:
+) -> RenderedView:
     """Composite the planes front to back along every ray and average the rays of each pixel."""
     colours = () if planes[0].reflectance.ndim == 2 else (3,)
     light = np.zeros((*rays.shape[:2], *colours), np.float32)
@@ -107,7 +107,7 @@ def _render_view(
         visible[plane.name] = _pixel_means(opacity * unhidden, samples_per_px)
         unhidden *= 1 - opacity
     light = _pixel_means(light, samples_per_px)
-    return View(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
+    return RenderedView(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
 
 
 def _look_up(

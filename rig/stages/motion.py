@@ -53,7 +53,7 @@ def one_sided(start: Point, target: Point, approach_mm: float) -> tuple[Point, .
     return (target,) if turn == target else (turn, target)
 
 
-def patience_s(predicted_s: float) -> float:
+def timeout_s(predicted_s: float) -> float:
     """Return how long to wait for something that should take `predicted_s`, before it counts as failed."""
     return 1.5 * predicted_s + 2.0
 

@@ -12,7 +12,7 @@ from faintfield.rig.stages.protocol import Box, Point
 _ROUNDING_MM = 1e-6
 
 
-class Workspace(Struct, frozen=True):
+class StageWorkspace(Struct, frozen=True):
     """The travel of the stage and the boxes that it must stay out of.
 
     Parameters

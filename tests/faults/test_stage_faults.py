@@ -30,7 +30,7 @@ MOMENTS = {"connecting": 1.02, "homing": 5.0, "moving": 0.35, "exposing": 0.35}
 
 
 @dataclass(frozen=True)
-class Exposure:
+class KeptFrame:
     """A frame that was kept, and where the camera truly was from its beginning to its end."""
 
     number: int
@@ -43,12 +43,12 @@ class Exposure:
 
 
 @dataclass
-class Capture:
+class RehearsedCapture:
     """A capture in small: the rules by which frames are taken and kept, on a bench where things go wrong."""
 
     bench: Bench
     recovery_bound_s: float = 2.0
-    kept: list[Exposure] = field(default_factory=list)
+    kept: list[KeptFrame] = field(default_factory=list)
     failures: list[RigError] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -98,11 +98,11 @@ class Capture:
         self.on_expose()
         self.bench.clock.sleep_s(1.0)
         self.stage.verify_at(*target)
-        exposure = Exposure(len(self.kept), target, began, self.bench.true_position())
+        exposure = KeptFrame(len(self.kept), target, began, self.bench.true_position())
         self.kept.append(exposure)
         self.watch.visited(exposure.number)
 
-    def vouched_for(self) -> list[Exposure]:
+    def accepted(self) -> list[KeptFrame]:
         """Return the frames that are neither doubtful nor unchecked."""
         doubtful = {*self.watch.doubtful, *self.watch.unchecked}
         return [exposure for exposure in self.kept if exposure.number not in doubtful]
@@ -134,9 +134,9 @@ class Capture:
             raise
         assert self.bench.clock.now_s() - started_s <= bound_s
 
-    def assert_honest(self, faults: list[Fault]) -> None:
+    def check_frames(self, faults: list[Fault]) -> None:
         """Assert that no frame was kept from a wrong place unless it is marked, and that failures say what to do."""
-        for exposure in self.vouched_for():
+        for exposure in self.accepted():
             assert exposure.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
         if not any(fault.nature == "mechanics" for fault in faults):
             assert all(exposure.error_mm() <= ON_TARGET_MM for exposure in self.kept)
@@ -163,7 +163,7 @@ def test_there_are_enough_faults() -> None:
     ids=str,
 )
 def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
-    capture = Capture(Bench(CONTROLLERS[protocol]))
+    capture = RehearsedCapture(Bench(CONTROLLERS[protocol]))
 
     def strike() -> None:
         capture.bench.clock.after(MOMENTS[moment], lambda: fault.strike(capture.bench))
@@ -175,18 +175,18 @@ def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
     else:
         strike()
     capture.run()
-    capture.assert_honest([fault])
+    capture.check_frames([fault])
     if not capture.failures:
         assert len(capture.kept) == 4
 
 
 def test_an_undisturbed_capture_keeps_everything() -> None:
     for controller in CONTROLLERS.values():
-        capture = Capture(Bench(controller))
+        capture = RehearsedCapture(Bench(controller))
         capture.run()
         assert len(capture.kept) == 4
         assert not capture.failures
-        assert capture.vouched_for() == capture.kept
+        assert capture.accepted() == capture.kept
 
 
 @pytest.mark.parametrize("protocol", CONTROLLERS)
@@ -195,15 +195,15 @@ def test_an_undisturbed_capture_keeps_everything() -> None:
 def test_faults_through_the_operating_system(protocol: str, link: type[PtyLink] | type[SocketLink], name: str) -> None:
     made = link()
     fault = next(fault for fault in FAULTS if fault.name == name)
-    capture = Capture(Bench(CONTROLLERS[protocol], made))
+    capture = RehearsedCapture(Bench(CONTROLLERS[protocol], made))
     capture.on_move = once(lambda: fault_soon(capture, fault))
     capture.run()
     made.close()
-    capture.assert_honest([fault])
+    capture.check_frames([fault])
     assert capture.failures or name == "noise"
 
 
-def fault_soon(capture: Capture, fault: Fault) -> None:
+def fault_soon(capture: RehearsedCapture, fault: Fault) -> None:
     """Strike while the stage is on its way."""
     capture.bench.clock.after(0.35, lambda: fault.strike(capture.bench))
 
@@ -213,7 +213,7 @@ def fault_soon(capture: Capture, fault: Fault) -> None:
 @given(data=st.data())
 def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: st.DataObject) -> None:
     # A second fault may strike in the middle of recovering from the first
-    capture = Capture(Bench(CONTROLLERS[protocol]), recovery_bound_s=6.0)
+    capture = RehearsedCapture(Bench(CONTROLLERS[protocol]), recovery_bound_s=6.0)
     known = faults_of(CONTROLLERS[protocol].protocol)
     silent = [fault for fault in known if fault.nature == "mechanics"]
     loud = [fault for fault in known if fault.nature != "mechanics"]
@@ -225,4 +225,4 @@ def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: s
         when_s = data.draw(st.floats(0.0, 90.0))
         capture.bench.clock.after(when_s, lambda fault=fault: fault.strike(capture.bench))  # type: ignore[misc]
     capture.run()
-    capture.assert_honest(faults)
+    capture.check_frames(faults)

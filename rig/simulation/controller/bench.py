@@ -3,17 +3,14 @@
 from collections.abc import Callable
 
 from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.firmware import Firmware
 from faintfield.rig.simulation.controller.link import DirectLink, Link
-from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.wire import Wire
-from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
 from faintfield.rig.stages.transport import NoTrafficLog, Port, TrafficLog
-
-type Firmware = SimulatedGrbl | SimulatedMarlin
 
 
 class Bench:
@@ -64,7 +61,7 @@ class Bench:
             Where every byte is recorded.
         """
         settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
-        return stage_from(settings, self.clock, traffic or NoTrafficLog(), self.open_port)
+        return make_stage(settings, self.clock, traffic or NoTrafficLog(), self.open_port)
 
     def true_position(self) -> Point:
         """Return where the carriages really are, whatever the controller reports."""

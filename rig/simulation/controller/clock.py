@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(order=True)
-class Event:
+class ScheduledEvent:
     """Something that will happen at a time."""
 
     at_s: float
@@ -29,7 +29,7 @@ class SimulatedClock:
 
     def __init__(self) -> None:
         self._now_s = 0.0
-        self._agenda: list[Event] = []
+        self._agenda: list[ScheduledEvent] = []
         self._order = itertools.count()
 
     def now_s(self) -> float:
@@ -42,9 +42,9 @@ class SimulatedClock:
         while self.step(deadline_s):
             pass
 
-    def after(self, delay_s: float, action: Callable[[], None]) -> Event:
+    def after(self, delay_s: float, action: Callable[[], None]) -> ScheduledEvent:
         """Put `action` on the agenda, `delay_s` from now."""
-        event = Event(self._now_s + max(0.0, delay_s), next(self._order), action)
+        event = ScheduledEvent(self._now_s + max(0.0, delay_s), next(self._order), action)
         heapq.heappush(self._agenda, event)
         return event
 

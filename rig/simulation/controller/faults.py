@@ -10,7 +10,7 @@ from typing import Literal
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.controller.wire import Spoil
+from faintfield.rig.simulation.controller.wire import ByteFilter
 from faintfield.rig.stages.settings import ProtocolName
 
 type Nature = Literal["wire", "controller", "mechanics"]
@@ -55,8 +55,8 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0x04]) + data[middle + 1 :] if data else data
 
 
-def _next_only(spoils: list[Spoil], spoil: Spoil, applies: Callable[[bytes], bool] = bool) -> None:
-    """Spoil the next bytes that `applies` holds for, and no others."""
+def _next_only(spoils: list[ByteFilter], spoil: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
+    """ByteFilter the next bytes that `applies` holds for, and no others."""
 
     def once(data: bytes) -> bytes:
         if not applies(data):
@@ -67,7 +67,7 @@ def _next_only(spoils: list[Spoil], spoil: Spoil, applies: Callable[[bytes], boo
     spoils.append(once)
 
 
-def _for_a_while(bench: Bench, spoils: list[Spoil], duration_s: float) -> None:
+def _for_a_while(bench: Bench, spoils: list[ByteFilter], duration_s: float) -> None:
     """Lose everything for `duration_s`."""
 
     def nothing(data: bytes) -> bytes:
@@ -77,24 +77,24 @@ def _for_a_while(bench: Bench, spoils: list[Spoil], duration_s: float) -> None:
     bench.clock.after(duration_s, lambda: spoils.remove(nothing))
 
 
-def _to_controller(spoil: Spoil) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.spoil_to_controller, spoil)
+def _to_controller(spoil: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _next_only(bench.wire.filters_to_controller, spoil)
 
 
-def _to_host(spoil: Spoil) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.spoil_to_host, spoil)
+def _to_host(spoil: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _next_only(bench.wire.filters_to_host, spoil)
 
 
 def _lose_ok(bench: Bench) -> None:
-    _next_only(bench.wire.spoil_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
+    _next_only(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
 
 
 def _mute(bench: Bench) -> None:
-    bench.wire.spoil_to_host.append(lambda data: b"")
+    bench.wire.filters_to_host.append(lambda data: b"")
 
 
 def _deaf(bench: Bench) -> None:
-    bench.wire.spoil_to_controller.append(lambda data: b"")
+    bench.wire.filters_to_controller.append(lambda data: b"")
 
 
 def _babble(bench: Bench) -> None:
@@ -109,7 +109,7 @@ def _answer_late(bench: Bench) -> None:
 
 def _restart_unseen(bench: Bench) -> None:
     bench.firmware.restart()
-    _for_a_while(bench, bench.wire.spoil_to_host, bench.firmware.boot_s + 0.1)
+    _for_a_while(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
 
 def _unplug_and_return(bench: Bench) -> None:
@@ -177,7 +177,7 @@ def _alarm(code: int) -> Callable[[Bench], None]:
 
 def _early_idle(bench: Bench) -> None:
     """One report says idle while the stage moves."""
-    _next_only(bench.wire.spoil_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
+    _next_only(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
 
 
 def _lose_settings(firmware: SimulatedGrbl) -> None:
@@ -186,7 +186,7 @@ def _lose_settings(firmware: SimulatedGrbl) -> None:
 
 
 def _damage_every_line(bench: Bench) -> None:
-    bench.wire.spoil_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
+    bench.wire.filters_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
 
 
 _COMMON = (
@@ -202,7 +202,7 @@ _COMMON = (
     Fault("noise", "wire", lambda bench: bench.wire.to_host(bytes(range(128, 256)) + b"\x00ok\x00\n")),
     Fault("controller mute", "wire", _mute),
     Fault("controller deaf", "wire", _deaf),
-    Fault("silence for a moment", "wire", lambda bench: _for_a_while(bench, bench.wire.spoil_to_host, 0.5)),
+    Fault("silence for a moment", "wire", lambda bench: _for_a_while(bench, bench.wire.filters_to_host, 0.5)),
     Fault("answers late", "wire", _answer_late),
     Fault("babble", "wire", _babble),
     Fault("every line damaged", "wire", _damage_every_line),

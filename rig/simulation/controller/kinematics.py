@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 
 type Vector = tuple[float, ...]
 
@@ -142,7 +142,7 @@ class Mechanics:
     _commanded: Vector = (0.0, 0.0)
     _queue: list[tuple[Vector, float, float]] = field(default_factory=list)
     _motion: Motion | None = None
-    _events: list[Event] = field(default_factory=list)
+    _events: list[ScheduledEvent] = field(default_factory=list)
 
     @property
     def moving(self) -> bool:

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from faintfield.rig.simulation.controller.bench import Firmware
 from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.firmware import Firmware
 from faintfield.rig.simulation.controller.wire import Wire
 
 _LONGEST_NAP_S = 0.05

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 
 _SECONDS_PER_BYTE = 10.0 / 115200.0
 _LATENCY_S = 0.002
 
-type Spoil = Callable[[bytes], bytes]
+type ByteFilter = Callable[[bytes], bytes]
 """Turns bytes that pass into those that arrive."""
 
 
@@ -21,24 +21,24 @@ class Wire:
 
     Attributes
     ----------
-    spoil_to_controller, spoil_to_host : list
+    filters_to_controller, filters_to_host : list
         What happens to bytes on the way, in order; faults add to it.
     connected : bool
         Whether the cable is in.
     """
 
     def __init__(self, clock: SimulatedClock) -> None:
-        self.spoil_to_controller: list[Spoil] = []
-        self.spoil_to_host: list[Spoil] = []
+        self.filters_to_controller: list[ByteFilter] = []
+        self.filters_to_host: list[ByteFilter] = []
         self.connected = True
         self._clock = clock
         self._free_at_s = 0.0
         self._arrived = bytearray()
-        self._under_way: list[Event] = []
+        self._under_way: list[ScheduledEvent] = []
 
     def to_controller(self, data: bytes) -> bytes:
         """Return what arrives at the controller of what the host sends."""
-        return _spoilt(data, self.spoil_to_controller)
+        return _spoilt(data, self.filters_to_controller)
 
     def to_host(self, data: bytes) -> None:
         """Put what the controller says on the wire, behind what is on it."""
@@ -72,10 +72,10 @@ class Wire:
         """Let the host have `data`, if the cable is in."""
         del self._under_way[0]
         if self.connected:
-            self._arrived += _spoilt(data, self.spoil_to_host)
+            self._arrived += _spoilt(data, self.filters_to_host)
 
 
-def _spoilt(data: bytes, spoils: list[Spoil]) -> bytes:
+def _spoilt(data: bytes, spoils: list[ByteFilter]) -> bytes:
     """Return `data` after everything that happens to it."""
     for spoil in tuple(spoils):
         data = spoil(data)

@@ -25,7 +25,7 @@ class Profiles:
         return PROFILE
 
 
-class Bench:
+class PrinterServer:
     """Makes printers and connects the newest to whoever has connected."""
 
     def __init__(self, changes: dict[str, Any]) -> None:
@@ -75,7 +75,7 @@ class Bench:
 
 def main() -> None:
     """Serve until the parent goes away."""
-    bench = Bench(json.loads(sys.argv[1]))
+    server = PrinterServer(json.loads(sys.argv[1]))
     listener = socket.create_server(("127.0.0.1", 0))
     sys.stdout.write(f"{listener.getsockname()[1]}\n")
     sys.stdout.flush()
@@ -83,10 +83,10 @@ def main() -> None:
     def accept() -> None:
         while True:
             connection, _ = listener.accept()
-            threading.Thread(target=bench.serve, args=(connection,), daemon=True).start()
+            threading.Thread(target=server.serve, args=(connection,), daemon=True).start()
 
     threading.Thread(target=accept, daemon=True).start()
-    bench.obey()
+    server.obey()
 
 
 if __name__ == "__main__":

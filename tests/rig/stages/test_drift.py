@@ -103,7 +103,7 @@ def test_a_disturbance_while_homing_was_timed_is_found_at_once(controller: Contr
                 bench.clock.after(1.0, lambda: bench.wire.hold_up(8.0))
         return data
 
-    bench.wire.spoil_to_controller.append(late_on_the_third)
+    bench.wire.filters_to_controller.append(late_on_the_third)
     with pytest.raises(PositionDrifted):
         DriftWatch(stage).begin()
 

@@ -191,7 +191,7 @@ def test_a_restart_after_alarm_2_loses_the_position_whether_it_was_seen_or_not(s
         stage.position()
     assert stage.trusted
     if not seen:
-        bench.wire.spoil_to_host.append(lambda data: b"" if b"Grbl" in data else data)
+        bench.wire.filters_to_host.append(lambda data: b"" if b"Grbl" in data else data)
     bench.firmware.restart()
     bench.clock.sleep_s(2.0)
     stage.recover()
@@ -211,10 +211,10 @@ def test_hold_waits_as_long_as_slow_brakes_need() -> None:
 def test_a_path_of_which_the_second_part_is_refused_is_not_followed() -> None:
     bench = Bench(SimulatedGrbl)
     stage = homed(bench)
-    bench.wire.spoil_to_controller.append(lambda data: data.replace(b"$J=G90 G21 G53 X-300.000", b"$Q"))
+    bench.wire.filters_to_controller.append(lambda data: data.replace(b"$J=G90 G21 G53 X-300.000", b"$Q"))
     with pytest.raises(StageRejected, match=r"refused .* nothing moved by it"):
         stage.move_to(-300.0, -300.0)
-    bench.wire.spoil_to_controller.clear()
+    bench.wire.filters_to_controller.clear()
     bench.clock.sleep_s(1.0)
     assert not bench.firmware.mechanics.moving
     assert bench.true_position().x_mm > -50.0

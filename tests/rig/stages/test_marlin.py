@@ -37,7 +37,7 @@ def test_damaged_lines_are_sent_again_and_executed_once() -> None:
         sent += 1
         return data.replace(b"1", b"7", 1) if sent % 3 == 0 else data
 
-    bench.wire.spoil_to_controller.append(damage_every_third)
+    bench.wire.filters_to_controller.append(damage_every_third)
     for target in (Point(100.0, 100.0), Point(50.0, 150.0), Point(11.0, 11.0)):
         assert stage.move_to(*target).is_at(target)
         assert bench.true_position() == pytest.approx(target, abs=0.01)
@@ -46,7 +46,7 @@ def test_damaged_lines_are_sent_again_and_executed_once() -> None:
 def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
-    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.wire.filters_to_host.append(without(b"start"))
     bench.firmware.restart()
     bench.clock.sleep_s(5.0)
     with pytest.raises(StageLost, match="waits for line 1 "):
@@ -64,7 +64,7 @@ def test_recovery_notices_a_restart_that_nobody_saw() -> None:
     stage = homed(bench)
     stage.recover()
     assert stage.trusted
-    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.wire.filters_to_host.append(without(b"start"))
     bench.firmware.restart()
     bench.clock.sleep_s(5.0)
     stage.recover()
@@ -74,7 +74,7 @@ def test_recovery_notices_a_restart_that_nobody_saw() -> None:
 def test_a_position_is_not_taken_from_an_answer_that_has_none() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
-    bench.wire.spoil_to_host.append(without(b"X:"))
+    bench.wire.filters_to_host.append(without(b"X:"))
     with pytest.raises(StageTimeout, match="without a position"):
         stage.position()
     assert not stage.trusted
@@ -152,14 +152,14 @@ def test_travel_is_what_all_sources_allow() -> None:
     stage = bench.stage()
     stage.connect()
     assert stage.travel() == Box((0.0, 400.0), (0.0, 400.0))
-    bench.wire.spoil_to_host.append(lambda data: data.replace(b"Max:  X400.00", b"Max:  X350.00"))
+    bench.wire.filters_to_host.append(lambda data: data.replace(b"Max:  X400.00", b"Max:  X350.00"))
     stage.connect()
     assert stage.travel() == Box((0.0, 350.0), (0.0, 400.0))
 
 
 def test_travel_that_is_not_told_has_to_be_configured() -> None:
     bench = Bench(SimulatedMarlin)
-    bench.wire.spoil_to_host.append(without(b"area:", b"echo:Soft"))
+    bench.wire.filters_to_host.append(without(b"area:", b"echo:Soft"))
     with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
         bench.stage().connect()
     travel = Box((0.0, 300.0), (0.0, 300.0))
@@ -178,7 +178,7 @@ def test_settings_that_change_while_read_are_not_believed() -> None:
             return data.replace(b"X80", b"X8")
         return data
 
-    bench.wire.spoil_to_host.append(lose_a_digit_once)
+    bench.wire.filters_to_host.append(lose_a_digit_once)
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()
 
@@ -186,7 +186,7 @@ def test_settings_that_change_while_read_are_not_believed() -> None:
 @pytest.mark.parametrize("line", [b"FIRMWARE_NAME", b"echo: M92", b"echo: M203", b"echo: M201", b"echo: M204"])
 def test_firmware_that_does_not_tell_what_is_needed_is_refused(line: bytes) -> None:
     bench = Bench(SimulatedMarlin)
-    bench.wire.spoil_to_host.append(without(line))
+    bench.wire.filters_to_host.append(without(line))
     with pytest.raises(WrongFirmware):
         bench.stage().connect()
 

@@ -113,8 +113,8 @@ def test_every_byte_and_its_time_is_in_the_log(pty: PtyLink) -> None:
         return data
 
     stage = bench.stage(traffic=traffic)
-    bench.wire.spoil_to_controller.append(lambda data: watch("sent", data))
-    bench.wire.spoil_to_host.append(lambda data: watch("received", data))
+    bench.wire.filters_to_controller.append(lambda data: watch("sent", data))
+    bench.wire.filters_to_host.append(lambda data: watch("received", data))
     stage.connect()
     stage.home()
     stage.move_to(-100.0, -100.0)
@@ -148,7 +148,7 @@ def test_an_unplugged_stage_comes_back_by_the_same_name(link: type[PtyLink] | ty
 
 def test_a_mute_controller_does_not_hang_the_connection() -> None:
     bench = Bench(SimulatedGrbl)
-    bench.wire.spoil_to_host.append(lambda data: b"")
+    bench.wire.filters_to_host.append(lambda data: b"")
     with pytest.raises(StageTimeout, match="no answer"):
         bench.stage().connect()
     assert bench.clock.now_s() < 10.0
