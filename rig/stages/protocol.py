@@ -1,7 +1,7 @@
-"""What a stage is: the vocabulary that drivers, plans and simulators share.
+"""Defines a stage: the types that drivers, plans and simulators share.
 
-Coordinates are the controller's own machine coordinates in millimetres, along the two axes that carry the camera.
-Nothing is shifted or flipped on the way, so a position in a log can be compared with the controller's display.
+Coordinates are the controller's machine coordinates in millimetres, along the two axes that carry the camera. They are
+not shifted or flipped, so a position in a log can be compared with the controller's display.
 """
 
 from typing import Literal, NamedTuple, Protocol, Self
@@ -22,7 +22,7 @@ class Point(NamedTuple):
 
 
 class Box(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle of positions, its edges included.
+    """A rectangle of positions, including its edges.
 
     Parameters
     ----------
@@ -41,48 +41,48 @@ class Box(Struct, frozen=True, forbid_unknown_fields=True):
         return f"[{self.x_mm[0]:g}, {self.x_mm[1]:g}] x [{self.y_mm[0]:g}, {self.y_mm[1]:g}] mm"
 
     def holds(self, point: Point, slack_mm: float = 0.0) -> bool:
-        """Return whether `point` lies in the box grown by `slack_mm` on every side."""
+        """Return whether `point` lies in the box enlarged by `slack_mm` on every side."""
         return all(
             low - slack_mm <= value <= high + slack_mm
             for value, (low, high) in zip(point, (self.x_mm, self.y_mm), strict=True)
         )
 
     def intersection(self, other: Self) -> "Box":
-        """Return the box of positions that both boxes hold; `ValueError` when there are none."""
+        """Return the box of positions that both boxes hold; raises `ValueError` if there are none."""
         (ax, ay), (bx, by) = (self.x_mm, self.y_mm), (other.x_mm, other.y_mm)
         return Box((max(ax[0], bx[0]), min(ax[1], bx[1])), (max(ay[0], by[0]), min(ay[1], by[1])))
 
 
 class MotionLimits(Struct, frozen=True):
-    """How fast each axis may go and change its speed, as set in the controller."""
+    """Highest rate and acceleration of each axis, as set in the controller."""
 
     rate_mm_per_s: tuple[float, float]
     acceleration_mm_per_s2: tuple[float, float]
 
 
 class Identity(Struct, frozen=True):
-    """Who the controller says it is, and what it is set to.
+    """What the controller reports about itself: firmware, limits, settings.
 
     Parameters
     ----------
     firmware : str
         Name and version, as reported.
     travel_mm : Box
-        The positions that the controller itself allows.
+        Positions that the controller allows.
     motion : MotionLimits
         Rates and accelerations.
     tolerance_mm : (float, float)
-        Half a motor step plus the rounding of reports, per axis: a reported position within it is on target.
+        Half a motor step plus the rounding of reports, per axis: how far a report may be from its target.
     homing_bound_s : float
-        How long homing may take before it counts as failed.
+        Time after which homing counts as failed.
     homes_together : bool
-        Whether one homing command moves both axes at once and none can be homed alone.
+        Whether homing moves both axes at once, and neither can be homed alone.
     pull_off_mm : float
-        How far homing backs off the switches.
+        Distance by which homing backs off the switches.
     settings : dict
         The controller's settings as reported, for the record.
     warnings : tuple of str
-        Settings that work but should be changed, each with what to do.
+        Settings that work but should be changed, each with its remedy.
     """
 
     firmware: str
@@ -97,16 +97,16 @@ class Identity(Struct, frozen=True):
 
 
 class Position(Struct, frozen=True):
-    """Where the controller says the stage is, and whether that may be believed.
+    """A reported position, and whether it can be trusted.
 
     Parameters
     ----------
     point : Point
         The reported position.
     tolerance_mm : (float, float)
-        By how much a report may differ from a target that was reached.
+        How far a report may be from its target, per axis.
     trusted : bool
-        Whether the stage was homed and nothing has happened since that could have moved its scale.
+        Whether the stage was homed and nothing since could have changed its count of steps.
     """
 
     point: Point
@@ -114,13 +114,13 @@ class Position(Struct, frozen=True):
     trusted: bool
 
     def is_at(self, target: Point) -> bool:
-        """Return whether the stage stands at `target`, by a report that may be believed."""
+        """Return whether this trusted report puts the stage at `target`."""
         near = zip(self.point, target, self.tolerance_mm, strict=True)
         return self.trusted and all(abs(here - there) <= tolerance for here, there, tolerance in near)
 
 
 class Homing(Struct, frozen=True):
-    """What homing came to: where it ended, and how long the controller took."""
+    """The result of homing: the position at its end, and how long the controller took."""
 
     position: Position
     duration_s: float
@@ -129,36 +129,35 @@ class Homing(Struct, frozen=True):
 class Stage(Protocol):
     """Two axes that carry the camera, driven from one thread.
 
-    Every method that talks to the controller ends within a bound, and raises a `StageError` when the controller does
-    not do what it was told. After an error nothing moves again until `recover`, and, unless the error kept the
-    position, `home`.
+    Every method that uses the controller is bounded in time, and raises a `StageError` if the controller does not obey.
+    After an error nothing moves until `recover` and, unless the error kept the position, `home`.
     """
 
     @property
     def trusted(self) -> bool:
-        """Whether reported positions may be believed."""
+        """Whether reported positions can be trusted."""
         ...
 
     def connect(self) -> None:
-        """Open the port, wait for the controller and read its settings; nothing moves."""
+        """Open the port, wait for the controller and read its settings, without moving."""
         ...
 
     def identify(self) -> Identity:
-        """Return what the controller said about itself when it was connected."""
+        """Return what the controller reported when it was connected."""
         ...
 
     def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Find the switches; positions are trusted from here on.
+        """Find the switches; positions are trusted from then on.
 
         Parameters
         ----------
         axis : 0 or 1, optional
-            Home this axis alone where the controller can (see `Identity.homes_together`).
+            Home only this axis, if the controller can (see `Identity.homes_together`).
         """
         ...
 
     def travel(self) -> Box:
-        """Return the positions that may be asked for."""
+        """Return the allowed positions."""
         ...
 
     def move_to(self, x_mm: float, y_mm: float) -> Position:
@@ -166,11 +165,11 @@ class Stage(Protocol):
         ...
 
     def position(self) -> Position:
-        """Ask the controller where it stands."""
+        """Read the position from the controller."""
         ...
 
     def verify_at(self, x_mm: float, y_mm: float) -> Position:
-        """Ask again, and raise unless the stage stands at this position: the last step before an exposure."""
+        """Raise unless the stage stands at this position: the last check before an exposure."""
         ...
 
     def switches(self) -> frozenset[AxisIndex]:
@@ -178,13 +177,13 @@ class Stage(Protocol):
         ...
 
     def hold(self) -> None:
-        """Stop moving, now."""
+        """Stop at once."""
         ...
 
     def recover(self) -> None:
-        """After an error, make the controller listen again, without moving; see `trusted` for what was lost."""
+        """Make the controller accept commands again after an error, without moving; `trusted` may then be False."""
         ...
 
     def close(self) -> None:
-        """Give the port back; the stage stays where it is."""
+        """Close the port, without moving."""
         ...

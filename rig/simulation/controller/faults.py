@@ -1,6 +1,6 @@
-"""Faults to order: what goes wrong with stages, each as a function that makes it happen on a bench, now.
+"""Faults of stages, for tests: each makes one thing go wrong on a bench, at once.
 
-A fault strikes once and leaves the world as it would be: a byte is lost, a cable is out, an axis is stuck.
+A fault strikes once and its effect remains: a byte is lost, a cable is unplugged, an axis is stuck.
 """
 
 from collections.abc import Callable
@@ -23,13 +23,13 @@ class Fault:
     Parameters
     ----------
     name : str
-        What to call it.
+        Name of the fault.
     nature : str
-        Where it strikes. Faults of the mechanics show in no report: only a drift check finds them.
+        Part that it affects. Faults of the mechanics show in no report; only a drift check finds them.
     strike : callable
         Makes it happen on a bench.
     protocols : tuple of str
-        Controllers that know it.
+        Controllers that can have it.
     """
 
     name: str
@@ -55,38 +55,38 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0x04]) + data[middle + 1 :] if data else data
 
 
-def _next_only(spoils: list[ByteFilter], spoil: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
-    """ByteFilter the next bytes that `applies` holds for, and no others."""
+def _filter_once(filters: list[ByteFilter], change: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
+    """Change only the next bytes to which `applies`."""
 
     def once(data: bytes) -> bytes:
         if not applies(data):
             return data
-        spoils.remove(once)
-        return spoil(data)
+        filters.remove(once)
+        return change(data)
 
-    spoils.append(once)
+    filters.append(once)
 
 
-def _for_a_while(bench: Bench, spoils: list[ByteFilter], duration_s: float) -> None:
-    """Lose everything for `duration_s`."""
+def _silence(bench: Bench, filters: list[ByteFilter], duration_s: float) -> None:
+    """Lose all bytes for `duration_s`."""
 
     def nothing(data: bytes) -> bytes:
         return b""
 
-    spoils.append(nothing)
-    bench.clock.after(duration_s, lambda: spoils.remove(nothing))
+    filters.append(nothing)
+    bench.clock.after(duration_s, lambda: filters.remove(nothing))
 
 
-def _to_controller(spoil: ByteFilter) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.filters_to_controller, spoil)
+def _to_controller(change: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _filter_once(bench.wire.filters_to_controller, change)
 
 
-def _to_host(spoil: ByteFilter) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.filters_to_host, spoil)
+def _to_host(change: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _filter_once(bench.wire.filters_to_host, change)
 
 
 def _lose_ok(bench: Bench) -> None:
-    _next_only(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
+    _filter_once(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
 
 
 def _mute(bench: Bench) -> None:
@@ -98,7 +98,7 @@ def _deaf(bench: Bench) -> None:
 
 
 def _babble(bench: Bench) -> None:
-    """Talk nonsense a hundred times a second for a minute."""
+    """Send nonsense a hundred times a second for a minute."""
     for line in range(6000):
         bench.clock.after(0.01 * line, lambda: bench.firmware.say("<Jog|MPos:0.0"))
 
@@ -109,7 +109,7 @@ def _answer_late(bench: Bench) -> None:
 
 def _restart_unseen(bench: Bench) -> None:
     bench.firmware.restart()
-    _for_a_while(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
+    _silence(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
 
 def _unplug_and_return(bench: Bench) -> None:
@@ -149,7 +149,7 @@ def _never_end(bench: Bench) -> None:
 
 
 def _push_by_pendant(bench: Bench) -> None:
-    """Somebody moves the stage by another control."""
+    """Move the stage as if by a hand control."""
     x, y = bench.firmware.mechanics.commanded_mm()
     inward = -3.0 if isinstance(bench.firmware, SimulatedGrbl) else 3.0
     bench.firmware.mechanics.queue((x + inward, y + inward), 20.0, 500.0)
@@ -176,8 +176,8 @@ def _alarm(code: int) -> Callable[[Bench], None]:
 
 
 def _early_idle(bench: Bench) -> None:
-    """One report says idle while the stage moves."""
-    _next_only(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
+    """Report idle once while the stage moves."""
+    _filter_once(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
 
 
 def _lose_settings(firmware: SimulatedGrbl) -> None:
@@ -202,7 +202,7 @@ _COMMON = (
     Fault("noise", "wire", lambda bench: bench.wire.to_host(bytes(range(128, 256)) + b"\x00ok\x00\n")),
     Fault("controller mute", "wire", _mute),
     Fault("controller deaf", "wire", _deaf),
-    Fault("silence for a moment", "wire", lambda bench: _for_a_while(bench, bench.wire.filters_to_host, 0.5)),
+    Fault("silence for a moment", "wire", lambda bench: _silence(bench, bench.wire.filters_to_host, 0.5)),
     Fault("answers late", "wire", _answer_late),
     Fault("babble", "wire", _babble),
     Fault("every line damaged", "wire", _damage_every_line),
@@ -231,7 +231,7 @@ _MARLIN = (
 )
 
 FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
-"""Everything that can be made to go wrong."""
+"""All faults."""
 
 
 def faults_of(protocol: ProtocolName) -> tuple[Fault, ...]:

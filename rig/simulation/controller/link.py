@@ -1,4 +1,4 @@
-"""What lies between the driver and the simulated controller: nothing, a pseudo-terminal, or a socket.
+"""The link between driver and simulated controller: within the program, a pseudo-terminal, or a socket.
 
 The last two pass every byte through pyserial and the operating system, as with real hardware.
 """
@@ -13,7 +13,8 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.stages.transport import Port, SerialPort
 
-_REAL_BOUND_S = 10.0
+# Timeout of socket operations in s of real time; only a defect reaches it.
+_SOCKET_TIMEOUT_S = 10.0
 
 
 class Link(Protocol):
@@ -21,7 +22,7 @@ class Link(Protocol):
 
     @property
     def url(self) -> str:
-        """What the driver opens."""
+        """URL that the driver opens."""
         ...
 
     def open(self) -> Port:
@@ -37,7 +38,7 @@ class Link(Protocol):
         ...
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         ...
 
     def unplug(self) -> None:
@@ -46,7 +47,7 @@ class Link(Protocol):
 
 
 class DirectLink:
-    """A cable within the program, for simulations that need no operating system."""
+    """A link within the program."""
 
     url = "simulated:"
 
@@ -55,7 +56,7 @@ class DirectLink:
         self._written, self._readable = bytearray(), bytearray()
 
     def open(self) -> Port:
-        """Return this end of the cable."""
+        """Return the host's end, emptied."""
         self._require_plug()
         self._written.clear()
         self._readable.clear()
@@ -74,7 +75,7 @@ class DirectLink:
         return data
 
     def close(self) -> None:
-        """Give this end back."""
+        """Do nothing: the link needs no closing."""
 
     def receive(self, count: int) -> bytes:
         """Return `count` bytes that the host has written."""
@@ -87,7 +88,7 @@ class DirectLink:
         self._readable += data
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         self._plugged = True
 
     def unplug(self) -> None:
@@ -95,15 +96,15 @@ class DirectLink:
         self._plugged = False
 
     def _require_plug(self) -> None:
-        """Fail as a port does whose cable is out."""
+        """Raise `StageLost` as a port does when its cable is unplugged."""
         if not self._plugged:
-            raise StageLost("simulated: the connection is gone (unplugged); check cable and power")
+            raise StageLost("simulated: the connection is lost (unplugged); check cable and power")
 
 
 class PtyLink:
-    """A pseudo-terminal: to the driver, a serial port like any other.
+    """A pseudo-terminal, which is a serial port to the driver.
 
-    The name of the port is a symbolic link, so that it stays the same when the cable is put in again.
+    Its name is a symbolic link, so that it stays the same when the cable is plugged in again.
     """
 
     def __init__(self) -> None:
@@ -128,7 +129,7 @@ class PtyLink:
         os.write(self._far, data)
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         if self._far >= 0:
             return
         self._far, near = os.openpty()
@@ -151,7 +152,7 @@ class PtyLink:
 
 
 class SocketLink:
-    """A TCP connection on this computer, which pyserial opens by `socket://`, as to a serial device server."""
+    """A TCP connection on this computer, as to a serial device server; pyserial opens it by `socket://`."""
 
     def __init__(self) -> None:
         self._listener: socket.socket | None = None
@@ -161,7 +162,7 @@ class SocketLink:
 
     @property
     def url(self) -> str:
-        """What the driver opens."""
+        """URL that the driver opens."""
         host, port = self._address
         return f"socket://{host}:{port}"
 
@@ -171,7 +172,7 @@ class SocketLink:
         if self._listener is not None:
             self._hang_up()
             self._far, _ = self._listener.accept()
-            self._far.settimeout(_REAL_BOUND_S)
+            self._far.settimeout(_SOCKET_TIMEOUT_S)
             self._far.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return port
 
@@ -188,10 +189,10 @@ class SocketLink:
             self._far.sendall(data)
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         if self._listener is None:
             self._listener = socket.create_server(self._address, reuse_port=True)
-            self._listener.settimeout(_REAL_BOUND_S)
+            self._listener.settimeout(_SOCKET_TIMEOUT_S)
             self._address = self._listener.getsockname()[:2]
 
     def unplug(self) -> None:
@@ -206,7 +207,7 @@ class SocketLink:
         self.unplug()
 
     def _hang_up(self) -> None:
-        """End the connection there is."""
+        """Close the connection, if there is one."""
         if self._far is not None:
             self._far.close()
             self._far = None

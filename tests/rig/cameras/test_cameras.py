@@ -130,7 +130,7 @@ def test_a_file_that_never_ends_and_two_files_at_once(incoming: Incoming) -> Non
 
 
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match="is no folder; create it"):
+    with pytest.raises(CameraError, match="is not a folder; create it"):
         FolderCamera(FolderSettings(str(tmp_path / "absent")), SimulatedClock()).open()
 
 
