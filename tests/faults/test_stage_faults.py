@@ -1,4 +1,4 @@
-"""Everything that can go wrong with a stage, at every moment: a named failure or a recovery, and no wrong exposure."""
+"""Every fault of a stage, at every moment, ends in a named failure or a recovery, and never in a wrong frame."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -31,7 +31,7 @@ MOMENTS = {"connecting": 1.02, "homing": 5.0, "moving": 0.35, "exposing": 0.35}
 
 @dataclass(frozen=True)
 class KeptFrame:
-    """A frame that was kept, and where the camera truly was from its beginning to its end."""
+    """A frame that was kept, and the true positions of the camera at the beginning and the end of its exposure."""
 
     number: int
     target: Point
@@ -44,7 +44,7 @@ class KeptFrame:
 
 @dataclass
 class RehearsedCapture:
-    """A capture in small: the rules by which frames are taken and kept, on a bench where things go wrong."""
+    """A small capture, with the rules by which frames are taken and kept, on a bench with faults."""
 
     bench: Bench
     recovery_bound_s: float = 2.0
@@ -58,12 +58,12 @@ class RehearsedCapture:
         self.on_expose: Callable[[], None] = lambda: None
 
     def run(self) -> None:
-        """Take four frames, coping with failures as a capture would; end well or with a failure noted."""
+        """Take four frames, recovering from failures as a capture does; record every failure."""
         try:
             self.start()
             for target in self.targets():
                 for _ in range(3):
-                    with self.coping():
+                    with self.recovering():
                         self.take(target)
                         break
             self.watch.check()
@@ -73,16 +73,16 @@ class RehearsedCapture:
             self.stage.close()
 
     def start(self) -> None:
-        """Connect and begin to watch for drift, again if it fails."""
-        with self.coping():
+        """Connect and begin the drift watch, repeatedly if it fails."""
+        with self.recovering():
             self.stage.connect()
         for _ in range(3):
-            with self.coping():
+            with self.recovering():
                 self.watch.begin()
                 break
 
     def targets(self) -> list[Point]:
-        """Return places to visit, there and back."""
+        """Return the positions of the frames."""
         travel = self.stage.travel()
         x, y = travel.x_mm[0] + 100.0, travel.y_mm[0] + 100.0
         return [Point(x, y), Point(x + 50.0, y), Point(x + 50.0, y + 50.0), Point(x, y + 50.0)]
@@ -98,18 +98,18 @@ class RehearsedCapture:
         self.on_expose()
         self.bench.clock.sleep_s(1.0)
         self.stage.verify_at(*target)
-        exposure = KeptFrame(len(self.kept), target, began, self.bench.true_position())
-        self.kept.append(exposure)
-        self.watch.visited(exposure.number)
+        frame = KeptFrame(len(self.kept), target, began, self.bench.true_position())
+        self.kept.append(frame)
+        self.watch.visited(frame.number)
 
     def accepted(self) -> list[KeptFrame]:
         """Return the frames that are neither doubtful nor unchecked."""
         doubtful = {*self.watch.doubtful, *self.watch.unchecked}
-        return [exposure for exposure in self.kept if exposure.number not in doubtful]
+        return [frame for frame in self.kept if frame.number not in doubtful]
 
     @contextmanager
-    def coping(self) -> Iterator[None]:
-        """Note a failure of the stage and recover from it; what cannot be recovered from is raised."""
+    def recovering(self) -> Iterator[None]:
+        """Record a failure of the stage and recover; raise if that is impossible."""
         try:
             yield
         except StageError as failure:
@@ -117,36 +117,36 @@ class RehearsedCapture:
             self.recover()
 
     def recover(self) -> None:
-        """Recover within the time allowed, homing if need be."""
-        with self.bounded(self.recovery_bound_s, when_it_ends_well=True):
+        """Recover within the time limit, homing if necessary."""
+        with self.bounded(self.recovery_bound_s, only_on_success=True):
             self.stage.recover()
         recover(self.stage, lambda question: True, self.watch)
 
     @contextmanager
-    def bounded(self, bound_s: float, *, when_it_ends_well: bool = False) -> Iterator[None]:
+    def bounded(self, bound_s: float, *, only_on_success: bool = False) -> Iterator[None]:
         """Assert that the block takes no longer than `bound_s` of simulated time."""
         started_s = self.bench.clock.now_s()
         try:
             yield
         except RigError:
-            if not when_it_ends_well:
+            if not only_on_success:
                 assert self.bench.clock.now_s() - started_s <= bound_s
             raise
         assert self.bench.clock.now_s() - started_s <= bound_s
 
     def check_frames(self, faults: list[Fault]) -> None:
-        """Assert that no frame was kept from a wrong place unless it is marked, and that failures say what to do."""
-        for exposure in self.accepted():
-            assert exposure.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
+        """Assert that no frame from a wrong position is accepted, and that failures say what to do."""
+        for frame in self.accepted():
+            assert frame.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
         if not any(fault.nature == "mechanics" for fault in faults):
-            assert all(exposure.error_mm() <= ON_TARGET_MM for exposure in self.kept)
+            assert all(frame.error_mm() <= ON_TARGET_MM for frame in self.kept)
         for failure in self.failures:
             assert "; " in str(failure), "a failure says what is wrong; and what to do"
             assert "\n" not in str(failure)
 
 
 def once(action: Callable[[], None]) -> Callable[[], None]:
-    """Return `action` such that it happens the first time only."""
+    """Return a function that calls `action` the first time only."""
     pending = [action]
     return lambda: pending.pop()() if pending else None
 

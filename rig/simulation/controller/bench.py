@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.firmware import Firmware
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.link import DirectLink, Link
 from faintfield.rig.simulation.controller.wire import Wire
 from faintfield.rig.stages.drivers import make_stage
@@ -31,7 +31,7 @@ class Bench:
 
     def __init__(
         self,
-        firmware: Callable[[SimulatedClock, Wire], Firmware],
+        firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware],
         link: Link | None = None,
         *,
         resets_on_open: bool = True,

@@ -11,7 +11,7 @@ from faintfield.rig.simulation.controller.wire import Wire
 from faintfield.rig.stages.settings import ProtocolName
 
 
-class Firmware(ABC):
+class SimulatedFirmware(ABC):
     """A simulated controller.
 
     Parameters

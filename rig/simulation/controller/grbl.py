@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.firmware import Firmware
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.gcode import words
 from faintfield.rig.simulation.controller.grbl_lines import parse_jog, status_report
 from faintfield.rig.simulation.controller.grbl_settings import StoredSettings
@@ -25,7 +25,7 @@ _OFFSET_EVERY_BUSY, _OFFSET_EVERY_IDLE = 30, 10
 _ALARM_DELAY_S = 0.05  # from a critical alarm until a reset is accepted
 
 
-class SimulatedGrbl(Firmware):
+class SimulatedGrbl(SimulatedFirmware):
     """Firmware, settings and mechanics of a GRBL stage.
 
     Parameters

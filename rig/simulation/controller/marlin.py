@@ -12,7 +12,7 @@ from functools import reduce
 from operator import xor
 
 from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
-from faintfield.rig.simulation.controller.firmware import Firmware
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.gcode import words
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
 from faintfield.rig.simulation.controller.wire import Wire
@@ -30,7 +30,7 @@ _RELEASE_AFTER_S = 120.0
 _SEEK_MM_PER_S, _BUMP_MM = 25.0, 5.0
 
 
-class SimulatedMarlin(Firmware):
+class SimulatedMarlin(SimulatedFirmware):
     """Firmware, settings and mechanics of a Marlin stage.
 
     Parameters

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.firmware import Firmware
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import Wire
 
 # Longest wait in s between two looks at the port.
@@ -29,7 +29,7 @@ class Server:
     port: str
     _clock: SimulatedClock
     _wire: Wire
-    _firmware: Firmware
+    _firmware: SimulatedFirmware
     _far: int
 
     def run(self, speed: float = 1.0) -> None:
@@ -57,7 +57,7 @@ class Server:
 
 
 @contextmanager
-def serving(firmware: Callable[[SimulatedClock, Wire], Firmware]) -> Iterator[Server]:
+def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
     """Open a pseudo-terminal with a simulated controller behind it, and close it at the end.
 
     Parameters

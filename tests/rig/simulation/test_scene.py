@@ -1,4 +1,4 @@
-"""The renderer against closed forms, against rays cast one by one, and against the operator's own code path."""
+"""The renderer, compared with closed forms, with rays cast one by one, and with the operator of `recon`."""
 
 from collections.abc import Sequence
 from dataclasses import replace

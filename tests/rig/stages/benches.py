@@ -1,4 +1,4 @@
-"""What the tests of drivers share: a stage that is ready, and an ear on the wire."""
+"""What the tests of drivers share: a homed stage, and a record of the serial traffic."""
 
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
@@ -7,7 +7,7 @@ from faintfield.rig.stages.settings import StageSettings
 
 
 class Traffic:
-    """A `TrafficLog` that keeps what passes on the wire."""
+    """A `TrafficLog` that keeps all entries."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[float, str, bytes]] = []

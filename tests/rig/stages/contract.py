@@ -1,4 +1,4 @@
-"""The contract of a stage, which every implementation must keep."""
+"""The contract of a stage, which every implementation must meet."""
 
 import math
 
@@ -9,7 +9,7 @@ from faintfield.rig.stages.protocol import Point, Stage
 
 
 def check_stage(stage: Stage) -> None:
-    """Take an unconnected stage through its whole life."""
+    """Check an unconnected stage, from connecting to closing."""
     _check_unconnected(stage)
     stage.connect()
     _check_identity(stage)
@@ -23,7 +23,7 @@ def check_stage(stage: Stage) -> None:
 
 
 def inside(stage: Stage, share_x: float, share_y: float) -> Point:
-    """Return a point at shares of the travel, in hundredths of a millimetre."""
+    """Return the point at these fractions of the travel, rounded to 0.01 mm."""
     (x0, x1), (y0, y1) = stage.travel().x_mm, stage.travel().y_mm
     return Point(round(x0 + share_x * (x1 - x0), 2), round(y0 + share_y * (y1 - y0), 2))
 

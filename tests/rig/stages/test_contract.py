@@ -1,4 +1,4 @@
-"""Every stage keeps the contract, over every kind of connection."""
+"""Every stage meets the contract, over every kind of connection."""
 
 from collections.abc import Callable, Iterator
 

@@ -1,4 +1,4 @@
-"""Lost steps are found by homing again, and what was visited before stays doubtful."""
+"""Homing again finds lost steps, and what was recorded before stays doubtful."""
 
 from functools import partial
 
@@ -77,7 +77,7 @@ def test_only_what_came_after_the_last_good_check_is_doubtful(controller: Contro
     assert watch.doubtful == ("late",)
 
 
-def test_without_a_beginning_nothing_is_vouched_for() -> None:
+def test_a_check_without_begin_is_refused() -> None:
     stage = Bench(SimulatedGrbl).stage()
     stage.connect()
     stage.home()

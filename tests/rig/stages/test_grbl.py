@@ -1,4 +1,4 @@
-"""What is peculiar to GRBL, on a simulated controller: each trap of the protocol, and the driver's way around it."""
+"""The GRBL driver on a simulated controller: one test for each peculiarity of the protocol."""
 
 from functools import partial
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""Lines from controllers are read strictly: whatever comes, nothing crashes and nothing false passes for an answer."""
+"""Lines of controllers are parsed strictly: no input crashes, and no damaged line is taken for an answer."""
 
 import re
 from functools import reduce
@@ -67,7 +67,7 @@ def test_marlin_lines_are_read() -> None:
 
 @given(st.tuples(*[st.floats(-999.0, 999.0)] * 3), st.sampled_from(["Idle", "Jog", "Alarm", "Home"]))
 @settings(deadline=None)
-def test_a_report_tells_what_was_written(position: tuple[float, float, float], state: str) -> None:
+def test_a_report_is_read_as_it_was_written(position: tuple[float, float, float], state: str) -> None:
     written = ",".join(f"{value:.3f}" for value in position)
     report = grbl.parse(f"<{state}|MPos:{written}|FS:0,0>")
     assert isinstance(report, grbl.Report)
@@ -94,7 +94,7 @@ def test_damaged_and_similar_lines_are_no_answers(line: str) -> None:
 @settings(deadline=None, max_examples=500)
 @given(st.data())
 def test_one_damaged_character_never_makes_another_answer(data: st.DataObject) -> None:
-    """A damaged line is unknown, or of its own kind, or pushed: it never becomes an ok."""
+    """A damaged line never becomes an ok."""
     line = data.draw(st.sampled_from([line for line in GRBL_LINES + MARLIN_LINES if not line.startswith("ok")]))
     place = data.draw(st.integers(0, len(line) - 1))
     new = data.draw(st.characters(max_codepoint=255))
@@ -104,7 +104,7 @@ def test_one_damaged_character_never_makes_another_answer(data: st.DataObject) -
 
 
 def test_a_million_random_lines() -> None:
-    """Half of them are noise, half are real lines with a few bytes changed."""
+    """Half of them are noise, half are real lines with one character changed."""
     generator = np.random.default_rng(31)
     lines = [*_noise(generator, 500_000), *_damaged(generator, 500_000)]
     assert len(lines) == 1_000_000
@@ -120,7 +120,7 @@ def test_a_million_random_lines() -> None:
 
 
 def _noise(generator: np.random.Generator, count: int) -> list[str]:
-    """Return lines of random bytes, biased to those that messages are made of."""
+    """Return lines of random bytes, mostly those that occur in messages."""
     alphabet = np.frombuffer(b"ok:.,|<>[]$=-0123456789 XYMPosIdleJgAarmErn*N\xff\x00", dtype=np.uint8)
     lengths = generator.integers(1, 24, size=count)
     data = alphabet[generator.integers(0, alphabet.size, size=int(lengths.sum()))].tobytes().decode("latin-1")

@@ -1,4 +1,4 @@
-"""Times of motions, the one-sided way, and where the stage may go."""
+"""Durations of motions, one-sided paths, and allowed positions."""
 
 import math
 

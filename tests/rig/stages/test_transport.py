@@ -1,4 +1,4 @@
-"""Lines over pyserial: bounded waits, every byte in the log, and dead connections named."""
+"""Lines over pyserial: bounded waits, every byte in the log, and named failures for lost connections."""
 
 from collections.abc import Iterator
 
@@ -33,7 +33,7 @@ def test_a_port_that_cannot_be_opened_is_named_in_one_line_with_those_that_exist
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_is_taken_alone(pty: PtyLink) -> None:
+def test_a_port_is_opened_exclusively(pty: PtyLink) -> None:
     first = pty.open()
     with pytest.raises(StageLost, match="no other program"):
         pty.open()
@@ -59,7 +59,7 @@ def test_bytes_pass_and_an_unplugged_port_is_lost(pty: PtyLink) -> None:
     port.close()
 
 
-def test_lines_are_cut_stripped_and_decoded_without_fail() -> None:
+def test_lines_are_split_stripped_and_decoded_whatever_they_contain() -> None:
     link = DirectLink()
     line = line_over(link)
     line.open()

@@ -1,4 +1,4 @@
-"""The simulated controllers answer as the real ones do: tests of the tester, line by line."""
+"""The simulated controllers answer as the real ones do."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from faintfield.rig.stages.transport import SerialPort
 
 
 class ControllerTerminal:
-    """A person at the keyboard."""
+    """Types lines to a simulated controller and returns its answers."""
 
     def __init__(self, firmware: type[SimulatedGrbl] | type[SimulatedMarlin], **options: Any) -> None:
         self.clock = SimulatedClock()
@@ -131,7 +131,7 @@ def test_marlin_is_busy_while_it_waits_and_projects_positions() -> None:
     assert terminal.type(b"M400\n", 10.0) == ["echo:busy: processing", "echo:busy: processing", "ok"]
 
 
-def test_marlin_clips_targets_and_lets_its_motors_go() -> None:
+def test_marlin_clips_targets_and_releases_its_motors() -> None:
     terminal = ControllerTerminal(SimulatedMarlin)
     terminal.type(b"G28\n", 60.0)
     terminal.type(b"G1 X900 F6000\n", 20.0)
@@ -147,7 +147,7 @@ def test_no_bytes_crash_a_controller(firmware: type[SimulatedGrbl] | type[Simula
     terminal = ControllerTerminal(firmware)
     for data in typed:
         terminal.type(data)
-    # Ends whatever line was begun and, on GRBL, whatever state was reached
+    # Ends an unfinished line and, on GRBL, any state
     terminal.type(b"\n\x18\n", 2000.0)
     answer = terminal.type(b"?" if firmware is SimulatedGrbl else b"M115\n")
     assert any("<" in line or "FIRMWARE_NAME" in line for line in answer)
