@@ -25,7 +25,7 @@ from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
+from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
 # Prefix of the port of a simulated stage; the name of its controller follows.
 SIMULATED = "simulated:"
@@ -71,7 +71,8 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
         case FolderSettings():
             camera = FolderCamera(settings.camera, WallClock())
         case SimulatedSettings() if bench is not None:
-            lab = _lab(settings, settings.camera, bench)
+            centre = settings.grid.centre().target
+            lab = SimulatedLab(centre, bench.true_position, bench.still_s, settings.board, settings.camera)
             camera = SimulatedCamera(settings.camera, stage.clock, lab)
             return Rig(stage, camera, stage.clock, lab.arrange)
         case SimulatedSettings():
@@ -99,7 +100,6 @@ def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench
     PlanRefused
         The port names no simulated stage.
     """
-    traffic = traffic or NoTrafficLog()
     if is_simulated(settings):
         bench = bench or _simulated_bench(settings)
         port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
@@ -129,8 +129,3 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     bench = Bench(SIMULATED_FIRMWARE[name], link)
     weakref.finalize(bench, link.close)
     return bench
-
-
-def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
-    """Return the simulated lab around a simulated stage."""
-    return SimulatedLab(settings.grid.centre().target, bench.true_position, bench.still_s, settings.board, camera)

@@ -14,7 +14,8 @@ import math
 from msgspec import Struct
 
 from faintfield.rig.errors import PlanRefused, PositionDrifted, StageError
-from faintfield.rig.stages.protocol import AxisIndex, Point, Stage
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import AxisIndex, Point
 
 # Longest delay in s by which serial adapters hold back a short answer; it limits the resolution.
 _JITTER_S = 0.016
@@ -48,13 +49,13 @@ class DriftWatch:
 
     Parameters
     ----------
-    stage : Stage
+    stage : Gantry
         A connected stage.
     limit_mm : float
         Largest drift that passes a check.
     """
 
-    def __init__(self, stage: Stage, *, limit_mm: float = 0.5) -> None:
+    def __init__(self, stage: Gantry, *, limit_mm: float = 0.5) -> None:
         self._stage = stage
         self._limit_mm = limit_mm
         self._unchecked: list[object] = []

@@ -3,15 +3,17 @@
 from collections.abc import Callable
 
 from faintfield.rig.clock import Clock
-from faintfield.rig.stages.controller import Controller
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.grbl.controller import GrblController
 from faintfield.rig.stages.marlin.controller import MarlinController
+from faintfield.rig.stages.protocol import Controller
 from faintfield.rig.stages.settings import StageSettings
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 
-def make_stage(settings: StageSettings, clock: Clock, traffic: TrafficLog, open_port: Callable[[], Port]) -> Gantry:
+def make_stage(
+    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
+) -> Gantry:
     """Return the stage that `settings` describe, not yet connected.
 
     Parameters
@@ -20,7 +22,7 @@ def make_stage(settings: StageSettings, clock: Clock, traffic: TrafficLog, open_
         Protocol, axes and limits.
     clock : Clock
         Clock of the rig.
-    traffic : TrafficLog
+    traffic : TrafficLog, optional
         Log of every byte sent and received.
     open_port : callable
         Opens the connection; for real hardware, a `SerialPort` on `settings.port`.

@@ -12,9 +12,8 @@ from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.controller import Controller
 from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s
-from faintfield.rig.stages.protocol import AxisIndex, Box, Homing, Identity, Point, Position
+from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position
 from faintfield.rig.stages.settings import StageSettings
 from faintfield.rig.stages.workspace import StageWorkspace
 
@@ -23,7 +22,10 @@ _MAX_UNHOMED_JOG_MM = 10.0
 
 
 class Gantry:
-    """A `Stage` that adds trust, limits and verification to a controller.
+    """Two axes that carry the camera, driven from one thread.
+
+    Every method that uses the controller is bounded in time, and raises a `StageError` if the controller does not obey.
+    After an error nothing moves until `recover` and, unless the error kept the position, `home`.
 
     Parameters
     ----------
@@ -94,6 +96,11 @@ class Gantry:
 
     def home(self, axis: AxisIndex | None = None) -> Homing:
         """Find the switches; positions are trusted from then on.
+
+        Parameters
+        ----------
+        axis : 0 or 1, optional
+            Home only this axis, if the controller can (see `Identity.homes_together`).
 
         Raises
         ------

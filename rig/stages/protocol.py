@@ -1,9 +1,10 @@
-"""Defines a stage: the types that drivers, plans and simulators share.
+"""The types of a stage, and `Controller`: what the driver of one firmware must be able to do.
 
 Coordinates are the controller's machine coordinates in millimetres, along the two axes that carry the camera. They are
 not shifted or flipped, so a position in a log can be compared with the controller's display.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol, Self
 
 from msgspec import Struct
@@ -126,64 +127,52 @@ class Homing(Struct, frozen=True):
     duration_s: float
 
 
-class Stage(Protocol):
-    """Two axes that carry the camera, driven from one thread.
+class Controller(Protocol):
+    """Takes motions and reports positions; `Gantry` adds trust, limits and verification.
 
-    Every method that uses the controller is bounded in time, and raises a `StageError` if the controller does not obey.
-    After an error nothing moves until `recover` and, unless the error kept the position, `home`.
+    Every method is bounded in time, and raises a `StageError` if the controller does not obey.
     """
 
-    @property
-    def trusted(self) -> bool:
-        """Whether reported positions can be trusted."""
-        ...
-
     def connect(self) -> None:
-        """Open the port, wait for the controller and read its settings, without moving."""
+        """Open the connection and wait until the controller answers."""
         ...
 
     def identify(self) -> Identity:
-        """Return what the controller reported when it was connected."""
+        """Read the firmware's version and settings; raises `WrongFirmware`."""
         ...
 
-    def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Find the switches; positions are trusted from then on.
-
-        Parameters
-        ----------
-        axis : 0 or 1, optional
-            Home only this axis, if the controller can (see `Identity.homes_together`).
-        """
+    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
+        """Home, and return how long the controller took, in seconds."""
         ...
 
-    def travel(self) -> Box:
-        """Return the allowed positions."""
+    def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
+        """Move through the points of `path`, wait until the stage stands still, and return the reported position."""
         ...
 
-    def move_to(self, x_mm: float, y_mm: float) -> Position:
-        """Go to a position, wait until the stage stands still there, and return the verified report."""
+    def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
+        """Move relative to the present position, first clearing a lock if `unlock`; return the new position."""
         ...
 
-    def position(self) -> Position:
-        """Read the position from the controller."""
-        ...
-
-    def verify_at(self, x_mm: float, y_mm: float) -> Position:
-        """Raise unless the stage stands at this position: the last check before an exposure."""
+    def read_position(self) -> Point:
+        """Return the reported position; raises unless the stage stands still."""
         ...
 
     def switches(self) -> frozenset[AxisIndex]:
-        """Return the axes whose homing switch is closed now."""
+        """Return the axes whose switch is closed."""
         ...
 
-    def hold(self) -> None:
-        """Stop at once."""
+    def stop(self) -> bool:
+        """Stop the motion, wait until it has ended, and return whether the position is kept."""
         ...
 
-    def recover(self) -> None:
-        """Make the controller accept commands again after an error, without moving; `trusted` may then be False."""
+    def abort(self) -> bool:
+        """Tell the stage to stop, without waiting and without raising; return whether the position is kept."""
+        ...
+
+    def recover(self) -> bool:
+        """Make the controller accept commands again, without moving; return whether the position is kept."""
         ...
 
     def close(self) -> None:
-        """Close the port, without moving."""
+        """Close the connection."""
         ...

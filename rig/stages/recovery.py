@@ -4,15 +4,15 @@ from collections.abc import Callable
 
 from faintfield.rig.errors import NotHomed
 from faintfield.rig.stages.drift import DriftWatch
-from faintfield.rig.stages.protocol import Stage
+from faintfield.rig.stages.gantry import Gantry
 
 
-def recover(stage: Stage, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
+def recover(stage: Gantry, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
     """Make the stage usable again after a `StageError`.
 
     Parameters
     ----------
-    stage : Stage
+    stage : Gantry
         The stage that failed.
     may_home : callable
         Called with a question before the stage moves to its switches; homing needs the answer True.

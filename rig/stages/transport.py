@@ -27,13 +27,6 @@ class TrafficLog(Protocol):
         ...
 
 
-class NoTrafficLog:
-    """A log that keeps nothing."""
-
-    def record(self, at_s: float, direction: Direction, data: bytes) -> None:
-        """Ignore `data`."""
-
-
 class Port(Protocol):
     """An open connection that carries bytes in both directions."""
 
@@ -123,11 +116,11 @@ class LineTransport:
         Opens the connection; called at each `open`.
     clock : Clock
         Clock of the time limits.
-    traffic : TrafficLog
+    traffic : TrafficLog, optional
         Log of every byte sent and received.
     """
 
-    def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog) -> None:
+    def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog | None = None) -> None:
         self.clock = clock
         self._open_port = open_port
         self._traffic = traffic
@@ -154,7 +147,7 @@ class LineTransport:
         """Send `data`; raises `StageLost`."""
         with self._live_port() as port:
             port.write(data)
-        self._traffic.record(self.clock.now_s(), "sent", data)
+        self._log("sent", data)
 
     def next_line(self, deadline_s: float) -> str | None:
         """Return the next line that is not empty, or None when the clock reaches `deadline_s`; raises `StageLost`.
@@ -174,7 +167,7 @@ class LineTransport:
             with self._live_port() as port:
                 data = port.read(remaining_s)
             if data:
-                self._traffic.record(self.clock.now_s(), "received", data)
+                self._log("received", data)
                 self._buffer += data
             elif self.clock.now_s() >= deadline_s:
                 return None
@@ -183,6 +176,11 @@ class LineTransport:
         """Yield lines until the clock reaches `deadline_s`; if that is now, yield those already received."""
         while (line := self.next_line(deadline_s)) is not None:
             yield line
+
+    def _log(self, direction: Direction, data: bytes) -> None:
+        """Record `data`, if there is a log."""
+        if self._traffic is not None:
+            self._traffic.record(self.clock.now_s(), direction, data)
 
     @contextmanager
     def _live_port(self) -> Iterator[Port]:

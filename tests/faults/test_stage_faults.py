@@ -11,14 +11,15 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import RigError, StageError
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.faults import FAULTS, Fault, faults_of
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import PtyLink, SocketLink
+from faintfield.rig.simulation.controller.link import PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.recovery import recover
+from tests.faults.stage_faults import FAULTS, Fault, faults_of
+from tests.rig.stages.socket_link import SocketLink
 
 type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
 

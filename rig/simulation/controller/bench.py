@@ -10,7 +10,7 @@ from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import NoTrafficLog, Port, TrafficLog
+from faintfield.rig.stages.transport import Port, TrafficLog
 
 
 class Bench:
@@ -61,7 +61,7 @@ class Bench:
             Log of every byte sent and received.
         """
         settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
-        return make_stage(settings, self.clock, traffic or NoTrafficLog(), self.open_port)
+        return make_stage(settings, self.clock, traffic, self.open_port)
 
     def true_position(self) -> Point:
         """Return the true position of the carriages, whatever the controller reports."""

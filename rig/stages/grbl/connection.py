@@ -3,23 +3,9 @@
 import re
 
 from faintfield.rig.errors import StageTimeout, WrongFirmware
-from faintfield.rig.stages.controller import restart_failure
-from faintfield.rig.stages.grbl.failures import (
-    LOCKED_ERROR,
-    SOFT_LIMIT_ALARM,
-    alarm_failure,
-    error_failure,
-    state_failure,
-)
-from faintfield.rig.stages.grbl.messages import (
-    Alarm,
-    Banner,
-    ErrorCode,
-    Message,
-    Report,
-    parse,
-)
-from faintfield.rig.stages.messages import Ok
+from faintfield.rig.stages.grbl import failures
+from faintfield.rig.stages.grbl.messages import Alarm, Banner, ErrorCode, Message, Report, parse
+from faintfield.rig.stages.messages import Ok, restart_failure
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.transport import LineTransport
 
@@ -111,9 +97,13 @@ class GrblConnection:
             if isinstance(message, Ok):
                 return messages
             if isinstance(message, ErrorCode):
-                if message.code == LOCKED_ERROR and (locked := self.poll()).state not in ("Idle", "Jog", "Run"):
-                    raise state_failure(locked, self.alarm)
-                raise error_failure(text, message.code)
+                if message.code == failures.LOCKED_ERROR and (locked := self.poll()).state not in (
+                    "Idle",
+                    "Jog",
+                    "Run",
+                ):
+                    raise failures.state_failure(locked, self.alarm)
+                raise failures.error_failure(text, message.code)
             messages.append(message)
         raise StageTimeout(
             f"no answer to {text!r} within {bound_s:g} s; check cable and power, then recover and home the stage"
@@ -168,7 +158,7 @@ class GrblConnection:
         message = parse(text)
         self._note(message)
         if isinstance(message, Alarm):
-            raise alarm_failure(message.code)
+            raise failures.alarm_failure(message.code)
         if isinstance(message, Banner):
             raise restart_failure()
         return message
@@ -181,7 +171,7 @@ class GrblConnection:
             self.count_lost = True
         elif isinstance(message, Alarm):
             self.alarm = message.code
-            self.count_lost = self.count_lost or message.code != SOFT_LIMIT_ALARM
+            self.count_lost = self.count_lost or message.code != failures.SOFT_LIMIT_ALARM
 
     def _await_banner(self, within_s: float) -> bool:
         """Return whether the controller reports a start within `within_s`."""

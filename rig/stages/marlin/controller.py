@@ -8,22 +8,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
-from faintfield.rig.stages.controller import restart_failure
-from faintfield.rig.stages.marlin.messages import (
-    ErrorText,
-    Limits,
-    MarlinSetting,
-    Message,
-    PositionReport,
-    Refusal,
-    Resend,
-    Start,
-    Switch,
-    numbered,
-    parse,
-)
+from faintfield.rig.stages.marlin import messages as marlin
 from faintfield.rig.stages.marlin.settings import MarlinSettings
-from faintfield.rig.stages.messages import Ok
+from faintfield.rig.stages.messages import Ok, restart_failure
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport
@@ -105,7 +92,7 @@ class MarlinController:
     def read_position(self) -> Point:
         """Return the real position (R) if the firmware reports it, otherwise the last target."""
         for message in self._command("M114 R"):
-            if isinstance(message, PositionReport):
+            if isinstance(message, marlin.PositionReport):
                 try:
                     return Point(*(message.axes_mm[axis] for axis in self._axes))
                 except KeyError as missing:
@@ -115,7 +102,9 @@ class MarlinController:
     def switches(self) -> frozenset[AxisIndex]:
         """Return the axes with a closed limit switch."""
         messages = self._command("M119")
-        closed = {message.name[0].upper() for message in messages if isinstance(message, Switch) and message.closed}
+        closed = {
+            message.name[0].upper() for message in messages if isinstance(message, marlin.Switch) and message.closed
+        }
         return frozenset(index for index in (0, 1) if self._axes[index] in closed)
 
     def stop(self) -> bool:
@@ -160,10 +149,10 @@ class MarlinController:
         """
         for _ in range(_MAX_STARTS):
             marker = self._new_marker()
-            self._line.send(numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
+            self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
             echoed = False
             for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
-                if echoed and isinstance(parse(text), Ok):
+                if echoed and isinstance(marlin.parse(text), Ok):
                     self._line_number = 0
                     for command in ("G21", "G90", "M84 S0"):
                         self._command(command)
@@ -177,7 +166,7 @@ class MarlinController:
         """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
         marker = self._new_marker()
         self._line_number += 1
-        self._line.send(numbered(self._line_number, f"M118 {marker}"))
+        self._line.send(marlin.numbered(self._line_number, f"M118 {marker}"))
         answered = None
         for text in self._line.lines_until(self._clock.now_s() + _QUIET_S):
             if marker in text:
@@ -197,23 +186,23 @@ class MarlinController:
         while (text := self._line.next_line(deadline_s)) is not None:
             if re.match(r"Grbl", text, re.IGNORECASE):
                 raise WrongFirmware(f"the controller answers as GRBL ({text[:60]!r}); use protocol 'grbl'")
-            if not started and isinstance(parse(text), Start):
+            if not started and isinstance(marlin.parse(text), marlin.Start):
                 started, last_s = True, self._clock.now_s() + 2.0 * _QUIET_S
             if started:
                 deadline_s = min(self._clock.now_s() + _QUIET_S, last_s)
 
-    def _read_settings(self) -> list[Message]:
+    def _read_settings(self) -> list[marlin.Message]:
         """Return the messages about settings and limits."""
         messages = [*self._command("M503"), *self._command("M211")]
-        return [message for message in messages if isinstance(message, MarlinSetting | Limits)]
+        return [message for message in messages if isinstance(message, marlin.MarlinSetting | marlin.Limits)]
 
-    def _command(self, command: str, bound_s: float = _ANSWER_S) -> list[Message]:
+    def _command(self, command: str, bound_s: float = _ANSWER_S) -> list[marlin.Message]:
         """Send one command, again if it arrives damaged, and return the messages before its `ok`."""
         for text in self._line.lines_until(self._clock.now_s()):
-            self._check(parse(text), command)
+            self._check(marlin.parse(text), command)
         self._line_number += 1
         for _ in range(_MAX_SENDINGS):
-            self._line.send(numbered(self._line_number, command))
+            self._line.send(marlin.numbered(self._line_number, command))
             messages = self._await_ok(command, bound_s)
             if messages is not None:
                 return messages
@@ -221,18 +210,18 @@ class MarlinController:
             f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter or shielded cable"
         )
 
-    def _await_ok(self, command: str, bound_s: float) -> list[Message] | None:
+    def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
         """Return the messages up to the `ok`, or None if the controller asks for the line again."""
         deadline_s = self._clock.now_s() + bound_s
-        messages: list[Message] = []
+        messages: list[marlin.Message] = []
         while (text := self._line.next_line(deadline_s)) is not None:
-            message = parse(text)
+            message = marlin.parse(text)
             self._check(message, command)
             messages.append(message)
-            if isinstance(message, Ok) or (isinstance(message, PositionReport) and message.is_ok):
-                if any(isinstance(earlier, Resend) for earlier in messages):
+            if isinstance(message, Ok) or (isinstance(message, marlin.PositionReport) and message.is_ok):
+                if any(isinstance(earlier, marlin.Resend) for earlier in messages):
                     return None
-                refusals = [earlier for earlier in messages if isinstance(earlier, Refusal)]
+                refusals = [earlier for earlier in messages if isinstance(earlier, marlin.Refusal)]
                 if refusals:
                     raise StageRejected(f"the controller refused {command!r}: {refusals[0].text}; home the stage first")
                 return messages
@@ -241,16 +230,16 @@ class MarlinController:
             "check cable and power, then recover and home it"
         )
 
-    def _check(self, message: Message, command: str) -> None:
+    def _check(self, message: marlin.Message, command: str) -> None:
         """Raise for a message that the controller has restarted or stopped."""
-        if isinstance(message, Start):
+        if isinstance(message, marlin.Start):
             raise restart_failure()
-        if isinstance(message, Resend) and message.number != self._line_number:
+        if isinstance(message, marlin.Resend) and message.number != self._line_number:
             raise StageLost(
                 f"the controller waits for line {message.number} and was sent {self._line_number}: it has restarted, "
                 "and its position is lost; recover and home it"
             )
-        if isinstance(message, ErrorText) and not message.in_transmission:
+        if isinstance(message, marlin.ErrorText) and not message.in_transmission:
             raise StageAlarm(
                 f"the controller says {message.text!r} to {command!r}; look for the cause, then recover and home it"
             )

@@ -7,12 +7,13 @@ import pytest
 from faintfield.rig.devices import open_stage
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink, SocketLink
+from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.conformance import conformance
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
 from tests.rig.stages.contract import check_stage
+from tests.rig.stages.socket_link import SocketLink
 
 type MakeBench = Callable[[], Bench]
 

@@ -9,10 +9,11 @@ from faintfield.rig.errors import StageLost, StageTimeout
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.clock import SimulatedClock
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
+from faintfield.rig.simulation.controller.link import DirectLink, PtyLink
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
+from faintfield.rig.stages.transport import LineTransport, SerialPort
 from tests.rig.stages.benches import Traffic
+from tests.rig.stages.socket_link import SocketLink
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def pty() -> Iterator[PtyLink]:
 
 
 def line_over(link: DirectLink) -> LineTransport:
-    return LineTransport(link.open, SimulatedClock(), NoTrafficLog())
+    return LineTransport(link.open, SimulatedClock())
 
 
 @pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x", ""])

@@ -155,24 +155,20 @@ def _push_by_pendant(bench: Bench) -> None:
     bench.firmware.mechanics.queue((x + inward, y + inward), 20.0, 500.0)
 
 
-def _grbl(act: Callable[[SimulatedGrbl], None]) -> Callable[[Bench], None]:
+def _on[Kind: SimulatedGrbl | SimulatedMarlin](
+    kind: type[Kind], act: Callable[[Kind], None]
+) -> Callable[[Bench], None]:
+    """Return what calls `act` with the controller of a bench, which must be of this kind."""
+
     def strike(bench: Bench) -> None:
-        assert isinstance(bench.firmware, SimulatedGrbl)
-        act(bench.firmware)
-
-    return strike
-
-
-def _marlin(act: Callable[[SimulatedMarlin], None]) -> Callable[[Bench], None]:
-    def strike(bench: Bench) -> None:
-        assert isinstance(bench.firmware, SimulatedMarlin)
+        assert isinstance(bench.firmware, kind)
         act(bench.firmware)
 
     return strike
 
 
 def _alarm(code: int) -> Callable[[Bench], None]:
-    return _grbl(lambda firmware: firmware.alarm(code))
+    return _on(SimulatedGrbl, lambda firmware: firmware.alarm(code))
 
 
 def _early_idle(bench: Bench) -> None:
@@ -220,14 +216,16 @@ _COMMON = (
 )
 _GRBL = (
     *(Fault(f"alarm {code}", "controller", _alarm(code), ("grbl",)) for code in range(1, 10)),
-    Fault("hold button", "controller", _grbl(SimulatedGrbl.pause), ("grbl",)),
-    Fault("door open", "controller", _grbl(SimulatedGrbl.open_door), ("grbl",)),
+    Fault("hold button", "controller", _on(SimulatedGrbl, SimulatedGrbl.pause), ("grbl",)),
+    Fault("door open", "controller", _on(SimulatedGrbl, SimulatedGrbl.open_door), ("grbl",)),
     Fault("idle told too early", "wire", _early_idle, ("grbl",)),
-    Fault("settings lost", "controller", _grbl(_lose_settings), ("grbl",)),
+    Fault("settings lost", "controller", _on(SimulatedGrbl, _lose_settings), ("grbl",)),
 )
 _MARLIN = (
-    Fault("killed", "controller", _marlin(lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)),
-    Fault("motors released", "mechanics", _marlin(SimulatedMarlin.release_motors), ("marlin",)),
+    Fault(
+        "killed", "controller", _on(SimulatedMarlin, lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)
+    ),
+    Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), ("marlin",)),
 )
 
 FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
