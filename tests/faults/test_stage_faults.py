@@ -11,19 +11,17 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import RigError, StageError
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.link import PtyLink
-from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.recovery import recover
+from faintfield.rig.stages.settings import ProtocolName
 from tests.faults.stage_faults import FAULTS, Fault, faults_of
+from tests.rig.stages.benches import CONTROLLERS
 from tests.rig.stages.socket_link import SocketLink
 
-type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
-
-CONTROLLERS: dict[str, Controller] = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+BY_PROTOCOL = {controller.protocol: controller for controller in CONTROLLERS}
 DRIFT_LIMIT_MM = 0.5
 # Half a step of 1/80 mm and the rounding of reports
 ON_TARGET_MM = 0.5 / 80.0 + 0.0055
@@ -163,8 +161,8 @@ def test_there_are_enough_faults() -> None:
     [(protocol, fault) for protocol in ("grbl", "marlin") for fault in faults_of(protocol)],
     ids=str,
 )
-def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
-    capture = RehearsedCapture(Bench(CONTROLLERS[protocol]))
+def test_one_fault(protocol: ProtocolName, fault: Fault, moment: str) -> None:
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]))
 
     def strike() -> None:
         capture.bench.clock.after(MOMENTS[moment], lambda: fault.strike(capture.bench))
@@ -182,7 +180,7 @@ def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
 
 
 def test_an_undisturbed_capture_keeps_everything() -> None:
-    for controller in CONTROLLERS.values():
+    for controller in CONTROLLERS:
         capture = RehearsedCapture(Bench(controller))
         capture.run()
         assert len(capture.kept) == 4
@@ -190,13 +188,15 @@ def test_an_undisturbed_capture_keeps_everything() -> None:
         assert capture.accepted() == capture.kept
 
 
-@pytest.mark.parametrize("protocol", CONTROLLERS)
+@pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
 @pytest.mark.parametrize("name", ["unplugged", "unplugged and back", "restart", "noise", "controller mute"])
-def test_faults_through_the_operating_system(protocol: str, link: type[PtyLink] | type[SocketLink], name: str) -> None:
+def test_faults_through_the_operating_system(
+    protocol: ProtocolName, link: type[PtyLink] | type[SocketLink], name: str
+) -> None:
     made = link()
     fault = next(fault for fault in FAULTS if fault.name == name)
-    capture = RehearsedCapture(Bench(CONTROLLERS[protocol], made))
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol], made))
     capture.on_move = once(lambda: fault_soon(capture, fault))
     capture.run()
     made.close()
@@ -209,13 +209,13 @@ def fault_soon(capture: RehearsedCapture, fault: Fault) -> None:
     capture.bench.clock.after(0.35, lambda: fault.strike(capture.bench))
 
 
-@pytest.mark.parametrize("protocol", CONTROLLERS)
+@pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
-def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: st.DataObject) -> None:
+def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: ProtocolName, data: st.DataObject) -> None:
     # A second fault may strike in the middle of recovering from the first
-    capture = RehearsedCapture(Bench(CONTROLLERS[protocol]), recovery_bound_s=6.0)
-    known = faults_of(CONTROLLERS[protocol].protocol)
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]), recovery_bound_s=6.0)
+    known = faults_of(BY_PROTOCOL[protocol].protocol)
     silent = [fault for fault in known if fault.nature == "mechanics"]
     loud = [fault for fault in known if fault.nature != "mechanics"]
     # Two drifts between two checks may cancel: no check by homing can find them, so one at most is drawn.

@@ -12,7 +12,7 @@ from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 # Reports have two decimals and commands three; each rounds by up to half of its last digit.
 _ROUNDING_MM = 0.0055
 
-# Homing may take this long (s); Marlin reports no homing speed to compute it from.
+# Homing may take this long (s); the settings that are read contain no homing speed to compute it from.
 _HOMING_BOUND_S = 240.0
 
 

@@ -2,8 +2,13 @@
 
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.settings import StageSettings
+
+type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
+
+CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
 
 
 class Traffic:

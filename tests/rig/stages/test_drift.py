@@ -13,10 +13,7 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.recovery import recover
-
-type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
-
-CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
+from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
 def watched(bench: Bench, limit_mm: float = 0.5) -> tuple[Gantry, DriftWatch]:

@@ -12,12 +12,13 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.server import serving
 from faintfield.rig.simulation.controller.wire import Wire
 from faintfield.rig.stages.transport import SerialPort
+from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
 class ControllerTerminal:
     """Types lines to a simulated controller and returns its answers."""
 
-    def __init__(self, firmware: type[SimulatedGrbl] | type[SimulatedMarlin], **options: Any) -> None:
+    def __init__(self, firmware: Controller, **options: Any) -> None:
         self.clock = SimulatedClock()
         self.wire = Wire(self.clock)
         self.firmware = firmware(self.clock, self.wire, **options)
@@ -142,8 +143,8 @@ def test_marlin_clips_targets_and_releases_its_motors() -> None:
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(st.binary(max_size=40), max_size=8))
-@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
-def test_no_bytes_crash_a_controller(firmware: type[SimulatedGrbl] | type[SimulatedMarlin], typed: list[bytes]) -> None:
+@pytest.mark.parametrize("firmware", CONTROLLERS)
+def test_no_bytes_crash_a_controller(firmware: Controller, typed: list[bytes]) -> None:
     terminal = ControllerTerminal(firmware)
     for data in typed:
         terminal.type(data)
@@ -153,9 +154,9 @@ def test_no_bytes_crash_a_controller(firmware: type[SimulatedGrbl] | type[Simula
     assert any("<" in line or "FIRMWARE_NAME" in line for line in answer)
 
 
-@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
+@pytest.mark.parametrize("firmware", CONTROLLERS)
 def test_a_served_controller_answers_whoever_opens_its_port(
-    firmware: type[SimulatedGrbl] | type[SimulatedMarlin],
+    firmware: Controller,
 ) -> None:
     with serving(firmware) as server:
         port = SerialPort(server.port, 115200)
