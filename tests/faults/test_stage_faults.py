@@ -16,12 +16,11 @@ from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.recovery import recover
-from faintfield.rig.stages.settings import ProtocolName
 from tests.faults.stage_faults import FAULTS, Fault, faults_of
-from tests.rig.stages.benches import CONTROLLERS
+from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink
 
-BY_PROTOCOL = {controller.protocol: controller for controller in CONTROLLERS}
+BY_PROTOCOL: dict[str, Controller] = {controller.protocol: controller for controller in CONTROLLERS}
 DRIFT_LIMIT_MM = 0.5
 # Half a step of 1/80 mm and the rounding of reports
 ON_TARGET_MM = 0.5 / 80.0 + 0.0055
@@ -161,7 +160,7 @@ def test_there_are_enough_faults() -> None:
     [(protocol, fault) for protocol in ("grbl", "marlin") for fault in faults_of(protocol)],
     ids=str,
 )
-def test_one_fault(protocol: ProtocolName, fault: Fault, moment: str) -> None:
+def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
     capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]))
 
     def strike() -> None:
@@ -191,9 +190,7 @@ def test_an_undisturbed_capture_keeps_everything() -> None:
 @pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
 @pytest.mark.parametrize("name", ["unplugged", "unplugged and back", "restart", "noise", "controller mute"])
-def test_faults_through_the_operating_system(
-    protocol: ProtocolName, link: type[PtyLink] | type[SocketLink], name: str
-) -> None:
+def test_faults_through_the_operating_system(protocol: str, link: type[PtyLink] | type[SocketLink], name: str) -> None:
     made = link()
     fault = next(fault for fault in FAULTS if fault.name == name)
     capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol], made))
@@ -212,7 +209,7 @@ def fault_soon(capture: RehearsedCapture, fault: Fault) -> None:
 @pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
-def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: ProtocolName, data: st.DataObject) -> None:
+def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: st.DataObject) -> None:
     # A second fault may strike in the middle of recovering from the first
     capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]), recovery_bound_s=6.0)
     known = faults_of(BY_PROTOCOL[protocol].protocol)

@@ -97,12 +97,10 @@ class GrblConnection:
             if isinstance(message, Ok):
                 return messages
             if isinstance(message, ErrorCode):
-                if message.code == failures.LOCKED_ERROR and (locked := self.poll()).state not in (
-                    "Idle",
-                    "Jog",
-                    "Run",
-                ):
-                    raise failures.state_failure(locked, self.alarm)
+                if message.code == failures.LOCKED_ERROR:
+                    report = self.poll()
+                    if report.state not in ("Idle", "Jog", "Run"):
+                        raise failures.state_failure(report, self.alarm)
                 raise failures.error_failure(text, message.code)
             messages.append(message)
         raise StageTimeout(
