@@ -1,25 +1,25 @@
-"""Printed ChArUco boards, as rig.toml describes them."""
+"""The `[[board]]` tables of rig.toml: printed ChArUco boards."""
 
 import cv2
 import numpy as np
 from msgspec import Struct
 
 
-class Board(Struct, frozen=True, forbid_unknown_fields=True):
+class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """A `[[board]]` table: one printed ChArUco board.
 
     Parameters
     ----------
     name : str
-        What to call it.
+        Name in results and messages.
     columns, rows : int
-        Squares.
+        Number of squares.
     square_mm, marker_mm : float
-        Sides.
+        Sides of a square and of a marker.
     dictionary : str
         OpenCV's name of the marker dictionary.
     first_marker_id : int
-        Markers are numbered from here, so that several boards can be told apart.
+        Number of the first marker; boards with different markers can be told apart.
     """
 
     name: str
@@ -32,11 +32,11 @@ class Board(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not hasattr(cv2.aruco, self.dictionary) or not self.dictionary.startswith("DICT_"):
-            raise ValueError(f"board {self.name}: {self.dictionary!r} is no dictionary of OpenCV; try DICT_5X5_1000")
-        known, own = len(self._dictionary().bytesList), self.columns * self.rows // 2
-        if not 0 <= self.first_marker_id <= known - own:
+            raise ValueError(f"board {self.name}: {self.dictionary!r} is not a dictionary of OpenCV; try DICT_5X5_1000")
+        available, markers = len(self._dictionary().bytesList), self.columns * self.rows // 2
+        if not 0 <= self.first_marker_id <= available - markers:
             raise ValueError(
-                f"board {self.name}: {self.dictionary} has {known} markers, too few for {own} from "
+                f"board {self.name}: {self.dictionary} has {available} markers, too few for {markers} from "
                 f"{self.first_marker_id} on; take a larger dictionary or a lower first_marker_id"
             )
         if min(self.columns, self.rows) < 3 or not 0.0 < self.marker_mm < self.square_mm:
@@ -46,14 +46,15 @@ class Board(Struct, frozen=True, forbid_unknown_fields=True):
             )
 
     def in_opencv(self) -> cv2.aruco.CharucoBoard:
-        """Return OpenCV's idea of the board; its dictionary holds its own markers only: that is quicker."""
-        whole = self._dictionary()
+        """Return OpenCV's board; its dictionary holds only the board's own markers, which speeds up detection."""
+        predefined = self._dictionary()
         count = self.columns * self.rows // 2
-        own = whole.bytesList[self.first_marker_id : self.first_marker_id + count]
-        dictionary = cv2.aruco.Dictionary(own, whole.markerSize, whole.maxCorrectionBits)
+        own = predefined.bytesList[self.first_marker_id : self.first_marker_id + count]
+        dictionary = cv2.aruco.Dictionary(own, predefined.markerSize, predefined.maxCorrectionBits)
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square_mm, self.marker_mm, dictionary, np.arange(count, dtype=np.int32)
         )
 
     def _dictionary(self) -> cv2.aruco.Dictionary:
+        """Return the predefined dictionary that `dictionary` names."""
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))

@@ -1,28 +1,28 @@
-"""Time as the rig sees it, so that a simulated rig can bring a clock of its own."""
+"""The clock of the rig: real time, or the time of a simulation."""
 
 import time
 from typing import Protocol
 
 
 class Clock(Protocol):
-    """A clock that only runs forward."""
+    """A clock that never runs backwards."""
 
     def now_s(self) -> float:
-        """Return the seconds since some fixed moment."""
+        """Return the time in seconds since a fixed moment."""
         ...
 
     def sleep_s(self, duration_s: float) -> None:
-        """Let `duration_s` seconds go by."""
+        """Wait for `duration_s` seconds."""
         ...
 
 
 class WallClock:
-    """The real time, unmoved by changes to the date."""
+    """Real time, unaffected by changes of the system's date."""
 
     def now_s(self) -> float:
-        """Return the seconds since some fixed moment."""
+        """Return the time in seconds since a fixed moment."""
         return time.monotonic()
 
     def sleep_s(self, duration_s: float) -> None:
-        """Let `duration_s` seconds go by."""
+        """Wait for `duration_s` seconds."""
         time.sleep(duration_s)

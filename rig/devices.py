@@ -1,4 +1,4 @@
-"""From the configuration to the devices it names, real or simulated."""
+"""Makes the stage and the camera that rig.toml describes, real or simulated."""
 
 import weakref
 from collections.abc import Callable
@@ -12,22 +12,22 @@ from faintfield.rig.cameras.gphoto2 import GPhoto2Camera
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import Camera
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
-from faintfield.rig.cameras.simulated import SimulatedCamera
 from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import RigSettings
+from faintfield.rig.simulation.camera import SimulatedCamera
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.link import PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import NoTrafficLog, SerialPort, TrafficLog
+from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
-# A port that begins so is a simulated stage; what follows names its controller.
+# Prefix of the port of a simulated stage; the name of its controller follows.
 SIMULATED = "simulated:"
 SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 
@@ -39,12 +39,12 @@ class Rig:
     Parameters
     ----------
     stage, camera : Gantry, Camera
-        What moves and what sees.
+        The devices.
     clock : Clock
-        The time that both live in.
+        Their clock.
     arrange : callable
-        Told at the beginning of each step, by its kind and sweep; a simulated lab then does what a person has done
-        in a real one.
+        Called with kind and sweep at the beginning of each step; a simulated lab then does what a person does in a
+        real one.
     """
 
     stage: Gantry
@@ -54,12 +54,12 @@ class Rig:
 
 
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
-    """Return the stage and the camera that a rig.toml describes.
+    """Return the stage and the camera of a rig.toml, not yet connected.
 
     Raises
     ------
     PlanRefused
-        A simulated camera needs a simulated stage: only there it is known where the camera truly is.
+        The camera is simulated and the stage is not, so that the camera's true position is not known.
     """
     bench = _simulated_bench(settings.stage) if is_simulated(settings.stage) else None
     stage = open_stage(settings.stage, traffic, bench)
@@ -71,7 +71,8 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
         case FolderSettings():
             camera = FolderCamera(settings.camera, WallClock())
         case SimulatedSettings() if bench is not None:
-            lab = _lab(settings, settings.camera, bench)
+            centre = settings.grid.centre().target
+            lab = SimulatedLab(centre, bench.true_position, bench.still_s, settings.board, settings.camera)
             camera = SimulatedCamera(settings.camera, stage.clock, lab)
             return Rig(stage, camera, stage.clock, lab.arrange)
         case SimulatedSettings():
@@ -82,46 +83,45 @@ def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
 def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench: Bench | None = None) -> Gantry:
     """Return the stage that `settings` describe, not yet connected.
 
-    Protocol `simulated`, or a port `simulated:grbl` or `simulated:marlin`, gives a simulated stage that keeps its own
-    time: nothing takes any.
+    Protocol `simulated`, or a port `simulated:grbl` or `simulated:marlin`, gives a simulated stage with a clock of its
+    own, so that motions take no real time.
 
     Parameters
     ----------
     settings : StageSettings
         The `[stage]` table.
     traffic : TrafficLog, optional
-        Where every byte is recorded.
+        Log of every byte sent and received.
     bench : Bench, optional
-        The simulated world that a simulated stage shall stand in; one of its own without it.
+        Bench of a simulated stage; by default a new one.
 
     Raises
     ------
     PlanRefused
-        No such stage is simulated.
+        The port names no simulated stage.
     """
-    traffic = traffic or NoTrafficLog()
     if is_simulated(settings):
         bench = bench or _simulated_bench(settings)
         port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
         return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
-    return stage_from(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
+    return make_stage(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
 
 
 def is_simulated(settings: StageSettings) -> bool:
-    """Return whether the stage that `settings` describe exists in the computer alone."""
+    """Return whether `settings` describe a simulated stage."""
     return settings.protocol == "simulated" or settings.port.startswith(SIMULATED)
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:
     """Return the bench of the simulated stage that `settings` name, such as `simulated:grbl` or `simulated:grbl:pty`.
 
-    With the latter, every byte goes through a pseudo-terminal and pyserial.
+    With `:pty`, every byte passes through a pseudo-terminal and pyserial.
     """
     name, _, cable = settings.port.removeprefix(SIMULATED).partition(":")
     if (name or "grbl") not in SIMULATED_FIRMWARE or cable not in ("", "pty"):
         raise PlanRefused(
-            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, each "
-            "also with :pty behind it"
+            f"{settings.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}, "
+            "with or without :pty after it"
         )
     if not cable:
         return Bench(SIMULATED_FIRMWARE[name or "grbl"])
@@ -129,8 +129,3 @@ def _simulated_bench(settings: StageSettings) -> Bench:
     bench = Bench(SIMULATED_FIRMWARE[name], link)
     weakref.finalize(bench, link.close)
     return bench
-
-
-def _lab(settings: RigSettings, camera: SimulatedSettings, bench: Bench) -> SimulatedLab:
-    """Return the simulated lab around the simulated stage."""
-    return SimulatedLab(settings.grid.centre().target, bench.true_position, bench.still_s, settings.board, camera)

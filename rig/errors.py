@@ -1,4 +1,4 @@
-"""The failures of the rig, one tree: catch `RigError` to catch them all.
+"""The exceptions of the rig, in one tree: catch `RigError` to catch them all.
 
 RigError
 ├── StageError
@@ -23,35 +23,35 @@ RigError
 │   └── SessionUnwritable
 └── CaptureStopped
 
-A `StageError` happened to the stage, a `CameraError` to the camera; a `PlanRefused` was found before anything moved. A
-`SessionError` is about the files of a capture, and `CaptureStopped` ends one that the operator has stopped. Every
-message says what is wrong, the value found, the limit it broke, and what to do, in one line.
+A `StageError` concerns the stage, a `CameraError` the camera, and a `SessionError` the files of a capture; a
+`PlanRefused` is raised before anything moves, and `CaptureStopped` when the operator stops a capture. Every message is
+one line that says what is wrong, the value found, its limit, and what to do.
 """
 
 
 class RigError(Exception):
-    """Something in the world (stage, camera, session on disk) is not as it must be."""
+    """The stage, the camera or the session on disk does not work as it must."""
 
 
 class StageError(RigError):
-    """The stage did not do what it was told.
+    """The stage did not obey a command.
 
     Attributes
     ----------
     position_kept : bool
-        Whether the controller still knows where the stage is. When it does not, only homing restores it.
+        Whether the controller still knows the position of the stage; if not, the stage must be homed.
     """
 
     position_kept = False
 
 
 class StageAlarm(StageError):
-    """The controller has stopped and says why.
+    """The controller has stopped and reported why.
 
     Attributes
     ----------
     code : int or None
-        The controller's own number for the alarm, where it has one.
+        The controller's number of the alarm, if it has one.
     """
 
     def __init__(self, message: str, *, code: int | None = None, position_kept: bool = False) -> None:
@@ -61,36 +61,36 @@ class StageAlarm(StageError):
 
 
 class StageTimeout(StageError):
-    """A wait has reached its bound: no answer, or a motion that does not end."""
+    """A wait has timed out: no answer, or a motion that does not end."""
 
 
 class StageLost(StageError):
-    """The connection is gone, or the controller has restarted behind it."""
+    """The connection is lost, or the controller has restarted."""
 
 
 class StageRejected(StageError):
-    """The controller refused a command; nothing moved."""
+    """The controller refused a command, and nothing moved."""
 
     position_kept = True
 
 
 class StageUnfit(StageError):
-    """The stage does what it is told, but not well enough for a capture."""
+    """The stage obeys, but not well enough for a capture."""
 
     position_kept = True
 
 
 class PositionLost(StageError):
-    """The stage is not where it was sent."""
+    """The stage is not at its target."""
 
 
 class PositionDrifted(PositionLost):
-    """Homing again found the stage off its scale: positions since the last good check are suspect.
+    """Homing again showed lost steps: positions since the last passed check are suspect.
 
     Attributes
     ----------
     suspect : tuple
-        What was visited since the last good check, in order.
+        What was recorded since the last passed check, in order.
     """
 
     def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
@@ -99,52 +99,57 @@ class PositionDrifted(PositionLost):
 
 
 class PlanRefused(RigError):
-    """What was asked for is refused before anything moves."""
+    """A request is refused before anything moves."""
 
 
 class OutsideTravel(PlanRefused):
-    """A position, or the way to it, leaves the travel of the stage."""
+    """A position, or the path to it, leaves the travel of the stage."""
 
 
 class KeepOutCrossed(PlanRefused):
-    """A position, or the way to it, enters a keep-out box."""
+    """A position, or the path to it, enters a keep-out box."""
 
 
 class NotHomed(PlanRefused):
-    """The stage has not been homed since its position was last in doubt."""
+    """The stage has not been homed since its position was lost."""
 
 
 class WrongFirmware(PlanRefused):
-    """The controller's firmware, or one of its settings, cannot be driven safely."""
+    """The firmware, or one of its settings, cannot be used safely."""
 
 
 class CameraError(RigError):
-    """The camera did not take the frame that it was asked for."""
+    """The camera did not take the requested frame."""
 
 
 class CameraTimeout(CameraError):
-    """The camera did not answer, or no file came, within the bound."""
+    """The camera did not answer, or no file arrived, in time."""
 
 
 class MissingExtra(CameraError):
-    """The package that talks to this kind of camera is not installed."""
+    """The package for this kind of camera is not installed."""
 
 
 class SessionError(RigError):
-    """The session's folder cannot be used."""
+    """The folder of the session cannot be used."""
 
 
 class SessionCorrupt(SessionError):
-    """Plan, journal and frames do not agree, and it cannot be told from them which is right."""
+    """Plan, journal and frames disagree, and nothing shows which is right."""
 
 
 class SessionBusy(SessionError):
-    """Another capture has the session."""
+    """Another capture uses the session."""
 
 
 class SessionUnwritable(SessionError):
-    """A frame or an entry of the journal could not be written; what was committed before is safe."""
+    """A frame or a journal entry could not be written; what was committed before is safe."""
 
 
 class CaptureStopped(RigError):
-    """The operator has stopped the capture; running it again goes on."""
+    """The operator has stopped the capture; running it again resumes it."""
+
+
+def in_one_line(failure: BaseException) -> str:
+    """Return the message of `failure` without line breaks, or its type if it has none."""
+    return " ".join(str(failure).split()) or type(failure).__name__

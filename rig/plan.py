@@ -9,7 +9,7 @@ from msgspec import Struct
 from faintfield.rig.grid import centre_node
 from faintfield.rig.stages.motion import one_sided, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point
-from faintfield.rig.stages.workspace import Workspace
+from faintfield.rig.stages.workspace import StageWorkspace
 
 type Order = Literal["serpentine", "raster"]
 type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"]
@@ -155,7 +155,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
                 points.extend(one_sided(points[-1], target, self.approach_mm))
         return tuple(points)
 
-    def check(self, workspace: Workspace, start: Point | None = None) -> None:
+    def check(self, workspace: StageWorkspace, start: Point | None = None) -> None:
         """Refuse the plan if any of its positions, or the way between two, is not allowed.
 
         Raises

@@ -4,7 +4,7 @@ import math
 
 from msgspec import Struct
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
 from faintfield.rig.plan import Grid, Step, StepKind
 from faintfield.rig.stages.settings import StageSettings
@@ -158,7 +158,7 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
     checks: CheckSettings = CheckSettings()
     drift: DriftSettings = DriftSettings()
     scene: SceneSettings = SceneSettings()
-    board: tuple[Board, ...] = ()
+    board: tuple[BoardSettings, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.step:

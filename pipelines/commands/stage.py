@@ -1,4 +1,4 @@
-"""`faintfield stage`: bring up a stage by hand, with the driver that captures with it."""
+"""`faintfield stage`: bring up a stage by hand, with the driver that captures use."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,7 +23,7 @@ from faintfield.rig.stages.settings import StageSettings
 
 app = App(
     name="stage",
-    help="Bring up a stage: ask it, home it, move it, try it.",
+    help="Bring up a stage: identify it, home it, move it, test it.",
     help_epilogue="Example: faintfield stage test --port simulated:grbl",
 )
 
@@ -31,18 +31,18 @@ app = App(
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Connection:
-    """Which stage to talk to: a port, or the stage of a rig.toml.
+    """The stage to use: a port, or the stage of a rig.toml.
 
     Parameters
     ----------
     port
         Serial device, pyserial URL, or simulated:grbl, simulated:marlin.
     protocol
-        What the controller at the port speaks; grbl by default.
+        Firmware of the controller at the port; grbl by default.
     baud
         Bits per second; 115200 by default.
     rig
-        Take the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
+        Use the [stage] table of this rig.toml instead, with its limits and keep-out boxes.
     """
 
     port: str | None = None
@@ -51,11 +51,11 @@ class Connection:
     rig: Path | None = None
 
     def settings(self) -> StageSettings:
-        """Return the settings of the stage that is meant."""
+        """Return the settings of the stage."""
         stated = [name for name in ("port", "protocol", "baud") if getattr(self, name) is not None]
         if self.rig is not None:
             if stated:
-                raise WrongUsage(f"--rig says all there is to say of the stage; leave out --{stated[0]}, or --rig")
+                raise WrongUsage(f"--rig describes the whole stage; leave out --{stated[0]}, or --rig")
             return stage_table(self.rig)
         if self.port is None:
             raise WrongUsage(
@@ -63,7 +63,7 @@ class Connection:
             )
         if self.port.startswith(SIMULATED):
             if self.protocol is not None:
-                raise WrongUsage(f"--port {self.port} says what it speaks; leave out --protocol")
+                raise WrongUsage(f"--port {self.port} names its protocol; leave out --protocol")
             if self.port.removeprefix(SIMULATED) not in SIMULATED_FIRMWARE:
                 raise WrongUsage(
                     f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
@@ -72,7 +72,7 @@ class Connection:
 
 
 class _RigFile(msgspec.Struct):
-    """The part of a rig.toml that a stage needs; the rest is for others to read."""
+    """The part of a rig.toml that describes the stage; other tables are ignored."""
 
     stage: StageSettings
 
@@ -83,14 +83,14 @@ def stage_table(path: Path) -> StageSettings:
     Raises
     ------
     MissingFile, BadValue, UnknownKey
-        With the file's name and what is wrong in it.
+        The file cannot be read; the message names it and what is wrong.
     """
     return read_toml(path, _RigFile).stage
 
 
 @app.command(sort_key=1)
 def info(connection: Connection = Connection()) -> Identity:
-    """Say who the controller is and how it is set; nothing moves."""
+    """Show firmware, travel and settings of the controller, without moving."""
     with _connected(connection) as stage:
         identity = stage.identify()
         say(f"{identity.firmware}, travel {stage.travel()}")
@@ -101,7 +101,7 @@ def info(connection: Connection = Connection()) -> Identity:
 
 @app.command(sort_key=3)
 def home(connection: Connection = Connection()) -> Position:
-    """Find the switches."""
+    """Find the homing switches."""
     with _connected(connection) as stage:
         homing = stage.home()
         say(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
@@ -116,7 +116,7 @@ def goto(
     home: Annotated[bool, Parameter(negative=())] = False,
     connection: Connection = Connection(),
 ) -> Position:
-    """Go to a position in machine coordinates, and verify it.
+    """Move to a position in machine coordinates, and verify it.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def goto(
     y_mm
         Position along the second axis.
     home
-        Home first. Needed, since opening the port restarts most controllers.
+        Home first; needed because opening the port restarts most controllers.
     """
     with _connected(connection) as stage:
         stage.workspace().check_path([Point(x_mm, y_mm)])
@@ -144,7 +144,7 @@ def jog(
     unlock: Annotated[bool, Parameter(negative=())] = False,
     connection: Connection = Connection(),
 ) -> Position:
-    """Move by at most 10 mm without homing, to find out which way the axes go.
+    """Move by at most 10 mm without homing, to find the directions of the axes.
 
     Parameters
     ----------
@@ -157,18 +157,18 @@ def jog(
     """
     with _connected(connection) as stage:
         position = stage.jog(dx_mm, dy_mm, unlock=unlock)
-        say(f"reported at {position.point}; not homed, so this says nothing of where it is")
+        say(f"reported at {position.point}; not homed, so the true position is unknown")
         return position
 
 
 @app.command(name="test", sort_key=5)
 def conform(connection: Connection = Connection()) -> list[Check]:
-    """Try what a capture relies on: limits, speed, repeatability. The stage homes and moves.
+    """Test what a capture relies on: limits, speed, repeatability. The stage homes and moves.
 
     Raises
     ------
     StageUnfit
-        Something was not as it must be; the table says what.
+        A check failed; the table shows which.
     """
     with _connected(connection) as stage:
         checks = []
@@ -187,14 +187,14 @@ def conform(connection: Connection = Connection()) -> list[Check]:
 
 @app.command(sort_key=6)
 def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
-    """Serve a simulated controller on a port, for other programs, until Ctrl-C ends it.
+    """Serve a simulated controller on a port for other programs, until Ctrl-C.
 
     Parameters
     ----------
     protocol
-        What it speaks.
+        Firmware of the controller.
     speed
-        How many simulated seconds pass in a real one.
+        Simulated seconds per real second.
     """
     with serving(SIMULATED_FIRMWARE[protocol]) as server:
         say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
@@ -204,7 +204,7 @@ def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0
 
 @contextmanager
 def _connected(connection: Connection) -> Iterator[Gantry]:
-    """Connect to a stage, say what should be changed in it, and give the port back in the end."""
+    """Connect to a stage, print its warnings, and close the port at the end."""
     try:
         settings = connection.settings()
     except ValueError as failure:
@@ -220,7 +220,7 @@ def _connected(connection: Connection) -> Iterator[Gantry]:
 
 
 def _table(checks: list[Check]) -> Table:
-    """Return the checks as a table for people."""
+    """Return the checks as a table."""
     table = Table("", "check", "measured", "limit")
     for check in checks:
         mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from faintfield.recon.metrics import signal_scale_for_snr
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import (
@@ -77,7 +77,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
         checks=CheckSettings(saturation_dn=float(camera.saturation_dn)),
         drift=DriftSettings(),
         scene=SceneSettings((500.0, 700.0)),
-        board=(Board("large", 9, 7, 40.0, 30.0, "DICT_4X4_50"),),
+        board=(BoardSettings("large", 9, 7, 40.0, 30.0, "DICT_4X4_50"),),
     )
 
 

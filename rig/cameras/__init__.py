@@ -1,1 +1,1 @@
-"""Cameras: one protocol, and a driver for each way of reaching one."""
+"""Cameras: one protocol, and a driver for each way to connect one."""

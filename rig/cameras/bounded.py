@@ -1,4 +1,4 @@
-"""Calls into camera libraries that may never come back, with an end to the waiting."""
+"""Limits the time of calls into camera libraries, which may hang."""
 
 import threading
 from collections.abc import Callable
@@ -8,19 +8,19 @@ from faintfield.rig.errors import CameraTimeout
 
 
 def call_within[T](bound_s: float, call: Callable[[], T], what: str) -> T:
-    """Return what `call` returns, or raise `CameraTimeout` when it does not within `bound_s`.
+    """Return the result of `call`, or raise `CameraTimeout` if there is none within `bound_s`.
 
-    A library stuck in a driver cannot be stopped from outside. It is left behind in a thread of its own, which does
-    not keep the program from ending; the camera must not be used again before it was opened anew.
+    A library that hangs in a driver cannot be stopped from outside. It stays in a thread of its own, which does not
+    keep the program from ending; the camera must be opened again before it is used.
 
     Parameters
     ----------
     bound_s : float
-        How long to wait, in real seconds: cameras know no others.
+        Time limit in seconds of real time, even if the rig's clock is simulated.
     call : callable
-        What may hang.
+        The call that may hang.
     what : str
-        What it does, for the message.
+        What the call does, for the message.
     """
     outcome: Future[T] = Future()
 

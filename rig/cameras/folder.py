@@ -1,4 +1,4 @@
-"""Any vendor's program: it saves a file for each frame, and this camera waits for it."""
+"""A camera behind any vendor's program: waits for the file that the program saves for each frame."""
 
 from pathlib import Path
 
@@ -7,20 +7,22 @@ from faintfield.rig.cameras.settings import FolderSettings
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CameraError, CameraTimeout
 
+# Interval in s at which the folder is listed.
 _POLL_S = 0.25
-# A file that has not grown for this many looks is taken as complete.
+
+# A file is complete when its size has not changed in this many listings.
 _QUIET_POLLS = 3
 
 
 class FolderCamera:
-    """A `Camera` behind a folder in which files appear.
+    """A `Camera` that takes its frames from new files in a folder.
 
     Parameters
     ----------
     settings : FolderSettings
         The `[camera]` table.
     clock : Clock
-        Real time, as the files are.
+        Clock of the waits.
     """
 
     def __init__(self, settings: FolderSettings, clock: Clock) -> None:
@@ -30,9 +32,9 @@ class FolderCamera:
         self._known: set[Path] | None = None
 
     def open(self) -> None:
-        """Note which files are there already: they are no frames of ours."""
+        """Remember the files that are already in the folder, which are not frames of this session."""
         if not self._folder.is_dir():
-            raise CameraError(f"{self._folder}: is no folder; create it, and let the camera's program save there")
+            raise CameraError(f"{self._folder}: is not a folder; create it, and let the camera's program save there")
         self._known = set(self._files())
 
     def report(self) -> CameraReport:
@@ -41,17 +43,17 @@ class FolderCamera:
         return CameraReport(f"files in {self._folder}", round(self._settings.frame_mb * 1e6), readout_s=1.0)
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
-        """Wait for the next file, until it is complete.
+        """Wait for the next file to appear and become complete.
 
         Raises
         ------
         CameraTimeout
-            No file came, or it never stopped growing.
+            No file appeared, or its size kept growing.
         CameraError
-            Two files came at once: which of them is this frame cannot be known.
+            Two files appeared at once, and either could be this frame.
         """
         known = self._require_open()
-        known.update(self._files())  # one that came late or unasked shows the wrong place
+        known.update(self._files())  # a late or unrequested frame shows another position
         bound_s = exposure_s + self._settings.arrival_s
         deadline_s = self._clock.now_s() + bound_s
         sizes: list[int] = []
@@ -77,15 +79,15 @@ class FolderCamera:
         )
 
     def close(self) -> None:
-        """Stop watching."""
+        """Forget the folder's files."""
         self._known = None
 
     def _files(self) -> list[Path]:
-        """Return the files of the right kind."""
+        """Return the files with the configured suffixes."""
         return [path for path in self._folder.iterdir() if path.suffix.lower() in self._settings.suffixes]
 
     def _require_open(self) -> set[Path]:
-        """Return the files that are known, or raise before `open`."""
+        """Return the files seen so far; raises `CameraError` before `open`."""
         if self._known is None:
             raise CameraError("the camera is not connected; open it first")
         return self._known

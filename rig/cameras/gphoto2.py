@@ -1,4 +1,4 @@
-"""Tethered cameras through libgphoto2: the file that the camera made is kept byte for byte."""
+"""Tethered cameras, through libgphoto2; files are kept byte for byte."""
 
 import re
 from pathlib import PurePath
@@ -9,12 +9,14 @@ from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import GPhoto2Settings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 
+# Names that cameras give the setting of the exposure time.
 _SHUTTER_NAMES = ("shutterspeed", "shutterspeed2", "exposuretime")
+# Settings that are recorded in the report.
 _RECORDED = ("iso", "f-number", "aperture", "imageformat", "imagequality", "focusmode", "batterylevel", "cameramodel")
 
 
 class GPhoto2Camera:
-    """A `Camera` that libgphoto2 talks to.
+    """A `Camera` that libgphoto2 supports.
 
     Parameters
     ----------
@@ -29,7 +31,7 @@ class GPhoto2Camera:
         self._shutter_s: float | None = None
 
     def open(self) -> None:
-        """Connect, and set what `settings` ask for."""
+        """Connect, and change the camera's settings as configured."""
         try:
             import gphoto2
         except ImportError as failure:
@@ -66,22 +68,22 @@ class GPhoto2Camera:
         return Exposure(PurePath(name).suffix.lower(), content=content, metadata={"camera_file": name})
 
     def close(self) -> None:
-        """End the connection; a camera that is gone is let go in silence."""
+        """Disconnect; a camera that does not answer is ignored."""
         camera, self._camera, self._shutter_s = self._camera, None, None
         if camera is not None:
             try:
                 call_within(self._settings.answer_s, camera.exit, "disconnecting")
             except (CameraError, self._gphoto2.GPhoto2Error):
-                pass  # whatever is wrong with it was reported when it was used
+                pass  # any fault was already raised when the camera was used
 
     def _bounded(self, call: Any, what: str, extra_s: float = 0.0) -> Any:
-        """Make a call within its bound, its failures in words."""
+        """Call with a time limit, and raise `CameraError` for what the library raises."""
         if self._camera is None and call != self._connect:
             raise CameraError("the camera is not connected; open it first")
         try:
             return call_within(self._settings.answer_s + 2.0 * extra_s, call, what)
         except CameraTimeout:
-            self._camera = None  # stuck, so not even to be asked to disconnect
+            self._camera = None  # it hangs, so it is not asked to disconnect
             raise
         except self._gphoto2.GPhoto2Error as failure:
             raise CameraError(
@@ -90,7 +92,7 @@ class GPhoto2Camera:
             ) from failure
 
     def _connect(self) -> Any:
-        """Find the camera and connect to it."""
+        """Return the connected camera."""
         camera = self._gphoto2.Camera()
         if self._settings.port:
             ports = self._gphoto2.PortInfoList()
@@ -100,7 +102,7 @@ class GPhoto2Camera:
         return camera
 
     def _read_settings(self) -> dict[str, str]:
-        """Return the value of every setting that has one."""
+        """Return the value of every setting, by name."""
         values: dict[str, str] = {}
         pending = [self._camera.get_config()]
         containers = (self._gphoto2.GP_WIDGET_WINDOW, self._gphoto2.GP_WIDGET_SECTION)
@@ -112,7 +114,7 @@ class GPhoto2Camera:
         return values
 
     def _shutter(self) -> Any:
-        """Return the setting of the exposure time, by the first name that this camera knows."""
+        """Return the setting of the exposure time, under the first name that this camera has."""
         for name in _SHUTTER_NAMES:
             try:
                 return self._camera.get_single_config(name)
@@ -122,12 +124,12 @@ class GPhoto2Camera:
         raise CameraError("the camera lets no program set its exposure time; turn its dial to M (manual)")
 
     def _shutter_choices(self) -> dict[float, str]:
-        """Return the camera's words by exposure time in seconds."""
+        """Return the camera's text for each exposure time in seconds."""
         choices = ((choice, shutter_s(choice)) for choice in self._shutter().get_choices())
         return {seconds: choice for choice, seconds in choices if seconds is not None}
 
     def _set_shutter(self, exposure_s: float) -> None:
-        """Set the offered exposure time that is nearest, if it is near enough."""
+        """Set the nearest available exposure time; raises `CameraError` if it is more than 1 % off."""
         choices = self._shutter_choices()
         nearest = min(choices, key=lambda seconds: abs(seconds - exposure_s), default=None)
         if nearest is None or abs(nearest - exposure_s) > 0.01 * nearest:
@@ -138,7 +140,7 @@ class GPhoto2Camera:
         self._camera.set_single_config(widget.get_name(), widget)
 
     def _set(self, name: str, value: str) -> None:
-        """Set one of the camera's settings."""
+        """Change one of the camera's settings."""
 
         def change() -> None:
             widget = self._camera.get_single_config(name)
@@ -157,9 +159,9 @@ class GPhoto2Camera:
         return content, place.name
 
 
-def shutter_s(words: str) -> float | None:
-    """Return the seconds of a camera's words for an exposure time, such as 1/250, 0.0100s or 2.5; None for bulb."""
-    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*s?\s*", words)
+def shutter_s(text: str) -> float | None:
+    """Return the seconds of a camera's text for an exposure time, such as 1/250, 0.0100s or 2.5; None for bulb."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)(?:/(\d+(?:\.\d+)?))?\s*s?\s*", text)
     if match is None or float(match[2] or 1) == 0:
         return None
     seconds = float(match[1]) / float(match[2] or 1)

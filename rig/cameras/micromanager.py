@@ -1,4 +1,4 @@
-"""Scientific cameras through Micro-Manager's device adapters."""
+"""Scientific cameras, through Micro-Manager's device adapters."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -7,11 +7,11 @@ from typing import Any
 from faintfield.rig.cameras.bounded import call_within
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import MicroManagerSettings
-from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
+from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra, in_one_line
 
 
 class MicroManagerCamera:
-    """A `Camera` that pymmcore-plus talks to.
+    """A `Camera` that Micro-Manager supports, through pymmcore-plus.
 
     Parameters
     ----------
@@ -24,7 +24,7 @@ class MicroManagerCamera:
         self._core: Any = None
 
     def open(self) -> None:
-        """Load the configuration, and set the camera's properties."""
+        """Load the configuration, and change the camera's properties as configured."""
         try:
             from pymmcore_plus import CMMCorePlus
         except ImportError as failure:
@@ -47,7 +47,7 @@ class MicroManagerCamera:
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
         pixels, label = self._bounded(
-            lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", bound_s=2.0 * exposure_s
+            lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", extra_s=2.0 * exposure_s
         )
         if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
             raise CameraError(
@@ -62,25 +62,25 @@ class MicroManagerCamera:
             try:
                 call_within(self._settings.answer_s, core.unloadAllDevices, "disconnecting")
             except (CameraError, RuntimeError):
-                pass  # whatever is wrong with it was reported when it was used
+                pass  # any fault was already raised when the camera was used
 
-    def _bounded[T](self, call: Callable[[], T], what: str, bound_s: float = 0.0) -> T:
-        """Make a call within its bound, its failures in words."""
+    def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0) -> T:
+        """Call with a time limit, and raise `CameraError` for what the library raises."""
         if self._core is None:
             raise CameraError("the camera is not connected; open it first")
         try:
-            return call_within(self._settings.answer_s + bound_s, call, what)
+            return call_within(self._settings.answer_s + extra_s, call, what)
         except CameraTimeout:
-            self._core = None  # stuck, so not even to be asked to disconnect
+            self._core = None  # it hangs, so it is not asked to disconnect
             raise
         except (RuntimeError, OSError) as failure:
             raise CameraError(
-                f"the camera failed at {what}: {_in_one_line(failure)}; check its cable, its power and the "
+                f"the camera failed at {what}: {in_one_line(failure)}; check its cable, its power and the "
                 "configuration file"
             ) from failure
 
     def _load(self) -> None:
-        """Load the adapters that the configuration names."""
+        """Load the configured devices and set the camera's properties."""
         if self._settings.adapters:
             self._core.setDeviceAdapterSearchPaths([self._settings.adapters])
         if self._settings.configuration:
@@ -110,8 +110,3 @@ class MicroManagerCamera:
             readout_s=0.05,
             settings=properties,
         )
-
-
-def _in_one_line(failure: BaseException) -> str:
-    """Return the message of `failure` without line breaks."""
-    return " ".join(str(failure).split()) or type(failure).__name__

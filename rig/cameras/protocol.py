@@ -1,4 +1,4 @@
-"""What a camera is: the vocabulary that drivers, capture and simulators share."""
+"""Defines a camera: the types that drivers, capture and simulators share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,20 +12,20 @@ type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
 
 
 class CameraReport(Struct, frozen=True):
-    """Who the camera is, and what it can do.
+    """What the camera reports about itself.
 
     Parameters
     ----------
     name : str
-        Maker, model and serial number, as far as it says.
+        Maker, model and serial number, as far as the camera reports them.
     frame_bytes : int
-        Room that one frame takes on disk, or an upper estimate.
+        Size of one frame on disk, or an upper estimate.
     exposures_s : tuple of float, optional
-        The exposure times that it offers; None when any will do.
+        Available exposure times; None if any can be set.
     readout_s : float
-        Time of a frame besides its exposure, an estimate until it is measured.
+        Time per frame in addition to the exposure; an estimate until it is measured.
     settings : dict
-        What it is set to, for the record.
+        The camera's settings, for the record.
     """
 
     name: str
@@ -35,24 +35,26 @@ class CameraReport(Struct, frozen=True):
     settings: dict[str, str] = {}
 
     def offers(self, exposure_s: float) -> bool:
-        """Return whether this exposure time can be set, to one part in a hundred."""
-        return self.exposures_s is None or any(abs(exposure_s - it) <= 0.01 * it for it in self.exposures_s)
+        """Return whether this exposure time can be set, to within 1 %."""
+        return self.exposures_s is None or any(
+            abs(exposure_s - offered) <= 0.01 * offered for offered in self.exposures_s
+        )
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One frame as the camera gave it: a file's bytes, or an array that becomes a TIFF.
+    """One frame as the camera delivers it: the bytes of a file, or an array to be written as TIFF.
 
     Parameters
     ----------
     suffix : str
-        Of the file, such as `.nef` or `.tiff`.
+        Suffix of the file, such as `.nef` or `.tiff`.
     content : bytes, optional
         The file, byte for byte.
     pixels : array, optional
-        (row, column) or (row, column, colour), when there is no file.
+        Values (row, column) or (row, column, colour), if there is no file.
     metadata : mapping
-        What the camera says about this frame.
+        What the camera reports about this frame.
     """
 
     suffix: str
@@ -66,14 +68,14 @@ class Exposure:
 
 
 class Camera(Protocol):
-    """Takes frames. Every method ends within a bound and raises a `CameraError` when it cannot do what it should."""
+    """Takes frames. Every method is bounded in time and raises a `CameraError` if it fails."""
 
     def open(self) -> None:
-        """Connect to the camera; nothing is exposed."""
+        """Connect to the camera, without exposing."""
         ...
 
     def report(self) -> CameraReport:
-        """Return who the camera is and how it is set."""
+        """Return the camera's name, limits and settings."""
         ...
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
@@ -84,10 +86,10 @@ class Camera(Protocol):
         exposure_s : float
             Exposure time.
         number : int
-            Counts the exposures of the session, those that were never kept included.
+            Number of the exposure in the session, counting those that were not kept.
         """
         ...
 
     def close(self) -> None:
-        """Let the camera go; closing twice does no harm."""
+        """Disconnect; closing twice does no harm."""
         ...

@@ -1,4 +1,4 @@
-"""The `[camera]` table of rig.toml: one kind of table for each backend."""
+"""The `[camera]` table of rig.toml, one type for each backend."""
 
 from pathlib import Path
 
@@ -8,20 +8,20 @@ type Mosaic = tuple[str, ...]
 
 
 class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
-    """A tethered camera that libgphoto2 knows.
+    """A tethered camera that libgphoto2 supports.
 
     Parameters
     ----------
     port : str
-        Such as `usb:001,004`, when there are several cameras; without it, the first that is found.
+        Port such as `usb:001,004`, if there are several cameras; by default the first that is found.
     settings : dict
-        libgphoto2's names and values, set when the camera is opened, such as `iso = "100"`.
+        Values by libgphoto2's names, set when the camera is opened, such as `iso = "100"`.
     frame_mb : float
-        Room for one raw file.
+        Upper estimate of the size of a raw file.
     answer_s : float
-        How long the camera may take for anything besides exposing.
+        Time limit for every operation, in addition to the exposure.
     keep_on_card : bool
-        Leave the file on the camera's card as well.
+        Keep the file on the camera's card as well.
     """
 
     port: str = ""
@@ -32,20 +32,20 @@ class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field
 
 
 class MicroManagerSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="micromanager"):
-    """A camera that Micro-Manager has a device adapter for.
+    """A camera for which Micro-Manager has a device adapter.
 
     Parameters
     ----------
     configuration : str
-        Micro-Manager's .cfg file; without it, the demonstration camera's.
+        Micro-Manager's .cfg file; by default that of the demonstration camera.
     adapters : str
-        Folder of the device adapters; without it, where pymmcore-plus finds them.
+        Folder of the device adapters; by default the one that pymmcore-plus finds.
     properties : dict
-        Of the camera, set when it is opened, such as `Binning = "1"`.
+        Properties of the camera, set when it is opened, such as `Binning = "1"`.
     answer_s : float
-        How long the camera may take for anything besides exposing.
+        Time limit for every operation, in addition to the exposure.
     mosaic : tuple of str, optional
-        Rows of one period of the colour filters, such as `["RG", "GB"]`; without it, none.
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
     """
 
     configuration: str = ""
@@ -56,20 +56,20 @@ class MicroManagerSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_
 
 
 class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
-    """Any vendor's program, which saves a file into a folder for each frame.
+    """Any vendor's program that saves each frame as a file in a folder.
 
     Parameters
     ----------
     folder : str
-        Where the files appear. They stay there; the session has copies.
+        Folder of the files, which stay there; the session keeps copies.
     suffixes : tuple of str
-        Which files are frames.
+        Suffixes of files that are frames.
     frame_mb : float
-        Room for one file.
+        Upper estimate of the size of a file.
     arrival_s : float
-        How long after the exposure the file may take to be complete.
+        Time limit from the end of the exposure until the file is complete.
     mosaic : tuple of str, optional
-        As above; raw files say it themselves.
+        Rows of one period of the colour filters; raw files contain this themselves.
     """
 
     folder: str
@@ -80,28 +80,28 @@ class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
 
     def __post_init__(self) -> None:
         if not Path(self.folder).name:
-            raise ValueError(f"camera.folder = {self.folder!r} names no folder; give the one that files appear in")
+            raise ValueError(f"camera.folder = {self.folder!r} names no folder; give the folder of the camera's files")
 
 
 class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):
-    """The paper's camera and scene, rendered where the simulated stage truly is.
+    """The paper's camera and scene, rendered from the true position of the simulated stage.
 
     Parameters
     ----------
     size_px : (int, int)
         Width and height of a frame.
     lit_photons_per_s, unlit_photons_per_s : float
-        On a pixel that sees a white object, with the lights on and almost off.
+        Photons on a pixel that sees a white object, with the lights on and almost off.
     read_noise_e, gain_dn_per_e, saturation_dn : float, float, int
-        Of the sensor; the paper's without them.
+        Read noise, gain and highest value of the sensor; by default those of the paper.
     mosaic : tuple of str, optional
-        Rows of one period of the colour filters, such as `["RG", "GB"]`; without it, none.
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
     position_error_mm, rotation_error_mrad : float
-        By how much the rails have the camera elsewhere than the motors are, on each axis: standard deviation.
+        Standard deviation, per axis, of the camera's pose from where the motors are.
     scale_error, squareness_mrad : float
-        Of the stage: by which part of itself a way along x is too long, and by how much y is askew.
+        Relative error of distances along x, and the angle by which y deviates from a right angle.
     seed : int
-        Of all chance.
+        Seed of the random generator.
     """
 
     size_px: tuple[int, int] = (640, 480)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from msgspec import Struct
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import CheckSettings
@@ -37,7 +37,7 @@ def check_frame(
     pixels: Pixels,
     kind: StepKind,
     limits: CheckSettings,
-    boards: Sequence[Board] = (),
+    boards: Sequence[BoardSettings] = (),
     earlier_sharpness: Sequence[float] = (),
 ) -> Findings:
     """Measure what matters in a frame of this kind; of boards `rig.capture.sweeps` judges, by more than one frame.
@@ -50,7 +50,7 @@ def check_frame(
         What the frame is for.
     limits : CheckSettings
         From where on to warn.
-    boards : sequence of Board
+    boards : sequence of BoardSettings
         What a charuco frame should show.
     earlier_sharpness : sequence of float
         Of the frames of the same step.
@@ -93,7 +93,7 @@ def leak_dn(grey: Pixels) -> float:
     return max(0.0, float(np.ptp(parts.mean(axis=(1, 3))) - noise))
 
 
-def board_corners(grey: Pixels, boards: Sequence[Board]) -> int:
+def board_corners(grey: Pixels, boards: Sequence[BoardSettings]) -> int:
     """Return how many corners of the boards are found."""
     white = max(float(np.quantile(grey, 0.99)), 1.0)
     scale = min(1.0, _LOOK_PX / max(grey.shape))

@@ -1,1 +1,1 @@
-"""The simulated world: what the rig would meet, without the rig."""
+"""Simulations of the lab, the camera and the stage, for use without hardware."""

@@ -1,4 +1,4 @@
-"""Boards in the simulated world: where they stand, and where the camera sees their corners."""
+"""Simulated boards: their poses, their printed texture, and where a camera sees their corners."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from faintfield.rig.simulation.optics import SimulatedOptics, distort
 from faintfield.rig.simulation.scene import TexturedPlane
 
-# Turned about x and y (degrees) and put at x, y, z (mm): tilted all ways, near and far, seen from the whole grid.
-_SIX_PLACES = (
+# Rotations about x and y (degrees), then x, y, z (mm): tilted in all directions, near and far, seen from every node.
+_SIX_POSES = (
     (22.0, 4.0, -60.0, -50.0, 540.0),
     (-24.0, 6.0, 70.0, 40.0, 560.0),
     (5.0, 28.0, 40.0, -45.0, 560.0),
@@ -22,14 +22,14 @@ _SIX_PLACES = (
 
 @dataclass(frozen=True)
 class SimulatedBoard:
-    """A chessboard's inner corners in space.
+    """The inner corners of a chessboard in space.
 
     Parameters
     ----------
     corner_rows, corner_columns : int
-        Of the inner corners.
+        Number of inner corners.
     square_mm : float
-        Their distance.
+        Distance of neighbouring corners.
     rt_ref_board : array (6,)
         Rodrigues rad and mm, from the board, whose origin is its first corner, to the reference camera.
     """
@@ -40,13 +40,13 @@ class SimulatedBoard:
     rt_ref_board: NDArray[np.float64]
 
     def points_ref_mm(self) -> NDArray[np.float64]:
-        """Return the corners (corner, 3) in the reference frame, along the rows."""
+        """Return the corners (corner, 3) in the reference frame, row by row."""
         row, column = np.divmod(np.arange(self.corner_rows * self.corner_columns), self.corner_columns)
         flat = np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
         return _transformed(self.rt_ref_board, flat)
 
     def seen(self, optics: SimulatedOptics, rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where a camera sees the corners (corner, 2) in pixels; NaN for those it does not."""
+        """Return the images (corner, 2) of the corners in pixels; NaN outside the detector."""
         points = _transformed(rt_cam_ref, self.points_ref_mm())
         x, y = distort(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2], optics.distortion)
         pixels = np.column_stack([x * optics.fx_px + optics.cx_px, y * optics.fy_px + optics.cy_px])
@@ -55,10 +55,10 @@ class SimulatedBoard:
 
 
 def six_boards(corner_rows: int, corner_columns: int, square_mm: float) -> list[SimulatedBoard]:
-    """Return a board at six places about the scene, as a careful person would hold it."""
+    """Return a board in six poses around the scene, as a careful person would hold it."""
     centre_mm = np.array([(corner_columns - 1) * square_mm / 2, (corner_rows - 1) * square_mm / 2, 0.0])
     boards = []
-    for about_x, about_y, *place_mm in _SIX_PLACES:
+    for about_x, about_y, *place_mm in _SIX_POSES:
         rotation = _rotation(np.radians([0, about_y, 0])) @ _rotation(np.radians([about_x, 0, 0]))
         r = cv2.Rodrigues(rotation)[0].ravel()
         boards.append(
@@ -74,20 +74,20 @@ def printed_board(
     board: SimulatedBoard,
     first_corner_mm: tuple[float, float],
 ) -> TexturedPlane:
-    """Return a print of a board standing where `board` says.
+    """Return a printed board in the pose of `board`.
 
     Parameters
     ----------
     name : str
-        Of the plane.
+        Name of the plane.
     picture : array (row, column)
-        Its reflectance, 0…1.
+        Reflectance, 0…1.
     pitch_mm : float
-        Distance of the picture's samples.
+        Distance of neighbouring samples of the picture.
     board : SimulatedBoard
-        Where it stands.
+        Pose of the board.
     first_corner_mm : (float, float)
-        x, y of the first inner corner from the outer edges of the picture's first sample.
+        Position x, y of the first inner corner from the outer edges of the picture's first sample.
     """
     height, width = picture.shape
     centre_mm = np.array([width * pitch_mm / 2 - first_corner_mm[0], height * pitch_mm / 2 - first_corner_mm[1], 0.0])

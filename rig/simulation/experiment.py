@@ -1,4 +1,4 @@
-"""The paper's experiment, assembled: two toys, a grid of nodes, a lens and a cooled 16-bit sensor."""
+"""The paper's experiment: two toys, a grid of nodes, a lens and a cooled 16-bit sensor."""
 
 from dataclasses import dataclass, field, replace
 
@@ -14,18 +14,18 @@ from faintfield.rig.simulation.sensor import SimulatedSensor
 
 @dataclass(frozen=True)
 class SimulatedExperiment:
-    """What stands where, and what it is taken with.
+    """A scene, a camera and a grid of nodes.
 
     Parameters
     ----------
     planes : tuple of TexturedPlane
-        The scene, in front of darkness.
+        The scene, before a black background.
     optics, sensor : SimulatedOptics, SimulatedSensor
         The camera.
     rows, columns, pitch_mm : int, int, float
         The grid.
     exposure_s : float
-        Of one dark-scene view.
+        Exposure time of one view of the dark scene.
     """
 
     planes: tuple[TexturedPlane, ...]
@@ -43,28 +43,28 @@ class SimulatedExperiment:
         return row * self.columns + column
 
     def nominal_poses_rt_cam_ref(self) -> NDArray[np.float64]:
-        """Return the poses (view, 6) that the gantry is told to take."""
+        """Return the poses (view, 6) of the nodes."""
         return nominal_poses_rt_cam_ref(self.rows, self.columns, self.pitch_mm)
 
     def poses_rt_cam_ref(
         self, position_sd_mm: float, rotation_sd_rad: float, generator: np.random.Generator
     ) -> NDArray[np.float64]:
-        """Return the poses (view, 6) that it takes: normal errors of each axis, none at the reference view."""
+        """Return the poses (view, 6) with normal errors of each axis, but none at the reference view."""
         poses = self.nominal_poses_rt_cam_ref()
         errors = generator.normal(size=poses.shape) * np.repeat([rotation_sd_rad, position_sd_mm], 3)
         errors[self.reference_view] = 0
         return np.asarray(poses + errors)
 
     def grey(self) -> "SimulatedExperiment":
-        """Return the experiment with a sensor without colour filters in mind."""
+        """Return the experiment as a sensor without colour filters sees it."""
         return replace(self, planes=tuple(plane.grey() for plane in self.planes))
 
 
 def paper_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedExperiment:
     """Return the paper's scene: a toy truck at 500 mm and a toy airplane at 700 mm.
 
-    The lens has the field of view of 800 px focal length at 640 px width, a mild barrel distortion and a principal
-    point beside the centre, as real ones have.
+    The lens has the field of view of 800 px focal length at 640 px width, slight barrel distortion, and a principal
+    point off the centre, as real lenses have.
     """
     f_px = 800.0 * width_px / 640.0
     optics = SimulatedOptics(

@@ -1,4 +1,4 @@
-"""The simulated lab: what stands before the camera in each step, seen from where the stage truly is."""
+"""The simulated lab: renders what the camera sees in each step, from the true position of the stage."""
 
 import math
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.plan import StepKind
 from faintfield.rig.simulation.carriage import Carriage
@@ -18,10 +18,10 @@ from faintfield.rig.simulation.scene import TexturedPlane, render
 from faintfield.rig.simulation.sensor import through_mosaic
 from faintfield.rig.stages.protocol import Point
 
-# Of a white object's light, what a flat has of it.
+# Light of a flat relative to that of a white object.
 _FLAT = 0.5
 
-# After a stop the carriage swings along both axes, as an undamped gantry does.
+# After a stop the carriage swings along both axes, as an undamped gantry does: amplitude, frequency, decay time.
 _SWING_MM, _SWING_HZ, _SWING_DECAY_S = 1.5, 7.0, 0.25
 
 
@@ -31,20 +31,20 @@ class SimulatedLab:
     Parameters
     ----------
     centre : Point
-        Where the stage has the camera in the reference pose.
+        Stage position of the reference pose.
     true_position : callable
-        Where the carriages really are, whatever the controller reports.
+        Returns the true position of the carriages.
     still_s : callable
-        How long ago they stopped.
-    boards : sequence of Board
-        What there is to put up for charuco sweeps.
+        Returns the time since they stopped.
+    boards : tuple of BoardSettings
+        Boards of the charuco sweeps.
     settings : SimulatedSettings
-        The camera, the light and the rails.
+        The camera, the light and the errors of the rails.
 
     Attributes
     ----------
     experiment : SimulatedExperiment
-        The paper's objects and the camera, drawn when they are first looked at.
+        The paper's objects and the camera, made on first use.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SimulatedLab:
         centre: Point,
         true_position: Callable[[], Point],
         still_s: Callable[[], float],
-        boards: tuple[Board, ...],
+        boards: tuple[BoardSettings, ...],
         settings: SimulatedSettings,
     ) -> None:
         self._true_position = true_position
@@ -73,16 +73,16 @@ class SimulatedLab:
 
     @cached_property
     def experiment(self) -> SimulatedExperiment:
-        """What stands before the camera, and the camera."""
+        """The objects and the camera."""
         return lab_experiment(self._settings)
 
     @cached_property
     def _illumination(self) -> NDArray[np.float32]:
-        """What the lens lets through."""
+        """Relative illumination (row, column) of the lens."""
         return self.experiment.optics.relative_illumination()
 
     def arrange(self, kind: StepKind, sweep: int) -> None:
-        """Do what the guide asks of a person: put things up or away, switch the light, cover the lens."""
+        """Do what a person does at the beginning of a step: objects or boards, light, lens cap."""
         self._planes = ()
         if kind == "charuco":
             optics = self.experiment.optics
@@ -94,7 +94,7 @@ class SimulatedLab:
         self._flat = kind == "flat"
 
     def expose(self, exposure_s: float, number: int) -> NDArray[np.uint16]:
-        """Return a frame in DN, taken now from where the camera is; its noise follows from its number alone."""
+        """Return a frame (row, column) in DN, taken now; its noise depends only on its number and the seed."""
         light: NDArray[np.floating] = np.zeros_like(self._illumination)
         if self._flat:
             light = _FLAT * self._illumination
@@ -107,7 +107,7 @@ class SimulatedLab:
         return self.experiment.sensor.expose(light * self._photons_per_s * exposure_s, exposure_s, generator)
 
     def rt_cam_ref(self, exposure_s: float) -> NDArray[np.float64]:
-        """Return the true pose (6,) in the middle of an exposure that begins now, swing included."""
+        """Return the true pose (6,) in the middle of an exposure that begins now, including the swing."""
         x_mm, y_mm = self._true_position()
         after_s = self._still_s() + 0.5 * exposure_s
         swing_mm = _SWING_MM * math.exp(-after_s / _SWING_DECAY_S) * math.cos(2.0 * math.pi * _SWING_HZ * after_s)
@@ -115,7 +115,7 @@ class SimulatedLab:
 
 
 def flat_photons_per_s(settings: SimulatedSettings) -> float:
-    """Return the light of a flat, photons per pixel and second, mean over the detector."""
+    """Return the mean light of a flat over the detector, in photons per pixel and second."""
     illumination = lab_experiment(settings).optics.relative_illumination()
     return float(_FLAT * settings.lit_photons_per_s * illumination.mean(dtype=np.float64))
 

@@ -1,4 +1,4 @@
-"""The boards of a simulated lab, as they come from the printer and stand before the camera."""
+"""The printed boards of the simulated lab, in a different pose for each sweep."""
 
 import math
 from dataclasses import replace
@@ -6,46 +6,47 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.simulation.boards import printed_board, six_boards
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import TexturedPlane
 
+# White margin around a board.
 _MARGIN_MM = 12.0
 
-# White paper reflects most of the light and black ink a little.
+# Reflectance of black ink and white paper.
 _BLACK, _WHITE = 0.04, 0.9
 
-# The print is finer than the detector sees it, and blurred as the lens does, which keeps its edges from aliasing.
+# Samples of the print per pixel of the detector, and the blur of the lens in pixels, which prevents aliasing.
 _SAMPLES_PER_PX, _BLUR_PX = 2.0, 0.6
 
-# Boards beside one another stand this far apart, so that none hides another.
-_BESIDE_MM = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 40.0])
+# Change of pose (rad, mm) from one board to the next, so that none hides another.
+_BOARD_OFFSET = np.array([0.0, 0.0, 0.0, 180.0, 0.0, 40.0])
 
 
-def standing_board(board: Board, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
-    """Return a board as it stands in a sweep: turned and tilted differently in each, several beside one another.
+def standing_board(board: BoardSettings, sweep: int, place: int, optics: SimulatedOptics) -> TexturedPlane:
+    """Return a board in the pose of a sweep; several boards stand side by side.
 
     Parameters
     ----------
-    board : Board
-        What is printed.
+    board : BoardSettings
+        The printed board.
     sweep : int
-        Which sweep.
+        Index of the sweep, which decides the pose.
     place : int
-        Which of the boards.
+        Index of the board.
     optics : SimulatedOptics
-        The camera that will look at it.
+        The camera, which decides how finely the board is sampled.
     """
-    places = six_boards(board.rows - 1, board.columns - 1, board.square_mm)
-    standing = places[sweep % len(places)]
-    standing = replace(standing, rt_ref_board=standing.rt_ref_board + place * _BESIDE_MM)
+    poses = six_boards(board.rows - 1, board.columns - 1, board.square_mm)
+    standing = poses[sweep % len(poses)]
+    standing = replace(standing, rt_ref_board=standing.rt_ref_board + place * _BOARD_OFFSET)
     px_mm = float(standing.rt_ref_board[5]) / optics.fx_px
     drawn = board.in_opencv()
-    # A whole number of samples per square, or the print would not be true to size, and one for each bit of a marker
+    # A whole number of samples per square keeps the print true to size; each bit of a marker needs at least one
     bits = drawn.getDictionary().markerSize + 2
-    least = math.ceil(bits * board.square_mm / board.marker_mm)
-    samples = max(round(board.square_mm * _SAMPLES_PER_PX / px_mm), least)
+    min_samples = math.ceil(bits * board.square_mm / board.marker_mm)
+    samples = max(round(board.square_mm * _SAMPLES_PER_PX / px_mm), min_samples)
     pitch_mm = board.square_mm / samples
     margin = round(_MARGIN_MM / pitch_mm)
     printed = drawn.generateImage((board.columns * samples, board.rows * samples)) / np.float32(255)

@@ -1,4 +1,4 @@
-"""The objects of the simulated experiments: toys with their markings, a chart of fine detail, a ball of soft shades."""
+"""The objects of the simulated experiments: toys, a resolution chart, a shaded ball."""
 
 import cv2
 import numpy as np
@@ -6,8 +6,10 @@ from numpy.typing import NDArray
 
 from faintfield.rig.simulation.scene import TexturedPlane
 
-# Drawn this many times finer than the texture and averaged down, so that edges have soft shares.
+# Objects are drawn this many times finer than the texture and averaged, so that edges are smooth.
 _OVERSAMPLING = 4
+
+# Distance of texture samples: finer than a pixel of the 640 px camera at the objects' depths.
 _TEXTURE_PITCH_MM = 0.25
 
 type Colour = tuple[float, float, float]
@@ -17,7 +19,7 @@ _BLUE, _GREY, _DARK = (0.35, 0.55, 0.95), (0.60, 0.62, 0.65), (0.18, 0.18, 0.20)
 
 
 class _Canvas:
-    """A drawing in millimetres, x to the right and y down from its centre, that remembers where something is drawn."""
+    """A drawing with an outline; coordinates in mm from its centre, x to the right and y down."""
 
     def __init__(self, width_mm: float, height_mm: float) -> None:
         self._scale = _OVERSAMPLING / _TEXTURE_PITCH_MM
@@ -38,20 +40,20 @@ class _Canvas:
         self.polygon([(x_mm + radius_x_mm * np.cos(a), y_mm + radius_y_mm * np.sin(a)) for a in angle], colour)
 
     def text(self, words: str, x_mm: float, y_mm: float, height_mm: float, colour: Colour) -> None:
-        """Write words whose lower left corner is at x, y, where something is drawn already."""
+        """Write text with its lower left corner at x, y, on what is already drawn."""
         scale = height_mm * self._scale / 21  # the font's capitals are 21 px high at scale 1
         at = tuple(int(value) for value in self._pixels([(x_mm, y_mm)])[0])
         thickness = round(3 * scale)
         cv2.putText(self._colour, words, at, cv2.FONT_HERSHEY_DUPLEX, scale, _levels(colour), thickness, cv2.LINE_AA)
 
     def plane(self, name: str, x_mm: float, y_mm: float, depth_mm: float, shading: float) -> TexturedPlane:
-        """Return the drawing as an object at x, y and a depth, a little darker towards its lower right."""
+        """Return the drawing as an object at x, y and a depth; shading darkens it towards its lower right."""
         size = (self._size[0] // _OVERSAMPLING, self._size[1] // _OVERSAMPLING)
         colour = cv2.resize(self._colour, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         opacity = cv2.resize(self._opacity, size, interpolation=cv2.INTER_AREA)
         rows, columns = np.mgrid[0 : 1 : size[1] * 1j, 0 : 1 : size[0] * 1j]
         light = (1 - shading * (rows + columns) / 2)[:, :, np.newaxis]
-        # The mean colour of partly covered samples includes nothing of what lies beside the object
+        # Divided by the opacity, the colour of partly covered samples is that of their covered part
         inside = colour * light / np.maximum(opacity, 1e-3)[:, :, np.newaxis]
         reflectance = np.clip(inside, 0, 1).astype(np.float32)
         return TexturedPlane(name, reflectance, opacity, _TEXTURE_PITCH_MM, (0, 0, 0, x_mm, y_mm, depth_mm))
@@ -67,7 +69,7 @@ def _levels(colour: Colour) -> tuple[int, int, int]:
 
 
 def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
-    """Return a toy truck of 190 mm, seen from its side, standing at x, y and a depth."""
+    """Return a toy truck 190 mm long, seen from the side, at x, y and a depth."""
     canvas = _Canvas(200, 120)
     canvas.box(-95, 22, 90, 32, _GREY)
     canvas.box(-95, -48, 38, 24, _YELLOW)
@@ -92,7 +94,7 @@ def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
 
 
 def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
-    """Return a toy airplane of 265 mm, seen from above, at x, y and a depth."""
+    """Return a toy airplane 265 mm long, seen from above, at x, y and a depth."""
     canvas = _Canvas(280, 250)
     for side in (-1, 1):
         canvas.polygon([(28, 10 * side), (-22, 116 * side), (-48, 116 * side), (-28, 10 * side)], _BLUE)
@@ -116,7 +118,7 @@ def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
 
 
 def sailing_boat(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
-    """Return a toy sailing boat of 180 mm, seen from its side, at x, y and a depth."""
+    """Return a toy sailing boat 180 mm long, seen from the side, at x, y and a depth."""
     canvas = _Canvas(190, 190)
     canvas.box(-3, -84, 2, 44, (0.75, 0.55, 0.15))
     canvas.polygon([(2, -92), (30, -84), (2, -76)], _RED)
@@ -135,7 +137,7 @@ def sailing_boat(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
 
 
 def star_chart(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.0, spokes: int = 24) -> TexturedPlane:
-    """Return a Siemens star on a white disc, at x, y and a depth: full contrast at every fineness."""
+    """Return a Siemens star on a white disc, at x, y and a depth: full contrast at every spatial frequency."""
     canvas = _Canvas(2.1 * radius_mm, 2.1 * radius_mm)
     canvas.ellipse(0, 0, radius_mm, radius_mm, _WHITE)
     for angle in 2 * np.pi * np.arange(spokes) / spokes:
@@ -146,7 +148,7 @@ def star_chart(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.
 
 
 def shaded_ball(x_mm: float, y_mm: float, depth_mm: float, radius_mm: float = 75.0) -> TexturedPlane:
-    """Return the picture of a ball lit from the upper left, at x, y and a depth: soft shades, no edge but its rim."""
+    """Return a picture of a ball lit from the upper left, at x, y and a depth: smooth shades inside its rim."""
     side = round(2.1 * radius_mm / _TEXTURE_PITCH_MM)
     y, x = (np.mgrid[:side, :side] - (side - 1) / 2) * (_TEXTURE_PITCH_MM / radius_mm)
     squared = x**2 + y**2

@@ -1,7 +1,6 @@
-"""The simulated camera's optics: where each point of the detector looks, and how much light reaches it.
+"""The optics of the simulated camera: the ray of each detector sample, and the light that reaches it.
 
-This is the world, not the calibration: it shares no code with `calib` or `recon`, so that either can be tested
-against it.
+This module shares no code with `calib` or `recon`, so that both can be tested against it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ type Points = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SimulatedOptics:
-    """A lens and the detector behind it; pixel centres are integers, the first is (0, 0).
+    """A lens and its detector; the centre of the first pixel is (0, 0).
 
     Parameters
     ----------
@@ -26,7 +25,7 @@ class SimulatedOptics:
     distortion : tuple of float
         Up to eight coefficients in OpenCV's order k1, k2, p1, p2, k3, k4, k5, k6.
     vignetting : bool
-        Light falls off with the fourth power of the cosine of the field angle.
+        Whether light falls off with the fourth power of the cosine of the field angle.
     """
 
     size_px: tuple[int, int]
@@ -40,13 +39,12 @@ class SimulatedOptics:
     def rays(self, samples_per_px: int = 1) -> NDArray[np.float32]:
         """Return x, y at unit depth of every detector sample, (row, column, 2).
 
-        With several samples per pixel and axis they lie evenly within each pixel, so that their mean over a pixel is
-        the mean over its area.
+        The samples are spread evenly over each pixel, so that their mean is the mean over the pixel's area.
         """
         return _rays(self, samples_per_px)
 
     def cast_rays(self, samples_per_px: int) -> NDArray[np.float32]:
-        """Compute what `rays` returns."""
+        """Compute the result of `rays`, which is cached."""
         width, height = self.size_px
         inside = (np.arange(samples_per_px) + 0.5) / samples_per_px - 0.5
         columns = (np.arange(width)[:, np.newaxis] + inside).ravel()
@@ -55,20 +53,20 @@ class SimulatedOptics:
         return np.stack(_undistort(x, y, self.distortion), axis=-1).astype(np.float32)
 
     def relative_illumination(self) -> NDArray[np.float32]:
-        """Return the light of each pixel relative to the axis, (row, column), for a scene of equal radiance."""
+        """Return the light (row, column) of a scene of uniform radiance, relative to the optical axis."""
         if not self.vignetting:
             return np.ones(self.size_px[::-1], np.float32)
         rays = self.rays()
         return (1 / (1 + np.square(rays).sum(axis=-1)) ** 2).astype(np.float32)
 
     def ideal(self) -> "SimulatedOptics":
-        """Return the same view through a pinhole: no distortion, no vignetting."""
+        """Return the optics without distortion and vignetting."""
         return SimulatedOptics(self.size_px, self.fx_px, self.fy_px, self.cx_px, self.cy_px, (), vignetting=False)
 
 
 @lru_cache(maxsize=8)
 def _rays(optics: SimulatedOptics, samples_per_px: int) -> NDArray[np.float32]:
-    """Return the rays of a lens, computed once: a capture looks through the same one for hours."""
+    """Return the rays of a lens, cached because a capture uses the same lens for every frame."""
     rays = optics.cast_rays(samples_per_px)
     rays.flags.writeable = False
     return rays
@@ -85,9 +83,9 @@ def distort(x: Points, y: Points, distortion: tuple[float, ...]) -> tuple[Points
     )
 
 
-@np.errstate(all="ignore")  # where the lens folds, points run off and never converge
+@np.errstate(all="ignore")  # where the distortion folds, the iteration diverges
 def _undistort(x_image: Points, y_image: Points, distortion: tuple[float, ...]) -> tuple[Points, Points]:
-    """Invert `distort` by Newton's method with a Jacobian from central differences."""
+    """Invert `distort` by Newton's method, with a Jacobian from central differences."""
     x, y = x_image.copy(), y_image.copy()
     if not any(distortion):
         return x, y

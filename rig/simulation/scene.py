@@ -1,4 +1,4 @@
-"""The simulated scene: textured planes with cut-out shapes that occlude one another, rendered by casting rays."""
+"""Renders scenes of textured planes that occlude one another, by casting rays."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from faintfield.rig.simulation.optics import SimulatedOptics
 
 @dataclass(frozen=True)
 class TexturedPlane:
-    """A flat object: a picture with a cut-out, standing in space.
+    """A flat object: a picture with an outline, in space.
 
     Parameters
     ----------
     name : str
-        What it shows.
+        Name of the object.
     reflectance : float array (row, column) or (row, column, 3)
-        0…1, grey or red, green, blue.
+        Reflectance 0…1, grey or red, green, blue.
     opacity : float array (row, column)
-        1 on the object, 0 beside it, between at its edge.
+        1 on the object, 0 outside it, between them at its edge.
     pitch_mm : float
         Distance of neighbouring texture samples.
     rt_ref_plane : (float, …) of six
@@ -37,7 +37,7 @@ class TexturedPlane:
 
     @property
     def depth_mm(self) -> float:
-        """Distance of the centre along the reference camera's axis."""
+        """Distance of the centre along the axis of the reference camera."""
         return self.rt_ref_plane[5]
 
     def grey(self) -> "TexturedPlane":
@@ -48,15 +48,15 @@ class TexturedPlane:
 
 
 @dataclass(frozen=True)
-class View:
-    """One rendered view: per pixel the light of the scene and how each plane contributes.
+class RenderedView:
+    """One rendered view.
 
     Attributes
     ----------
     light : float array (row, column) or (row, column, 3)
-        Mean reflectance seen in each pixel, times the lens's relative illumination.
-    visible : dict of name to float array (row, column)
-        Share of each pixel in which that plane is seen, not hidden by nearer ones.
+        Mean reflectance in each pixel, times the relative illumination of the lens.
+    visible : dict of float array (row, column)
+        Share of each pixel in which a plane is visible, by the plane's name.
     """
 
     light: NDArray[np.float32]
@@ -69,19 +69,19 @@ def render(
     poses_rt_cam_ref: NDArray[np.float64],
     *,
     samples_per_px: int = 2,
-) -> Iterator[View]:
-    """Yield the view of each pose: every detector sample's ray is cast through the planes from near to far.
+) -> Iterator[RenderedView]:
+    """Yield the view of each pose, casting the ray of every detector sample through the planes from near to far.
 
     Parameters
     ----------
     planes : sequence of TexturedPlane
-        All grey or all in colour. They must not cut through one another: order is by distance of their centres.
+        Either all grey or all in colour. They must not intersect, since they are ordered by the depth of their centres.
     optics : SimulatedOptics
-        The camera's.
+        Optics of the camera.
     poses_rt_cam_ref : array (view, 6)
-        Rodrigues rad and mm.
+        Poses of the camera, Rodrigues rad and mm.
     samples_per_px : int
-        Rays per pixel and axis; the pixel is their mean, which removes aliasing.
+        Rays per pixel and axis, whose mean is the pixel; several reduce aliasing.
     """
     rays = optics.rays(samples_per_px)
     illumination = optics.relative_illumination()
@@ -95,29 +95,29 @@ def _render_view(
     illumination: NDArray[np.float32],
     rt_cam_ref: NDArray[np.float64],
     samples_per_px: int,
-) -> View:
-    """Composite the planes front to back along every ray and average the rays of each pixel."""
+) -> RenderedView:
+    """Composite the planes from front to back along every ray, and average the rays of each pixel."""
     colours = () if planes[0].reflectance.ndim == 2 else (3,)
     light = np.zeros((*rays.shape[:2], *colours), np.float32)
     unhidden = np.ones(rays.shape[:2], np.float32)
     visible = {}
-    for plane in sorted(planes, key=lambda plane: _distance_mm(plane, rt_cam_ref)):
-        reflected, opacity = _look_up(plane, rays, rt_cam_ref)
+    for plane in sorted(planes, key=lambda plane: _depth_mm(plane, rt_cam_ref)):
+        reflected, opacity = _sample(plane, rays, rt_cam_ref)
         light += reflected * (unhidden if not colours else unhidden[:, :, np.newaxis])
         visible[plane.name] = _pixel_means(opacity * unhidden, samples_per_px)
         unhidden *= 1 - opacity
     light = _pixel_means(light, samples_per_px)
-    return View(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
+    return RenderedView(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
 
 
-def _look_up(
+def _sample(
     plane: TexturedPlane, rays: NDArray[np.float32], rt_cam_ref: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the reflected light (reflectance times opacity) and the opacity that each ray meets on one plane."""
+    """Return reflectance times opacity, and opacity, where each ray meets a plane."""
     origin_mm, axis_x, axis_y = _plane_in_camera(plane, rt_cam_ref)
     normal = np.cross(axis_x, axis_y)
-    # The ray s·(x, y, 1) meets the plane at s = n·origin / n·ray; the point minus the origin, along the plane's axes,
-    # is then a ratio of two linear functions of the ray
+    # The ray s·(x, y, 1) meets the plane at s = n·origin / n·ray. Relative to the origin, that point has coordinates
+    # along the plane's axes that are ratios of two linear functions of the ray
     numerators = np.stack(
         [axis @ (np.eye(3) * (normal @ origin_mm) - np.outer(origin_mm, normal)) for axis in (axis_x, axis_y)]
     )
@@ -148,7 +148,7 @@ def _look_up(
 def _plane_in_camera(
     plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the plane's origin (mm) and its two axes in the camera's coordinates."""
+    """Return the origin (mm) and the two axes of a plane in camera coordinates."""
     r_cam_ref, _ = cv2.Rodrigues(np.asarray(rt_cam_ref[:3], np.float64))
     r_ref_plane, _ = cv2.Rodrigues(np.asarray(plane.rt_ref_plane[:3], np.float64))
     r_cam_plane = r_cam_ref @ r_ref_plane
@@ -156,13 +156,13 @@ def _plane_in_camera(
     return origin_mm, r_cam_plane[:, 0], r_cam_plane[:, 1]
 
 
-def _distance_mm(plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]) -> float:
-    """Return how far in front of the camera the plane's centre stands."""
+def _depth_mm(plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]) -> float:
+    """Return the depth of the plane's centre in the camera."""
     return float(_plane_in_camera(plane, rt_cam_ref)[0][2])
 
 
 def _pixel_means(samples: NDArray[np.float32], samples_per_px: int) -> NDArray[np.float32]:
-    """Average the samples of each pixel, (row, column, …)."""
+    """Return the mean of the samples of each pixel, (row, column, …)."""
     if samples_per_px == 1:
         return samples
     size = (samples.shape[1] // samples_per_px, samples.shape[0] // samples_per_px)

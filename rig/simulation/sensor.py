@@ -1,4 +1,4 @@
-"""The simulated sensor: eq. (6) of the paper, then offset, gain, rounding and saturation."""
+"""The simulated sensor: noise by eq. (6) of the paper, then gain, offset, rounding and saturation."""
 
 from dataclasses import dataclass
 
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """What happens to light between the lens and the file; the defaults are the paper's camera.
+    """Converts light to DN; the defaults are those of the paper's camera.
 
     Parameters
     ----------
     offset_dn, gain_dn_per_e : float
-        DN of a dark pixel, and DN per electron.
+        DN without electrons, and DN per electron.
     read_noise_e : float
         Standard deviation; the paper's variance is 12 e⁻².
     dark_current_e_per_s, quantum_efficiency : float
         Electrons per pixel and second without light; electrons per photon.
     saturation_dn : int
-        The converter's last value.
+        Highest value of the converter.
     """
 
     offset_dn: float = 100.0
@@ -36,19 +36,19 @@ class SimulatedSensor:
     def expose(
         self, photons_per_px: NDArray[np.floating], exposure_s: float, generator: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """Return one frame (row, column) in DN of the expected photons that fall on each pixel during the exposure."""
+        """Return one frame (row, column) in DN, given the expected photons on each pixel during the exposure."""
         expected_e = self.quantum_efficiency * photons_per_px + self.dark_current_e_per_s * exposure_s
         electrons = generator.poisson(expected_e) + generator.normal(0.0, self.read_noise_e, expected_e.shape)
         return self.digitise(electrons)
 
     def digitise(self, electrons: NDArray[np.floating]) -> NDArray[np.uint16]:
-        """Return electrons as whole DN within the converter's range."""
+        """Return electrons as integer DN within the converter's range."""
         dn = np.rint(electrons * self.gain_dn_per_e + self.offset_dn)
         return np.clip(dn, 0, self.saturation_dn).astype(np.uint16)
 
 
 def through_mosaic(light: NDArray[np.floating], mosaic: tuple[str, ...]) -> NDArray[np.floating]:
-    """Return for each pixel of (row, column, RGB) the colour that its filter lets pass, (row, column)."""
+    """Return the light (row, column) behind the colour filters of a mosaic, from light (row, column, RGB)."""
     rows, columns = np.indices(light.shape[:2])
     colours = np.array([["RGB".index(letter) for letter in row] for row in mosaic])
     chosen = colours[rows % colours.shape[0], columns % colours.shape[1]]

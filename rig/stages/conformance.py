@@ -1,4 +1,4 @@
-"""What a stage must show before it is trusted with a capture, tried on the stage itself."""
+"""Checks on the stage itself what a capture relies on: limits, speed, arrival, repeatability."""
 
 import math
 from collections.abc import Iterator
@@ -11,21 +11,24 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import path_duration_s
 from faintfield.rig.stages.protocol import Point
 
-_SLOWEST_REPORTS_PER_S = 4.0
+# Lowest rate of position reports, per second: GRBL is asked five times a second.
+_MIN_REPORTS_PER_S = 4.0
+
+# Position reports that are timed.
 _REPORTS = 10
 
 
 class Check(Struct, frozen=True):
-    """One thing that was tried.
+    """The result of one check.
 
     Parameters
     ----------
     name : str
-        What was tried.
+        What was checked.
     passed : bool
-        Whether it came out as it must.
+        Whether the measured value is within its limit.
     measured, limit : str
-        What was found and what is asked for, with units.
+        The value and its limit, with units.
     """
 
     name: str
@@ -35,14 +38,14 @@ class Check(Struct, frozen=True):
 
 
 def conformance(stage: Gantry) -> Iterator[Check]:
-    """Try a connected stage, and yield each check as it is done.
+    """Check a connected stage, and yield each result.
 
-    The stage homes and moves within 40 % of its travel around the middle.
+    The stage homes and moves within the middle 40 % of its travel.
 
     Raises
     ------
     StageError
-        The stage failed in a way that leaves nothing to try.
+        The stage failed, so that no more checks are possible.
     """
     yield _settings(stage)
     yield _homing(stage)
@@ -54,7 +57,7 @@ def conformance(stage: Gantry) -> Iterator[Check]:
 
 
 def _settings(stage: Gantry) -> Check:
-    """Check that no setting should be changed."""
+    """Check that no setting needs to be changed."""
     warnings = stage.identify().warnings
     return Check("settings", not warnings, "; ".join(warnings) or "nothing to change", "nothing to change")
 
@@ -67,7 +70,7 @@ def _homing(stage: Gantry) -> Check:
 
 
 def _limits(stage: Gantry) -> Check:
-    """Check that a position outside the travel is refused and nothing moves."""
+    """Check that a position outside the travel is refused, and nothing moves."""
     travel, before = stage.travel(), stage.position()
     try:
         stage.move_to(travel.x_mm[1] + 10.0, travel.y_mm[1] + 10.0)
@@ -78,7 +81,7 @@ def _limits(stage: Gantry) -> Check:
 
 
 def _speed(stage: Gantry) -> Check:
-    """Check that a long motion takes as long as the controller's own settings say."""
+    """Check that a long motion takes the time that the controller's settings predict."""
     low, high = _corners(stage)
     stage.move_to(*low)
     predicted_s = path_duration_s((low, high), stage.identify().motion, stage.feed_mm_per_s())
@@ -92,7 +95,7 @@ def _speed(stage: Gantry) -> Check:
 
 
 def _arrival(stage: Gantry) -> Check:
-    """Check that one place is reached alike from all sides."""
+    """Check that a position is reached equally from all sides."""
     low, high = _corners(stage)
     middle = Point(0.5 * (low.x_mm + high.x_mm), 0.5 * (low.y_mm + high.y_mm))
     reports = []
@@ -105,16 +108,16 @@ def _arrival(stage: Gantry) -> Check:
 
 
 def _report_rate(stage: Gantry) -> Check:
-    """Check that positions are told often enough to watch a motion."""
+    """Check that positions are reported often enough to follow a motion."""
     started_s = stage.clock.now_s()
     for _ in range(_REPORTS):
         stage.position()
     rate = _REPORTS / (stage.clock.now_s() - started_s)
-    return Check("report rate", rate >= _SLOWEST_REPORTS_PER_S, f"{rate:.1f} /s", f">= {_SLOWEST_REPORTS_PER_S:.0f} /s")
+    return Check("report rate", rate >= _MIN_REPORTS_PER_S, f"{rate:.1f} /s", f">= {_MIN_REPORTS_PER_S:.0f} /s")
 
 
 def _repeatability(stage: Gantry) -> Check:
-    """Check by homing again that the way from the switches and back loses no steps."""
+    """Check by homing again that moving away from the switches and back loses no steps."""
     watch = DriftWatch(stage)
     try:
         watch.begin()
@@ -128,7 +131,7 @@ def _repeatability(stage: Gantry) -> Check:
 
 
 def _corners(stage: Gantry) -> tuple[Point, Point]:
-    """Return the lower and upper corner of the middle 40 % of the travel."""
+    """Return the lower and the upper corner of the middle 40 % of the travel."""
     travel = stage.travel()
     low, high = (
         Point(*(a + share * (b - a) for a, b in (travel.x_mm, travel.y_mm)))  # the same share of each axis

@@ -1,12 +1,12 @@
-"""Lost steps, which no report shows: found by homing again and timing it.
+"""Detects lost steps, which no report shows, by timing homing again.
 
-A motor that loses steps leaves the controller's count right and the carriage wrong. Homing again from a known place
-tells: the way to the switch is longer or shorter than the count says, and so is the time that homing takes. The speed
-of homing is measured at the beginning, from two distances, so no setting of the controller enters.
+When a motor loses steps, the carriage is not where the controller counts it. Homing from a known position then takes
+longer or shorter than before, since the distance to the switch has changed. The speed of homing is measured at the
+beginning, from two distances, so that it does not depend on the controller's settings.
 
-Controllers that home both axes at once (GRBL) end when the farther axis is at its switch, so their time shows only
-the axis that drifted farthest away. For these the stage first goes so near the switches that one would close if its
-axis had drifted towards it.
+Controllers that home both axes at once (GRBL) finish when the farther axis reaches its switch, so the time shows only
+drift away from the switches. For these, the stage first moves so close to the switches that one closes if its axis has
+drifted towards it.
 """
 
 import math
@@ -14,22 +14,25 @@ import math
 from msgspec import Struct
 
 from faintfield.rig.errors import PlanRefused, PositionDrifted, StageError
-from faintfield.rig.stages.protocol import AxisIndex, Point, Stage
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import AxisIndex, Point
 
-# Serial adapters hold a short answer back for up to this long.
+# Longest delay in s by which serial adapters hold back a short answer; it limits the resolution.
 _JITTER_S = 0.016
+
+# Distance in mm from which homing is timed; half of it serves to measure the speed.
 _RUN_UP_MM = 10.0
 
 
 class Drift(Struct, frozen=True):
-    """How far the carriages were off their count when the stage was homed again.
+    """The distance of the carriages from their count when the stage was homed again.
 
     Parameters
     ----------
     away_mm : tuple of float
-        Away from the switch is positive: per axis, or one number for both where they home together.
+        Drift away from the switch: per axis, or one number for both if they home together.
     limit_mm : float
-        From where on it counts as drift.
+        Largest drift that passes.
     """
 
     away_mm: tuple[float, ...]
@@ -37,22 +40,22 @@ class Drift(Struct, frozen=True):
 
     @property
     def passed(self) -> bool:
-        """Whether no axis has drifted."""
+        """Whether no axis has drifted by more than the limit."""
         return all(abs(value) <= self.limit_mm for value in self.away_mm)
 
 
 class DriftWatch:
-    """Remembers what was visited since the stage was last known to be on its scale.
+    """Checks for drift, and records what was taken at positions that are not yet checked.
 
     Parameters
     ----------
-    stage : Stage
+    stage : Gantry
         A connected stage.
     limit_mm : float
-        How much drift to look for.
+        Largest drift that passes a check.
     """
 
-    def __init__(self, stage: Stage, *, limit_mm: float = 0.5) -> None:
+    def __init__(self, stage: Gantry, *, limit_mm: float = 0.5) -> None:
         self._stage = stage
         self._limit_mm = limit_mm
         self._unchecked: list[object] = []
@@ -63,31 +66,31 @@ class DriftWatch:
 
     @property
     def unchecked(self) -> tuple[object, ...]:
-        """What was visited since the last good check, and will be vouched for or not by the next."""
+        """What was recorded since the last passed check, and is judged by the next."""
         return tuple(self._unchecked)
 
     @property
     def doubtful(self) -> tuple[object, ...]:
-        """What was visited before a check that failed, or was never checked before the scale was set anew."""
+        """What was recorded before a failed check, or not checked before the stage was homed again."""
         return tuple(self._doubtful)
 
     def visited(self, what: object) -> None:
-        """Note that `what` (a node, a frame) relies on the stage being on its scale."""
+        """Record that `what` (a node, a frame) was taken at a position not yet checked."""
         self._unchecked.append(what)
 
     def begin(self) -> None:
-        """Home, and learn how long homing takes from known distances; begin again whenever the stage was homed.
+        """Home, and measure how long homing takes from known distances; call again whenever the stage was homed.
 
-        Homing sets the scale anew: what was visited before and not checked can be checked no more, and is doubtful.
+        Homing resets the count: what was recorded before and not checked can no longer be checked and is doubtful.
 
         Raises
         ------
         PlanRefused
-            Drift of the limit cannot be told from the jitter of the clock, or not at all.
+            The limit cannot be resolved, or the time of homing shows no drift.
         PositionDrifted
-            Homing does not take as long twice.
+            Homing does not take the same time twice.
         """
-        self._doubt()
+        self._mark_doubtful()
         self._speed_mm_per_s.clear()
         self._home = self._stage.home().position.point
         if self._stage.identify().homes_together and self._stage.identify().pull_off_mm <= self._limit_mm:
@@ -95,55 +98,55 @@ class DriftWatch:
                 f"drift limit {self._limit_mm:g} mm, but homing pulls off the switches by only "
                 f"{self._stage.identify().pull_off_mm:g} mm; pull off farther ($27) or lower the limit"
             )
-        for axis in self._homings():
-            near_s = self._timed(axis, 0.5 * _RUN_UP_MM)
-            far_s = self._timed(axis, _RUN_UP_MM)
+        for axis in self._homing_axes():
+            near_s = self._time_homing(axis, 0.5 * _RUN_UP_MM)
+            far_s = self._time_homing(axis, _RUN_UP_MM)
             self._taken_s[axis] = far_s
-            self._speed_mm_per_s[axis] = self._speed(far_s - near_s)
-        self.check()  # a disturbance while homing was timed would mislead every later check
+            self._speed_mm_per_s[axis] = self._homing_speed(far_s - near_s)
+        self.check()  # a disturbance during the timing would falsify every later check
 
     def check(self) -> Drift:
-        """Home again; what was visited is on its scale if this returns, and doubtful if it raises.
+        """Home again: what was recorded is confirmed if this returns, and doubtful if it raises.
 
         Raises
         ------
         PositionDrifted
-            With what is suspect. The stage may need `recover` and `home`.
+            With what is suspect; the stage may need `recover` and `home`.
         PlanRefused
-            There is nothing to compare with, since `begin` did not end well.
+            There is nothing to compare with, because `begin` did not succeed.
         """
-        if set(self._speed_mm_per_s) != set(self._homings()):
+        if set(self._speed_mm_per_s) != set(self._homing_axes()):
             raise PlanRefused("drift cannot be checked: homing was not timed at the beginning; begin the watch first")
         try:
             if self._stage.identify().homes_together:
                 self._require_open_switches()
             drift = Drift(
                 tuple(
-                    (self._timed(axis, _RUN_UP_MM) - self._taken_s[axis]) * self._speed_mm_per_s[axis]
-                    for axis in self._homings()
+                    (self._time_homing(axis, _RUN_UP_MM) - self._taken_s[axis]) * self._speed_mm_per_s[axis]
+                    for axis in self._homing_axes()
                 ),
                 self._limit_mm,
             )
         except PositionDrifted:
             raise
         except StageError as failure:
-            raise self._drifted(f"the check ended in: {failure}") from failure
+            raise self._drift_failure(f"the check ended in: {failure}") from failure
         if not drift.passed:
             worst = max(drift.away_mm, key=abs)
-            raise self._drifted(f"{worst:+.2f} mm off its scale, more than {self._limit_mm:g} mm")
+            raise self._drift_failure(f"{worst:+.2f} mm off its scale, more than {self._limit_mm:g} mm")
         self._unchecked.clear()
         return drift
 
-    def _homings(self) -> tuple[AxisIndex | None, ...]:
-        """Return the ways to home that have to be timed."""
+    def _homing_axes(self) -> tuple[AxisIndex | None, ...]:
+        """Return the arguments of `home` that have to be timed."""
         return (None,) if self._stage.identify().homes_together else (0, 1)
 
-    def _timed(self, axis: AxisIndex | None, distance_mm: float) -> float:
-        """Return how long homing takes from `distance_mm` away from where it ends."""
-        self._stage.move_to(*self._inward(distance_mm))
+    def _time_homing(self, axis: AxisIndex | None, distance_mm: float) -> float:
+        """Return the time of homing from `distance_mm` away from where it ends."""
+        self._stage.move_to(*self._inward_point(distance_mm))
         return self._stage.home(axis).duration_s
 
-    def _inward(self, distance_mm: float) -> Point:
+    def _inward_point(self, distance_mm: float) -> Point:
         """Return the point that lies `distance_mm` from where homing ends, along both axes."""
         travel = self._stage.travel()
         return Point(
@@ -154,38 +157,38 @@ class DriftWatch:
         )
 
     def _require_open_switches(self) -> None:
-        """Go as near the switches as the limit, and raise if one is closed there."""
+        """Move to where a switch closes if its axis has drifted by the limit, and raise if one is closed."""
         pull_off = self._stage.identify().pull_off_mm
-        self._stage.move_to(*self._inward(self._limit_mm - pull_off))
+        self._stage.move_to(*self._inward_point(self._limit_mm - pull_off))
         if closed := self._stage.switches():
             axes = " and ".join("xy"[axis] for axis in sorted(closed))
-            raise self._drifted(f"the switch of {axes} is closed more than {self._limit_mm:g} mm early")
+            raise self._drift_failure(f"the switch of {axes} is closed more than {self._limit_mm:g} mm early")
 
-    def _speed(self, difference_s: float) -> float:
-        """Return the homing speed from the time that the half run-up takes."""
+    def _homing_speed(self, difference_s: float) -> float:
+        """Return the homing speed from the time that half the run-up takes."""
         if difference_s <= 0.0:
             raise PlanRefused(
-                "homing takes as long from near as from far: its time shows no drift; do without the check"
+                "homing takes no longer from farther away, so its time shows no drift; set check = false in [drift]"
             )
         speed = 0.5 * _RUN_UP_MM / difference_s
         if speed * _JITTER_S > self._limit_mm:
             raise PlanRefused(
-                f"homing at {speed:.0f} mm/s resolves {speed * _JITTER_S:.2f} mm and drift of {self._limit_mm:g} mm "
-                "is to be found; home more slowly or raise the limit"
+                f"homing at {speed:.0f} mm/s resolves {speed * _JITTER_S:.2f} mm, coarser than the drift limit "
+                f"{self._limit_mm:g} mm; home more slowly or raise the limit"
             )
         return speed
 
-    def _doubt(self) -> tuple[object, ...]:
+    def _mark_doubtful(self) -> tuple[object, ...]:
         """Count what is unchecked as doubtful, and return it."""
         doubtful, self._unchecked = self.unchecked, []
         self._doubtful.extend(doubtful)
         return doubtful
 
-    def _drifted(self, why: str) -> PositionDrifted:
-        """Return the failure that names what is suspect, and count it as doubtful."""
-        suspect = self._doubt()
+    def _drift_failure(self, why: str) -> PositionDrifted:
+        """Return the exception with what is suspect, which becomes doubtful."""
+        suspect = self._mark_doubtful()
         return PositionDrifted(
-            f"the stage has lost its scale: {why}; {len(suspect)} positions since the last good check are suspect: "
+            f"the stage has lost its scale: {why}; {len(suspect)} positions since the last passed check are suspect: "
             "look for an obstacle or too high an acceleration, home, and take them again",
             suspect=suspect,
         )

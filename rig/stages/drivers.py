@@ -1,16 +1,19 @@
-"""From settings to a stage."""
+"""Makes the stage that `[stage]` in rig.toml describes, with the driver of its firmware."""
 
 from collections.abc import Callable
 
 from faintfield.rig.clock import Clock
-from faintfield.rig.stages.gantry import Controller, Gantry
-from faintfield.rig.stages.grbl.stage import Grbl
-from faintfield.rig.stages.marlin.stage import Marlin
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.grbl.controller import GrblController
+from faintfield.rig.stages.marlin.controller import MarlinController
+from faintfield.rig.stages.protocol import Controller
 from faintfield.rig.stages.settings import StageSettings
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 
-def stage_from(settings: StageSettings, clock: Clock, traffic: TrafficLog, open_port: Callable[[], Port]) -> Gantry:
+def make_stage(
+    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
+) -> Gantry:
     """Return the stage that `settings` describe, not yet connected.
 
     Parameters
@@ -18,16 +21,16 @@ def stage_from(settings: StageSettings, clock: Clock, traffic: TrafficLog, open_
     settings : StageSettings
         Protocol, axes and limits.
     clock : Clock
-        The rig's time.
-    traffic : TrafficLog
-        Where every byte is recorded.
+        Clock of the rig.
+    traffic : TrafficLog, optional
+        Log of every byte sent and received.
     open_port : callable
-        Opens the connection; `SerialPort` on `settings.port` for real hardware.
+        Opens the connection; for real hardware, a `SerialPort` on `settings.port`.
     """
     line = LineTransport(open_port, clock, traffic)
     controller: Controller
     if settings.protocol == "grbl":
-        controller = Grbl(line, settings.axes)
+        controller = GrblController(line, settings.axes)
     else:
-        controller = Marlin(line, settings.axes, settings.travel_mm)
+        controller = MarlinController(line, settings.axes, settings.travel_mm)
     return Gantry(controller, settings, clock)

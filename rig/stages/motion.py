@@ -1,4 +1,4 @@
-"""How long motions take, and the way to a position that is always reached from the same side."""
+"""Predicts how long motions take, and plans paths that reach every position from the same side."""
 
 import math
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from faintfield.rig.stages.protocol import MotionLimits, Point
 
 
 def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
-    """Return the time of a straight motion from rest to rest.
+    """Return the duration of a straight motion from rest to rest.
 
     The speed along the line is the highest that keeps every axis within its own rate, likewise the acceleration. A
     motion of length d at speed v and acceleration a takes d/v + v/a, or 2 sqrt(d/a) when it is too short to reach v.
@@ -16,11 +16,11 @@ def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: fl
     Parameters
     ----------
     start, end : Point
-        Where the motion begins and ends.
+        Ends of the motion.
     motion : MotionLimits
         Rates and accelerations of the axes.
     feed_mm_per_s : float
-        Speed asked for along the line.
+        Requested speed along the line.
     """
     length_mm = math.dist(start, end)
     if length_mm == 0.0:
@@ -34,15 +34,15 @@ def duration_s(start: Point, end: Point, motion: MotionLimits, feed_mm_per_s: fl
 
 
 def path_duration_s(path: Sequence[Point], motion: MotionLimits, feed_mm_per_s: float = math.inf) -> float:
-    """Return the time along `path`, with a stop at each of its points."""
+    """Return the duration of `path` with a stop at each of its points."""
     return sum(duration_s(start, end, motion, feed_mm_per_s) for start, end in pairwise(path))
 
 
 def one_sided(start: Point, target: Point, approach_mm: float) -> tuple[Point, ...]:
-    """Return the points to go through so that no axis reaches `target` downwards.
+    """Return a path to `target` on which every axis arrives upwards.
 
-    Screws and belts have play: the carriage stops at a different place when it comes from the other side. An axis
-    that would arrive from above goes `approach_mm` past its target first and comes back up.
+    Screws and belts have play: the carriage stops at a different place when it arrives from the other side. An axis
+    that would arrive from above first goes `approach_mm` past its target and then back up.
 
     Returns
     -------
@@ -53,8 +53,8 @@ def one_sided(start: Point, target: Point, approach_mm: float) -> tuple[Point, .
     return (target,) if turn == target else (turn, target)
 
 
-def patience_s(predicted_s: float) -> float:
-    """Return how long to wait for something that should take `predicted_s`, before it counts as failed."""
+def timeout_s(predicted_s: float) -> float:
+    """Return how long to wait for what should take `predicted_s` until it counts as failed."""
     return 1.5 * predicted_s + 2.0
 
 

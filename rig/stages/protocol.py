@@ -1,9 +1,10 @@
-"""What a stage is: the vocabulary that drivers, plans and simulators share.
+"""The types of a stage, and `Controller`: what the driver of one firmware must be able to do.
 
-Coordinates are the controller's own machine coordinates in millimetres, along the two axes that carry the camera.
-Nothing is shifted or flipped on the way, so a position in a log can be compared with the controller's display.
+Coordinates are the controller's machine coordinates in millimetres, along the two axes that carry the camera. They are
+not shifted or flipped, so a position in a log can be compared with the controller's display.
 """
 
+from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol, Self
 
 from msgspec import Struct
@@ -22,7 +23,7 @@ class Point(NamedTuple):
 
 
 class Box(Struct, frozen=True, forbid_unknown_fields=True):
-    """A rectangle of positions, its edges included.
+    """A rectangle of positions, including its edges.
 
     Parameters
     ----------
@@ -41,48 +42,48 @@ class Box(Struct, frozen=True, forbid_unknown_fields=True):
         return f"[{self.x_mm[0]:g}, {self.x_mm[1]:g}] x [{self.y_mm[0]:g}, {self.y_mm[1]:g}] mm"
 
     def holds(self, point: Point, slack_mm: float = 0.0) -> bool:
-        """Return whether `point` lies in the box grown by `slack_mm` on every side."""
+        """Return whether `point` lies in the box enlarged by `slack_mm` on every side."""
         return all(
             low - slack_mm <= value <= high + slack_mm
             for value, (low, high) in zip(point, (self.x_mm, self.y_mm), strict=True)
         )
 
     def intersection(self, other: Self) -> "Box":
-        """Return the box of positions that both boxes hold; `ValueError` when there are none."""
+        """Return the box of positions that both boxes hold; raises `ValueError` if there are none."""
         (ax, ay), (bx, by) = (self.x_mm, self.y_mm), (other.x_mm, other.y_mm)
         return Box((max(ax[0], bx[0]), min(ax[1], bx[1])), (max(ay[0], by[0]), min(ay[1], by[1])))
 
 
 class MotionLimits(Struct, frozen=True):
-    """How fast each axis may go and change its speed, as set in the controller."""
+    """Highest rate and acceleration of each axis, as set in the controller."""
 
     rate_mm_per_s: tuple[float, float]
     acceleration_mm_per_s2: tuple[float, float]
 
 
 class Identity(Struct, frozen=True):
-    """Who the controller says it is, and what it is set to.
+    """What the controller reports about itself: firmware, limits, settings.
 
     Parameters
     ----------
     firmware : str
         Name and version, as reported.
     travel_mm : Box
-        The positions that the controller itself allows.
+        Positions that the controller allows.
     motion : MotionLimits
         Rates and accelerations.
     tolerance_mm : (float, float)
-        Half a motor step plus the rounding of reports, per axis: a reported position within it is on target.
+        Half a motor step plus the rounding of reports, per axis: how far a report may be from its target.
     homing_bound_s : float
-        How long homing may take before it counts as failed.
+        Time after which homing counts as failed.
     homes_together : bool
-        Whether one homing command moves both axes at once and none can be homed alone.
+        Whether homing moves both axes at once, and neither can be homed alone.
     pull_off_mm : float
-        How far homing backs off the switches.
+        Distance by which homing backs off the switches.
     settings : dict
         The controller's settings as reported, for the record.
     warnings : tuple of str
-        Settings that work but should be changed, each with what to do.
+        Settings that work but should be changed, each with its remedy.
     """
 
     firmware: str
@@ -97,16 +98,16 @@ class Identity(Struct, frozen=True):
 
 
 class Position(Struct, frozen=True):
-    """Where the controller says the stage is, and whether that may be believed.
+    """A reported position, and whether it can be trusted.
 
     Parameters
     ----------
     point : Point
         The reported position.
     tolerance_mm : (float, float)
-        By how much a report may differ from a target that was reached.
+        How far a report may be from its target, per axis.
     trusted : bool
-        Whether the stage was homed and nothing has happened since that could have moved its scale.
+        Whether the stage was homed and nothing since could have changed its count of steps.
     """
 
     point: Point
@@ -114,77 +115,64 @@ class Position(Struct, frozen=True):
     trusted: bool
 
     def is_at(self, target: Point) -> bool:
-        """Return whether the stage stands at `target`, by a report that may be believed."""
+        """Return whether this trusted report puts the stage at `target`."""
         near = zip(self.point, target, self.tolerance_mm, strict=True)
         return self.trusted and all(abs(here - there) <= tolerance for here, there, tolerance in near)
 
 
 class Homing(Struct, frozen=True):
-    """What homing came to: where it ended, and how long the controller took."""
+    """The result of homing: the position at its end, and how long the controller took."""
 
     position: Position
     duration_s: float
 
 
-class Stage(Protocol):
-    """Two axes that carry the camera, driven from one thread.
+class Controller(Protocol):
+    """Takes motions and reports positions; `Gantry` adds trust, limits and verification.
 
-    Every method that talks to the controller ends within a bound, and raises a `StageError` when the controller does
-    not do what it was told. After an error nothing moves again until `recover`, and, unless the error kept the
-    position, `home`.
+    Every method is bounded in time, and raises a `StageError` if the controller does not obey.
     """
 
-    @property
-    def trusted(self) -> bool:
-        """Whether reported positions may be believed."""
-        ...
-
     def connect(self) -> None:
-        """Open the port, wait for the controller and read its settings; nothing moves."""
+        """Open the connection and wait until the controller answers."""
         ...
 
     def identify(self) -> Identity:
-        """Return what the controller said about itself when it was connected."""
+        """Read the firmware's version and settings; raises `WrongFirmware`."""
         ...
 
-    def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Find the switches; positions are trusted from here on.
-
-        Parameters
-        ----------
-        axis : 0 or 1, optional
-            Home this axis alone where the controller can (see `Identity.homes_together`).
-        """
+    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
+        """Home, and return how long the controller took, in seconds."""
         ...
 
-    def travel(self) -> Box:
-        """Return the positions that may be asked for."""
+    def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
+        """Move through the points of `path`, wait until the stage stands still, and return the reported position."""
         ...
 
-    def move_to(self, x_mm: float, y_mm: float) -> Position:
-        """Go to a position, wait until the stage stands still there, and return the verified report."""
+    def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
+        """Move relative to the present position, first clearing a lock if `unlock`; return the new position."""
         ...
 
-    def position(self) -> Position:
-        """Ask the controller where it stands."""
-        ...
-
-    def verify_at(self, x_mm: float, y_mm: float) -> Position:
-        """Ask again, and raise unless the stage stands at this position: the last step before an exposure."""
+    def read_position(self) -> Point:
+        """Return the reported position; raises unless the stage stands still."""
         ...
 
     def switches(self) -> frozenset[AxisIndex]:
-        """Return the axes whose homing switch is closed now."""
+        """Return the axes whose switch is closed."""
         ...
 
-    def hold(self) -> None:
-        """Stop moving, now."""
+    def stop(self) -> bool:
+        """Stop the motion, wait until it has ended, and return whether the position is kept."""
         ...
 
-    def recover(self) -> None:
-        """After an error, make the controller listen again, without moving; see `trusted` for what was lost."""
+    def abort(self) -> bool:
+        """Tell the stage to stop, without waiting and without raising; return whether the position is kept."""
+        ...
+
+    def recover(self) -> bool:
+        """Make the controller accept commands again, without moving; return whether the position is kept."""
         ...
 
     def close(self) -> None:
-        """Give the port back; the stage stays where it is."""
+        """Close the connection."""
         ...

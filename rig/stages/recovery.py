@@ -1,31 +1,30 @@
-"""After an error: back to work, and to the switches only if that is agreed to."""
+"""Recovers the stage after an error, and homes it only with permission."""
 
 from collections.abc import Callable
 
 from faintfield.rig.errors import NotHomed
 from faintfield.rig.stages.drift import DriftWatch
-from faintfield.rig.stages.protocol import Stage
+from faintfield.rig.stages.gantry import Gantry
 
 
-def recover(stage: Stage, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
+def recover(stage: Gantry, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
     """Make the stage usable again after a `StageError`.
 
     Parameters
     ----------
-    stage : Stage
+    stage : Gantry
         The stage that failed.
     may_home : callable
-        Asked, with the question in words, before the stage moves to its switches: a prompt to the operator, or an
-        answer given in advance (`lambda question: True`).
+        Called with a question before the stage moves to its switches; homing needs the answer True.
     watch : DriftWatch, optional
-        Begins anew if the stage is homed; what was not yet checked for drift becomes doubtful.
+        Begins again if the stage is homed; positions not yet checked for drift become doubtful.
 
     Raises
     ------
     StageError
-        It cannot be recovered; the message says what the operator should do.
+        The stage cannot be recovered; the message says what to do.
     NotHomed
-        Homing was declined, and positions are not known.
+        Homing was declined and the position is not known.
     """
     stage.recover()
     if stage.trusted:

@@ -1,4 +1,4 @@
-"""The `[stage]` table of rig.toml, and the stage that it describes."""
+"""The `[stage]` table of rig.toml."""
 
 from typing import Literal
 
@@ -10,12 +10,12 @@ type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
 
 class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """How the stage is connected and what it may do.
+    """Connection and limits of the stage.
 
     Parameters
     ----------
     protocol : str
-        What its controller speaks; `simulated` needs no port and no hardware.
+        Firmware of the controller; `simulated` needs no port and no hardware.
     port : str
         Serial device or pyserial URL, such as `socket://127.0.0.1:7000`.
     baud : int
@@ -23,13 +23,13 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     axes : (str, str)
         The controller's letters for the two axes of the grid, columns first.
     feed_mm_per_min : float, optional
-        Speed of motions; without it, the slower axis's own highest rate.
+        Speed of motions; by default the highest rate of the slower axis.
     approach_mm : float
-        How far past a position an axis goes before it arrives from below. More than the play of the drive.
+        How far an axis goes past a position to arrive from below; must exceed the play of the drive.
     travel_mm : Box, optional
-        Where the stage may go, if that is less than the controller allows, or the controller does not know.
+        Allowed positions, if the controller allows more or does not report its travel.
     keep_out : tuple of Box
-        What the stage must neither reach nor cross.
+        Boxes that the stage must neither enter nor cross.
     """
 
     protocol: ProtocolName

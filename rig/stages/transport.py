@@ -1,4 +1,4 @@
-"""Lines over a serial port, every byte logged with its time."""
+"""Sends and receives lines over a serial port, and logs every byte with its time."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,34 +8,30 @@ import serial
 from serial.tools.list_ports import comports
 
 from faintfield.rig.clock import Clock
-from faintfield.rig.errors import StageLost
+from faintfield.rig.errors import StageLost, in_one_line
 
 type Direction = Literal["sent", "received"]
 
-_LONGEST_LINE_BYTES = 1024
-_WRITE_BOUND_S = 2.0
+# Bytes kept of a line without end, which is noise: longer than any line of the controllers.
+_MAX_LINE_BYTES = 1024
+
+# Timeout of a write in s, for a port that has stopped accepting bytes.
+_WRITE_TIMEOUT_S = 2.0
 
 
 class TrafficLog(Protocol):
-    """Where serial traffic is recorded, such as the journal of a session."""
+    """A log of serial traffic, such as the journal of a session."""
 
     def record(self, at_s: float, direction: Direction, data: bytes) -> None:
-        """Keep `data`, which passed at `at_s` on the rig's clock."""
+        """Record `data`, which passed at `at_s` on the rig's clock."""
         ...
 
 
-class NoTrafficLog:
-    """Keeps nothing."""
-
-    def record(self, at_s: float, direction: Direction, data: bytes) -> None:
-        """Let `data` go."""
-
-
 class Port(Protocol):
-    """An open connection that carries bytes both ways."""
+    """An open connection that carries bytes in both directions."""
 
     def write(self, data: bytes) -> None:
-        """Send `data`; raises `StageLost` when the connection is gone."""
+        """Send `data`; raises `StageLost` if the connection is lost."""
         ...
 
     def read(self, timeout_s: float) -> bytes:
@@ -43,12 +39,12 @@ class Port(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         ...
 
 
 class SerialPort:
-    """A port of this computer, or anything else that pyserial has a URL for (`socket://host:port`).
+    """A serial port, or another connection that pyserial has a URL for (`socket://host:port`).
 
     Parameters
     ----------
@@ -66,14 +62,14 @@ class SerialPort:
     def __init__(self, url: str, baud: int) -> None:
         self._url = url
         try:
-            # A second program on the same port would mix its commands with ours: take it alone.
+            # Exclusive: a second program on the same port would mix its commands with these.
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=0, write_timeout=_WRITE_BOUND_S, exclusive=True
+                url, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
         except (serial.SerialException, OSError, ValueError) as failure:
             present = ", ".join(port.device for port in comports()) or "none"
             raise StageLost(
-                f"{url}: cannot be opened ({_in_one_line(failure)}); serial ports here: {present}; "
+                f"{url}: cannot be opened ({in_one_line(failure)}); serial ports here: {present}; "
                 "check the cable, the name and that no other program has it"
             ) from failure
 
@@ -92,35 +88,39 @@ class SerialPort:
             return bytes(data)
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._serial.close()
 
     @contextmanager
     def _reported_as_lost(self) -> Iterator[None]:
-        """Turn what pyserial says about a dead connection into a named failure."""
+        """Raise `StageLost` for what pyserial raises on a lost connection."""
         try:
             yield
-        except (serial.SerialException, OSError, TypeError) as failure:  # TypeError: pyserial, on a port just closed
+        except (
+            serial.SerialException,
+            OSError,
+            TypeError,
+        ) as failure:  # TypeError: raised by pyserial on a closed port
             raise StageLost(
-                f"{self._url}: the connection is gone ({_in_one_line(failure)}); "
+                f"{self._url}: the connection is lost ({in_one_line(failure)}); "
                 "check cable and power; the stage must be homed again"
             ) from failure
 
 
 class LineTransport:
-    """Sends bytes and receives lines, with a bound on every wait.
+    """Sends bytes and receives lines, each within a time limit.
 
     Parameters
     ----------
     open_port : callable
-        Opens the connection, anew each time.
+        Opens the connection; called at each `open`.
     clock : Clock
-        What bounds are measured by.
-    traffic : TrafficLog
-        Where every byte is recorded.
+        Clock of the time limits.
+    traffic : TrafficLog, optional
+        Log of every byte sent and received.
     """
 
-    def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog) -> None:
+    def __init__(self, open_port: Callable[[], Port], clock: Clock, traffic: TrafficLog | None = None) -> None:
         self.clock = clock
         self._open_port = open_port
         self._traffic = traffic
@@ -129,11 +129,11 @@ class LineTransport:
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection was opened and has not been found dead since."""
+        """Whether the connection was opened and has not been lost since."""
         return self._port is not None
 
     def open(self) -> None:
-        """Open the connection, closing an older one first."""
+        """Open the connection, after closing an open one."""
         self.close()
         self._port = self._open_port()
 
@@ -147,12 +147,12 @@ class LineTransport:
         """Send `data`; raises `StageLost`."""
         with self._live_port() as port:
             port.write(data)
-        self._traffic.record(self.clock.now_s(), "sent", data)
+        self._log("sent", data)
 
     def next_line(self, deadline_s: float) -> str | None:
         """Return the next line that is not empty, or None when the clock reaches `deadline_s`; raises `StageLost`.
 
-        Bytes that are no ASCII text become U+FFFD, which no parser takes for an answer.
+        Bytes outside ASCII become U+FFFD, which no parser accepts in an answer.
         """
         while True:
             line, newline, rest = self._buffer.partition(b"\n")
@@ -161,25 +161,30 @@ class LineTransport:
                 if text := line.decode("ascii", errors="replace").strip():
                     return text
                 continue
-            # A line without an end is noise; keep it from growing for ever.
-            self._buffer = line[-_LONGEST_LINE_BYTES:]
+            # Noise may go on without a line end: limit the buffer.
+            self._buffer = line[-_MAX_LINE_BYTES:]
             remaining_s = max(0.0, deadline_s - self.clock.now_s())
             with self._live_port() as port:
                 data = port.read(remaining_s)
             if data:
-                self._traffic.record(self.clock.now_s(), "received", data)
+                self._log("received", data)
                 self._buffer += data
             elif self.clock.now_s() >= deadline_s:
                 return None
 
     def lines_until(self, deadline_s: float) -> Iterator[str]:
-        """Yield lines as they come until the clock reaches `deadline_s`; when that is now, those that are there."""
+        """Yield lines until the clock reaches `deadline_s`; if that is now, yield those already received."""
         while (line := self.next_line(deadline_s)) is not None:
             yield line
 
+    def _log(self, direction: Direction, data: bytes) -> None:
+        """Record `data`, if there is a log."""
+        if self._traffic is not None:
+            self._traffic.record(self.clock.now_s(), direction, data)
+
     @contextmanager
     def _live_port(self) -> Iterator[Port]:
-        """Yield the port, and forget it when it turns out to be dead."""
+        """Yield the port, and close it if the connection turns out to be lost."""
         if self._port is None:
             raise StageLost("the stage is not connected; connect it, or recover after the connection was lost")
         try:
@@ -187,8 +192,3 @@ class LineTransport:
         except StageLost:
             self.close()
             raise
-
-
-def _in_one_line(failure: BaseException) -> str:
-    """Return the message of `failure` without line breaks."""
-    return " ".join(str(failure).split()) or type(failure).__name__

@@ -1,4 +1,4 @@
-"""Where the stage may go: its travel less the keep-out boxes, checked along the whole way."""
+"""Checks paths against the travel of the stage and the keep-out boxes."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -8,31 +8,31 @@ from msgspec import Struct
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.stages.protocol import Box, Point
 
-# Positions computed from a pitch end a few units in the last place off an edge that they mean to touch.
+# Tolerance in mm: positions computed from a pitch miss the edge that they should touch by rounding errors.
 _ROUNDING_MM = 1e-6
 
 
-class Workspace(Struct, frozen=True):
-    """The travel of the stage and the boxes that it must stay out of.
+class StageWorkspace(Struct, frozen=True):
+    """The travel of the stage and its keep-out boxes.
 
     Parameters
     ----------
     travel_mm : Box
-        Positions that can be reached.
+        Positions that the stage can reach.
     keep_out : tuple of Box
-        Positions that must be neither reached nor crossed.
+        Boxes that the stage must neither enter nor cross.
     """
 
     travel_mm: Box
     keep_out: tuple[Box, ...] = ()
 
     def check_path(self, path: Sequence[Point]) -> None:
-        """Refuse a path that leaves the travel or meets a keep-out box on any of its straight segments.
+        """Raise if a path leaves the travel or meets a keep-out box on any of its straight segments.
 
         Raises
         ------
         OutsideTravel, KeepOutCrossed
-            With the offending position or segment.
+            The message names the position or segment.
         """
         for point in path:
             if not self.travel_mm.holds(point, _ROUNDING_MM):
@@ -50,9 +50,9 @@ class Workspace(Struct, frozen=True):
 
 
 def segment_meets(box: Box, start: Point, end: Point) -> bool:
-    """Return whether the straight way from `start` to `end` touches `box`.
+    """Return whether the straight line from `start` to `end` touches `box`.
 
-    The parameter of the segment is clipped against one pair of edges after the other (Liang and Barsky, 1984).
+    The parameter of the segment is clipped against each pair of edges in turn (Liang and Barsky, 1984).
     """
     enter, leave = 0.0, 1.0
     for a, b, (low, high) in zip(start, end, (box.x_mm, box.y_mm), strict=True):

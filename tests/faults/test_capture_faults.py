@@ -23,11 +23,11 @@ from faintfield.rig.session.session import FrozenPlan, is_sealed
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, RigSettings
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.faults import Fault, faults_of
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
+from tests.faults.stage_faults import Fault, faults_of
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}

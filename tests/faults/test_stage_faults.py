@@ -1,4 +1,4 @@
-"""Everything that can go wrong with a stage, at every moment: a named failure or a recovery, and no wrong exposure."""
+"""Every fault of a stage, at every moment, ends in a named failure or a recovery, and never in a wrong frame."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -11,18 +11,16 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import RigError, StageError
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.faults import FAULTS, Fault, faults_of
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import PtyLink, SocketLink
-from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.controller.link import PtyLink
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.recovery import recover
+from tests.faults.stage_faults import FAULTS, Fault, faults_of
+from tests.rig.stages.benches import CONTROLLERS, Controller
+from tests.rig.stages.socket_link import SocketLink
 
-type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
-
-CONTROLLERS: dict[str, Controller] = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+BY_PROTOCOL: dict[str, Controller] = {controller.protocol: controller for controller in CONTROLLERS}
 DRIFT_LIMIT_MM = 0.5
 # Half a step of 1/80 mm and the rounding of reports
 ON_TARGET_MM = 0.5 / 80.0 + 0.0055
@@ -30,8 +28,8 @@ MOMENTS = {"connecting": 1.02, "homing": 5.0, "moving": 0.35, "exposing": 0.35}
 
 
 @dataclass(frozen=True)
-class Exposure:
-    """A frame that was kept, and where the camera truly was from its beginning to its end."""
+class KeptFrame:
+    """A frame that was kept, and the true positions of the camera at the beginning and the end of its exposure."""
 
     number: int
     target: Point
@@ -43,12 +41,12 @@ class Exposure:
 
 
 @dataclass
-class Capture:
-    """A capture in small: the rules by which frames are taken and kept, on a bench where things go wrong."""
+class RehearsedCapture:
+    """A small capture, with the rules by which frames are taken and kept, on a bench with faults."""
 
     bench: Bench
     recovery_bound_s: float = 2.0
-    kept: list[Exposure] = field(default_factory=list)
+    kept: list[KeptFrame] = field(default_factory=list)
     failures: list[RigError] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -58,12 +56,12 @@ class Capture:
         self.on_expose: Callable[[], None] = lambda: None
 
     def run(self) -> None:
-        """Take four frames, coping with failures as a capture would; end well or with a failure noted."""
+        """Take four frames, recovering from failures as a capture does; record every failure."""
         try:
             self.start()
             for target in self.targets():
                 for _ in range(3):
-                    with self.coping():
+                    with self.recovering():
                         self.take(target)
                         break
             self.watch.check()
@@ -73,16 +71,16 @@ class Capture:
             self.stage.close()
 
     def start(self) -> None:
-        """Connect and begin to watch for drift, again if it fails."""
-        with self.coping():
+        """Connect and begin the drift watch, repeatedly if it fails."""
+        with self.recovering():
             self.stage.connect()
         for _ in range(3):
-            with self.coping():
+            with self.recovering():
                 self.watch.begin()
                 break
 
     def targets(self) -> list[Point]:
-        """Return places to visit, there and back."""
+        """Return the positions of the frames."""
         travel = self.stage.travel()
         x, y = travel.x_mm[0] + 100.0, travel.y_mm[0] + 100.0
         return [Point(x, y), Point(x + 50.0, y), Point(x + 50.0, y + 50.0), Point(x, y + 50.0)]
@@ -98,18 +96,18 @@ class Capture:
         self.on_expose()
         self.bench.clock.sleep_s(1.0)
         self.stage.verify_at(*target)
-        exposure = Exposure(len(self.kept), target, began, self.bench.true_position())
-        self.kept.append(exposure)
-        self.watch.visited(exposure.number)
+        frame = KeptFrame(len(self.kept), target, began, self.bench.true_position())
+        self.kept.append(frame)
+        self.watch.visited(frame.number)
 
-    def vouched_for(self) -> list[Exposure]:
+    def accepted(self) -> list[KeptFrame]:
         """Return the frames that are neither doubtful nor unchecked."""
         doubtful = {*self.watch.doubtful, *self.watch.unchecked}
-        return [exposure for exposure in self.kept if exposure.number not in doubtful]
+        return [frame for frame in self.kept if frame.number not in doubtful]
 
     @contextmanager
-    def coping(self) -> Iterator[None]:
-        """Note a failure of the stage and recover from it; what cannot be recovered from is raised."""
+    def recovering(self) -> Iterator[None]:
+        """Record a failure of the stage and recover; raise if that is impossible."""
         try:
             yield
         except StageError as failure:
@@ -117,36 +115,36 @@ class Capture:
             self.recover()
 
     def recover(self) -> None:
-        """Recover within the time allowed, homing if need be."""
-        with self.bounded(self.recovery_bound_s, when_it_ends_well=True):
+        """Recover within the time limit, homing if necessary."""
+        with self.bounded(self.recovery_bound_s, only_on_success=True):
             self.stage.recover()
         recover(self.stage, lambda question: True, self.watch)
 
     @contextmanager
-    def bounded(self, bound_s: float, *, when_it_ends_well: bool = False) -> Iterator[None]:
+    def bounded(self, bound_s: float, *, only_on_success: bool = False) -> Iterator[None]:
         """Assert that the block takes no longer than `bound_s` of simulated time."""
         started_s = self.bench.clock.now_s()
         try:
             yield
         except RigError:
-            if not when_it_ends_well:
+            if not only_on_success:
                 assert self.bench.clock.now_s() - started_s <= bound_s
             raise
         assert self.bench.clock.now_s() - started_s <= bound_s
 
-    def assert_honest(self, faults: list[Fault]) -> None:
-        """Assert that no frame was kept from a wrong place unless it is marked, and that failures say what to do."""
-        for exposure in self.vouched_for():
-            assert exposure.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
+    def check_frames(self, faults: list[Fault]) -> None:
+        """Assert that no frame from a wrong position is accepted, and that failures say what to do."""
+        for frame in self.accepted():
+            assert frame.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
         if not any(fault.nature == "mechanics" for fault in faults):
-            assert all(exposure.error_mm() <= ON_TARGET_MM for exposure in self.kept)
+            assert all(frame.error_mm() <= ON_TARGET_MM for frame in self.kept)
         for failure in self.failures:
             assert "; " in str(failure), "a failure says what is wrong; and what to do"
             assert "\n" not in str(failure)
 
 
 def once(action: Callable[[], None]) -> Callable[[], None]:
-    """Return `action` such that it happens the first time only."""
+    """Return a function that calls `action` the first time only."""
     pending = [action]
     return lambda: pending.pop()() if pending else None
 
@@ -163,7 +161,7 @@ def test_there_are_enough_faults() -> None:
     ids=str,
 )
 def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
-    capture = Capture(Bench(CONTROLLERS[protocol]))
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]))
 
     def strike() -> None:
         capture.bench.clock.after(MOMENTS[moment], lambda: fault.strike(capture.bench))
@@ -175,46 +173,46 @@ def test_one_fault(protocol: str, fault: Fault, moment: str) -> None:
     else:
         strike()
     capture.run()
-    capture.assert_honest([fault])
+    capture.check_frames([fault])
     if not capture.failures:
         assert len(capture.kept) == 4
 
 
 def test_an_undisturbed_capture_keeps_everything() -> None:
-    for controller in CONTROLLERS.values():
-        capture = Capture(Bench(controller))
+    for controller in CONTROLLERS:
+        capture = RehearsedCapture(Bench(controller))
         capture.run()
         assert len(capture.kept) == 4
         assert not capture.failures
-        assert capture.vouched_for() == capture.kept
+        assert capture.accepted() == capture.kept
 
 
-@pytest.mark.parametrize("protocol", CONTROLLERS)
+@pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
 @pytest.mark.parametrize("name", ["unplugged", "unplugged and back", "restart", "noise", "controller mute"])
 def test_faults_through_the_operating_system(protocol: str, link: type[PtyLink] | type[SocketLink], name: str) -> None:
     made = link()
     fault = next(fault for fault in FAULTS if fault.name == name)
-    capture = Capture(Bench(CONTROLLERS[protocol], made))
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol], made))
     capture.on_move = once(lambda: fault_soon(capture, fault))
     capture.run()
     made.close()
-    capture.assert_honest([fault])
+    capture.check_frames([fault])
     assert capture.failures or name == "noise"
 
 
-def fault_soon(capture: Capture, fault: Fault) -> None:
+def fault_soon(capture: RehearsedCapture, fault: Fault) -> None:
     """Strike while the stage is on its way."""
     capture.bench.clock.after(0.35, lambda: fault.strike(capture.bench))
 
 
-@pytest.mark.parametrize("protocol", CONTROLLERS)
+@pytest.mark.parametrize("protocol", BY_PROTOCOL)
 @settings(max_examples=150, deadline=None)
 @given(data=st.data())
 def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: st.DataObject) -> None:
     # A second fault may strike in the middle of recovering from the first
-    capture = Capture(Bench(CONTROLLERS[protocol]), recovery_bound_s=6.0)
-    known = faults_of(CONTROLLERS[protocol].protocol)
+    capture = RehearsedCapture(Bench(BY_PROTOCOL[protocol]), recovery_bound_s=6.0)
+    known = faults_of(BY_PROTOCOL[protocol].protocol)
     silent = [fault for fault in known if fault.nature == "mechanics"]
     loud = [fault for fault in known if fault.nature != "mechanics"]
     # Two drifts between two checks may cancel: no check by homing can find them, so one at most is drawn.
@@ -225,4 +223,4 @@ def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(protocol: str, data: s
         when_s = data.draw(st.floats(0.0, 90.0))
         capture.bench.clock.after(when_s, lambda fault=fault: fault.strike(capture.bench))  # type: ignore[misc]
     capture.run()
-    capture.assert_honest(faults)
+    capture.check_frames(faults)

@@ -14,7 +14,7 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
-from faintfield.rig.stages.workspace import Workspace
+from faintfield.rig.stages.workspace import StageWorkspace
 
 GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
 STEPS = (
@@ -66,13 +66,13 @@ def test_the_path_reaches_every_stop_from_below() -> None:
 
 
 def test_a_plan_outside_or_through_a_keep_out_is_refused() -> None:
-    plan_of().check(Workspace(TRAVEL))
+    plan_of().check(StageWorkspace(TRAVEL))
     with pytest.raises(OutsideTravel):
-        plan_of().check(Workspace(Box((0.0, 300.0), (0.0, 400.0))))
+        plan_of().check(StageWorkspace(Box((0.0, 300.0), (0.0, 400.0))))
     with pytest.raises(OutsideTravel):  # a node at the edge leaves no room to come from below
-        plan_of(Grid(7, 7, 50.0, Point(0.0, 0.0))).check(Workspace(TRAVEL))
+        plan_of(Grid(7, 7, 50.0, Point(0.0, 0.0))).check(StageWorkspace(TRAVEL))
     with pytest.raises(KeepOutCrossed):
-        plan_of().check(Workspace(TRAVEL, (Box((30.0, 35.0), (5.0, 15.0)),)))
+        plan_of().check(StageWorkspace(TRAVEL, (Box((30.0, 35.0), (5.0, 15.0)),)))
 
 
 @pytest.mark.parametrize(("controller", "origin"), [(SimulatedGrbl, -350.0), (SimulatedMarlin, 10.0)])

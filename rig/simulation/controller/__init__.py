@@ -1,1 +1,1 @@
-"""Simulated stage controllers: firmware, motors and wires, with a clock of their own and faults to order."""
+"""Simulated stage controllers: firmware, motors and wire, with a clock of their own and faults on demand."""

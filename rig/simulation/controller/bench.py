@@ -1,40 +1,37 @@
-"""A simulated controller on the bench: firmware, mechanics, wire and clock, with a port for the driver."""
+"""A simulated controller with its mechanics, wire and clock, and a port for the driver."""
 
 from collections.abc import Callable
 
 from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.link import DirectLink, Link
-from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.wire import Wire
-from faintfield.rig.stages.drivers import stage_from
+from faintfield.rig.stages.drivers import make_stage
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import NoTrafficLog, Port, TrafficLog
-
-type Firmware = SimulatedGrbl | SimulatedMarlin
+from faintfield.rig.stages.transport import Port, TrafficLog
 
 
 class Bench:
-    """A stage to try things on, without hardware and without waiting.
+    """A simulated stage, on which motions take no real time.
 
-    Driver and controller run in turns on one clock: when the driver waits for bytes, the simulated world goes on until
-    there are some or the wait is over. The bytes themselves go through `link`.
+    Driver and controller take turns on one clock: when the driver waits for bytes, simulated time advances until some
+    arrive or the wait is over. The bytes pass through `link`.
 
     Parameters
     ----------
     firmware : callable
-        Makes the controller from a clock and a wire: `SimulatedGrbl`, `SimulatedMarlin`, or either with settings.
+        Makes the controller from a clock and a wire: `SimulatedGrbl` or `SimulatedMarlin`, possibly with options.
     link : Link, optional
-        The cable; without it, one within the program.
+        The cable; by default a `DirectLink`.
     resets_on_open : bool
         Whether opening the port restarts the controller, as it does on most boards.
     """
 
     def __init__(
         self,
-        firmware: Callable[[SimulatedClock, Wire], Firmware],
+        firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware],
         link: Link | None = None,
         *,
         resets_on_open: bool = True,
@@ -46,7 +43,7 @@ class Bench:
         self.resets_on_open = resets_on_open
 
     def open_port(self) -> Port:
-        """Open the host's end of the cable."""
+        """Open the host's end of the link."""
         port = self.link.open()
         if self.resets_on_open:
             self.firmware.restart()
@@ -59,23 +56,23 @@ class Bench:
         Parameters
         ----------
         settings : StageSettings, optional
-            What to make of the stage; its protocol has to be the firmware's for anything to work.
+            Settings of the stage; the default has the firmware's protocol.
         traffic : TrafficLog, optional
-            Where every byte is recorded.
+            Log of every byte sent and received.
         """
         settings = settings or StageSettings(protocol=self.firmware.protocol, port=self.link.url)
-        return stage_from(settings, self.clock, traffic or NoTrafficLog(), self.open_port)
+        return make_stage(settings, self.clock, traffic, self.open_port)
 
     def true_position(self) -> Point:
-        """Return where the carriages really are, whatever the controller reports."""
+        """Return the true position of the carriages, whatever the controller reports."""
         return Point(*self.firmware.mechanics.true_mm())
 
     def still_s(self) -> float:
-        """Return how long ago the last motion ended."""
+        """Return the time since the last motion ended."""
         return self.clock.now_s() - self.firmware.mechanics.still_since_s
 
     def plug(self) -> None:
-        """Put the cable in; a controller powered by it starts."""
+        """Plug the cable in, which powers and starts the controller."""
         self.link.plug()
         self.wire.connected = True
         self.firmware.restart()
@@ -88,20 +85,20 @@ class Bench:
 
 
 class SteppedPort:
-    """A port on which time passes only while somebody waits for bytes."""
+    """A port on which simulated time passes only while the driver waits for bytes."""
 
     def __init__(self, port: Port, bench: Bench) -> None:
         self._port = port
         self._bench = bench
 
     def write(self, data: bytes) -> None:
-        """Send `data` through the cable and let the controller have what arrives."""
+        """Send `data` through the link, and pass what arrives to the controller."""
         self._port.write(data)
         arrived = self._bench.link.receive(len(data))
         self._bench.firmware.receive(self._bench.wire.to_controller(arrived))
 
     def read(self, timeout_s: float) -> bytes:
-        """Let the world go on until bytes arrive through the cable, or `timeout_s` is over."""
+        """Advance simulated time until bytes arrive or `timeout_s` is over, and return them."""
         bench = self._bench
         deadline_s = bench.clock.now_s() + timeout_s
         while not bench.wire.arrived():
@@ -117,5 +114,5 @@ class SteppedPort:
         return received
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         self._port.close()

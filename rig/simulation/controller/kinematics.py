@@ -1,33 +1,33 @@
-"""Motors, carriages and switches: where the controller believes the stage is, and where it truly is.
+"""Simulates motors, carriages and switches: the commanded and the true position of the stage.
 
 The controller counts the steps that it sends (the commanded position). The carriage follows, except for play in the
-drive, steps that the motor lost, an axis that is stuck, and the ends of the travel.
+drive, lost steps, an axis that is stuck, and the ends of the travel.
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 
 type Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Speed along a straight line over time: pieces of constant acceleration.
+    """Speed along a straight line over time, in pieces of constant acceleration.
 
     Parameters
     ----------
-    pieces : tuple of (duration_s, initial speed mm/s, acceleration mm/s^2)
-        In order.
+    pieces : tuple of (float, float, float)
+        Duration (s), initial speed (mm/s) and acceleration (mm/s²) of each piece, in order.
     """
 
     pieces: tuple[tuple[float, float, float], ...]
 
     @classmethod
     def rest_to_rest(cls, length_mm: float, speed: float, acceleration: float) -> "Profile":
-        """Speed up, cruise if there is room, slow down."""
+        """Return the profile that accelerates, cruises if the line is long enough, and decelerates."""
         peak = min(speed, math.sqrt(length_mm * acceleration))
         ramp_s = peak / acceleration
         cruise_s = (length_mm - peak * ramp_s) / peak if peak else 0.0
@@ -35,25 +35,25 @@ class Profile:
 
     @property
     def duration_s(self) -> float:
-        """Time from beginning to end."""
+        """Time from start to end."""
         return sum(duration for duration, _, _ in self.pieces)
 
     def at(self, elapsed_s: float) -> tuple[float, float]:
-        """Return the distance gone in mm and the speed in mm/s, `elapsed_s` after the beginning."""
-        gone, speed = 0.0, 0.0
+        """Return the distance covered in mm and the speed in mm/s, `elapsed_s` after the start."""
+        covered, speed = 0.0, 0.0
         for duration, initial, acceleration in self.pieces:
             spent = min(max(elapsed_s, 0.0), duration)
-            gone += initial * spent + 0.5 * acceleration * spent**2
+            covered += initial * spent + 0.5 * acceleration * spent**2
             speed = initial + acceleration * spent
             elapsed_s -= duration
             if elapsed_s < 0.0:
                 break
-        return gone, speed
+        return covered, speed
 
 
 @dataclass(frozen=True)
 class Motion:
-    """One straight motion, begun at a time."""
+    """A straight motion that began at `begun_s`."""
 
     start: Vector
     end: Vector
@@ -64,30 +64,30 @@ class Motion:
     def at(self, now_s: float) -> tuple[Vector, float]:
         """Return the commanded position and the speed at `now_s`."""
         length = math.dist(self.start, self.end)
-        gone, speed = self.profile.at(now_s - self.begun_s)
-        share = min(1.0, gone / length) if length else 1.0
+        covered, speed = self.profile.at(now_s - self.begun_s)
+        share = min(1.0, covered / length) if length else 1.0
         return tuple(a + share * (b - a) for a, b in zip(self.start, self.end, strict=True)), speed
 
 
 @dataclass
 class Axis:
-    """One drive and its carriage, in the coordinates of its switch.
+    """One drive and its carriage, in coordinates whose origin is at the switch.
 
     Parameters
     ----------
     low_mm, high_mm : float
         Ends of the mechanical travel.
     carriage_mm : float
-        Where the carriage is.
+        Position of the carriage.
     play_mm : float
-        How far the motor turns before the carriage follows in the other direction.
+        Distance that the motor turns after a reversal before the carriage follows.
 
     Attributes
     ----------
     slip_mm : float
-        Carriage less count, play aside: what the controller does not know.
+        Position of the carriage minus the count, without play; the controller does not know it.
     stuck : bool
-        Whether the carriage stays where it is whatever the motor does.
+        Whether the carriage stays in place when the motor turns.
     """
 
     low_mm: float
@@ -98,10 +98,10 @@ class Axis:
     stuck: bool = False
 
     def __post_init__(self) -> None:
-        self.slip_mm = self.carriage_mm  # the count begins at zero wherever the carriage was left
+        self.slip_mm = self.carriage_mm  # the count starts at zero, wherever the carriage is
 
     def follow(self, commanded_mm: float) -> float:
-        """Let the carriage follow the motor, and return where it comes to stand."""
+        """Move the carriage after the motor, and return its position."""
         if self.stuck:
             self.slip_mm = self.carriage_mm - commanded_mm
             return self.carriage_mm
@@ -114,20 +114,26 @@ class Axis:
 
 @dataclass
 class Mechanics:
-    """The mechanics of a stage with two axes that can be moved and a third that stands.
+    """The mechanics of a stage with two axes.
 
     Motions are queued and run one after the other, each from rest to rest.
 
     Parameters
     ----------
     clock : SimulatedClock
-        The world's time.
-    axes : sequence of Axis
+        The simulated time.
+    axes : (Axis, Axis)
         x and y.
     step_mm : float
         Distance of one motor step.
     switch_mm : (float, float)
-        Where the homing switches close; they are at the end of the travel that is nearer.
+        Positions at which the homing switches close.
+    switch_at_high_end : bool
+        Whether the switches are at the upper ends of the travel.
+    on_idle, on_switch : callable
+        Called when the last motion ends, and when a motion closes a switch.
+    endless : bool
+        Whether motions never end, as a fault.
     """
 
     clock: SimulatedClock
@@ -142,21 +148,21 @@ class Mechanics:
     _commanded: Vector = (0.0, 0.0)
     _queue: list[tuple[Vector, float, float]] = field(default_factory=list)
     _motion: Motion | None = None
-    _events: list[Event] = field(default_factory=list)
+    _events: list[ScheduledEvent] = field(default_factory=list)
 
     @property
     def moving(self) -> bool:
-        """Whether motors turn or will without being asked again."""
+        """Whether a motion is under way or queued."""
         return self._motion is not None
 
     def commanded_mm(self) -> Vector:
-        """Return where the controller has counted the stage to."""
+        """Return the position that the controller has counted."""
         if self._motion is not None:
             self._commanded = self._motion.at(self.clock.now_s())[0]
         return self._commanded
 
     def true_mm(self) -> Vector:
-        """Return where the carriages are."""
+        """Return the true position of the carriages."""
         return tuple(axis.follow(value) for axis, value in zip(self.axes, self.commanded_mm(), strict=True))
 
     def switches(self) -> tuple[bool, ...]:
@@ -165,30 +171,30 @@ class Mechanics:
         return tuple(sign * (t - s) >= -1e-9 for t, s in zip(self.true_mm(), self.switch_mm, strict=True))
 
     def set_count(self, position: Sequence[float]) -> None:
-        """Let the controller call its present place `position`; the carriage stays."""
+        """Set the controller's count to `position` without moving."""
         for axis, old, new in zip(self.axes, self.commanded_mm(), position, strict=True):
             axis.slip_mm += old - new
         self._commanded = tuple(position)
 
     def queue(self, target: Sequence[float], speed: float, acceleration: float) -> None:
-        """Go to `target`, rounded to steps, after what is queued already."""
+        """Queue a motion to `target`, rounded to steps."""
         rounded = tuple(round(value / self.step_mm) * self.step_mm for value in target)
         self._queue.append((rounded, speed, acceleration))
         if self._motion is None:
             self._start_next()
 
     def planned_mm(self) -> Vector:
-        """Return where the stage will be when all that is queued is done."""
+        """Return the commanded position after all queued motions."""
         if self._queue:
             return self._queue[-1][0]
         return self._motion.end if self._motion is not None else self._commanded
 
     def queued(self) -> int:
-        """Return how many motions are under way or waiting."""
+        """Return the number of motions under way or waiting."""
         return len(self._queue) + (self._motion is not None)
 
     def brake(self) -> None:
-        """Drop what is queued and slow down at the motion's own acceleration; then `on_idle`."""
+        """Drop the queue and decelerate at the motion's own acceleration; `on_idle` follows."""
         self._queue.clear()
         if self._motion is None:
             return
@@ -205,17 +211,17 @@ class Mechanics:
         self._begin(Motion(here, end, profile, motion.acceleration, self.clock.now_s()))
 
     def stop_dead(self) -> None:
-        """Cut the motion off, as a reset does."""
+        """End all motion at once, as a reset does."""
         self.true_mm()
         self._queue.clear()
         self._end_motion()
 
     def homing_distances_mm(self) -> Vector:
-        """Return how far each carriage is from its switch."""
+        """Return the distance of each carriage from its switch."""
         return tuple(abs(s - t) for s, t in zip(self.switch_mm, self.true_mm(), strict=True))
 
     def set_homed(self, axis: int, position_mm: float, carriage_mm: float) -> None:
-        """Let one axis stand at `carriage_mm` and be counted as `position_mm`, as homing leaves it."""
+        """Put one carriage at `carriage_mm` with the count `position_mm`, as homing leaves it."""
         self.axes[axis].carriage_mm = carriage_mm
         self.axes[axis].slip_mm = carriage_mm - position_mm
         values = list(self._commanded)
@@ -223,14 +229,14 @@ class Mechanics:
         self._commanded = tuple(values)
 
     def _start_next(self) -> None:
-        """Begin the next motion that is queued."""
+        """Start the next motion of the queue."""
         target, speed, acceleration = self._queue.pop(0)
         length = math.dist(self._commanded, target)
         profile = Profile.rest_to_rest(length, speed, acceleration) if length else Profile(())
         self._begin(Motion(self._commanded, target, profile, acceleration, self.clock.now_s()))
 
     def _begin(self, motion: Motion) -> None:
-        """Put the end of `motion`, and the moment it runs into a switch, on the agenda."""
+        """Start `motion`, and schedule its end and its first contact with a switch."""
         self._end_motion()
         self._motion = motion
         duration_s = motion.profile.duration_s
@@ -241,7 +247,7 @@ class Mechanics:
             self._events.append(self.clock.after(hit_s, self.on_switch))
 
     def _first_contact_s(self, motion: Motion) -> float | None:
-        """Return after how long a switch closes in `motion`, None when none does."""
+        """Return the time from the start of `motion` until it closes a switch, or None."""
         duration_s = motion.profile.duration_s
         if not self._contact_at(motion.end):
             return None
@@ -253,7 +259,7 @@ class Mechanics:
         return high
 
     def _contact_at(self, commanded: Vector) -> bool:
-        """Return whether a switch would be closed with the motors at `commanded`."""
+        """Return whether a switch would be closed at a commanded position."""
         sign = 1.0 if self.switch_at_high_end else -1.0
         return any(
             not axis.stuck and sign * (value + axis.slip_mm - switch) >= -1e-9
@@ -261,7 +267,7 @@ class Mechanics:
         )
 
     def _finish(self) -> None:
-        """End the motion that is due, and begin the next or fall idle."""
+        """End the motion, and start the next or become idle."""
         assert self._motion is not None
         self._commanded = self._motion.end
         self._motion, self._events = None, []
@@ -273,7 +279,7 @@ class Mechanics:
             self.on_idle()
 
     def _end_motion(self) -> None:
-        """Leave the present motion where it is."""
+        """End the motion at its present position."""
         self._commanded = self.commanded_mm()
         self._motion = None
         for event in self._events:
@@ -282,7 +288,7 @@ class Mechanics:
 
 
 def along(limits: Sequence[float], start: Sequence[float], target: Sequence[float]) -> float:
-    """Return the largest rate on the way from `start` to `target` that keeps each axis within its limit."""
+    """Return the highest rate along the line from `start` to `target` that keeps each axis within its limit."""
     length = math.dist(start, target)
     ways = zip(limits, start, target, strict=True)
     return min((limit * length / abs(b - a) for limit, a, b in ways if a != b), default=limits[0])

@@ -1,10 +1,9 @@
-"""What lies between the driver and the simulated controller: nothing, a pseudo-terminal, or a socket.
+"""The link between driver and simulated controller: within the program, or a pseudo-terminal.
 
-The last two pass every byte through pyserial and the operating system, as with real hardware.
+The latter passes every byte through pyserial and the operating system, as with real hardware.
 """
 
 import os
-import socket
 import tempfile
 import tty
 from pathlib import Path
@@ -13,15 +12,13 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.stages.transport import Port, SerialPort
 
-_REAL_BOUND_S = 10.0
-
 
 class Link(Protocol):
     """A cable from the host's port to the controller's."""
 
     @property
     def url(self) -> str:
-        """What the driver opens."""
+        """URL that the driver opens."""
         ...
 
     def open(self) -> Port:
@@ -37,7 +34,7 @@ class Link(Protocol):
         ...
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         ...
 
     def unplug(self) -> None:
@@ -46,7 +43,7 @@ class Link(Protocol):
 
 
 class DirectLink:
-    """A cable within the program, for simulations that need no operating system."""
+    """A link within the program."""
 
     url = "simulated:"
 
@@ -55,7 +52,7 @@ class DirectLink:
         self._written, self._readable = bytearray(), bytearray()
 
     def open(self) -> Port:
-        """Return this end of the cable."""
+        """Return the host's end, emptied."""
         self._require_plug()
         self._written.clear()
         self._readable.clear()
@@ -74,7 +71,7 @@ class DirectLink:
         return data
 
     def close(self) -> None:
-        """Give this end back."""
+        """Do nothing: the link needs no closing."""
 
     def receive(self, count: int) -> bytes:
         """Return `count` bytes that the host has written."""
@@ -87,7 +84,7 @@ class DirectLink:
         self._readable += data
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         self._plugged = True
 
     def unplug(self) -> None:
@@ -95,15 +92,15 @@ class DirectLink:
         self._plugged = False
 
     def _require_plug(self) -> None:
-        """Fail as a port does whose cable is out."""
+        """Raise `StageLost` as a port does when its cable is unplugged."""
         if not self._plugged:
-            raise StageLost("simulated: the connection is gone (unplugged); check cable and power")
+            raise StageLost("simulated: the connection is lost (unplugged); check cable and power")
 
 
 class PtyLink:
-    """A pseudo-terminal: to the driver, a serial port like any other.
+    """A pseudo-terminal, which is a serial port to the driver.
 
-    The name of the port is a symbolic link, so that it stays the same when the cable is put in again.
+    Its name is a symbolic link, so that it stays the same when the cable is plugged in again.
     """
 
     def __init__(self) -> None:
@@ -128,7 +125,7 @@ class PtyLink:
         os.write(self._far, data)
 
     def plug(self) -> None:
-        """Put the cable in."""
+        """Plug the cable in."""
         if self._far >= 0:
             return
         self._far, near = os.openpty()
@@ -148,65 +145,3 @@ class PtyLink:
         """Remove the port."""
         self.unplug()
         self._folder.cleanup()
-
-
-class SocketLink:
-    """A TCP connection on this computer, which pyserial opens by `socket://`, as to a serial device server."""
-
-    def __init__(self) -> None:
-        self._listener: socket.socket | None = None
-        self._far: socket.socket | None = None
-        self._address = ("127.0.0.1", 0)
-        self.plug()
-
-    @property
-    def url(self) -> str:
-        """What the driver opens."""
-        host, port = self._address
-        return f"socket://{host}:{port}"
-
-    def open(self) -> Port:
-        """Open the host's end with pyserial."""
-        port = SerialPort(self.url, 115200)
-        if self._listener is not None:
-            self._hang_up()
-            self._far, _ = self._listener.accept()
-            self._far.settimeout(_REAL_BOUND_S)
-            self._far.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return port
-
-    def receive(self, count: int) -> bytes:
-        """Return `count` bytes that the host has written."""
-        data = b""
-        while self._far is not None and len(data) < count:
-            data += self._far.recv(count - len(data))
-        return data
-
-    def send(self, data: bytes) -> None:
-        """Write bytes for the host to read."""
-        if self._far is not None:
-            self._far.sendall(data)
-
-    def plug(self) -> None:
-        """Put the cable in."""
-        if self._listener is None:
-            self._listener = socket.create_server(self._address, reuse_port=True)
-            self._listener.settimeout(_REAL_BOUND_S)
-            self._address = self._listener.getsockname()[:2]
-
-    def unplug(self) -> None:
-        """Pull the cable out."""
-        self._hang_up()
-        if self._listener is not None:
-            self._listener.close()
-            self._listener = None
-
-    def close(self) -> None:
-        """Stop listening."""
-        self.unplug()
-
-    def _hang_up(self) -> None:
-        """End the connection there is."""
-        if self._far is not None:
-            self._far.close()
-            self._far = None

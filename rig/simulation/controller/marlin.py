@@ -1,48 +1,56 @@
-"""A simulated Marlin 2.1 controller, faithful where a driver could be caught out.
+"""A simulated Marlin 2.1 controller, with the peculiarities that a driver must cope with.
 
-Among what it does like the real one: numbered lines with checksums, asked for again with an `ok` that acknowledges
-nothing; targets outside the travel are silently clipped; M114 tells where the stage was sent, M114 R where it is; an
-emergency stop drops motion without slowing down; motors let go after two idle minutes unless told otherwise; and a
-controller that was killed says nothing more until it is restarted.
+As in the real one, a damaged numbered line is asked for again with an `ok` that acknowledges nothing; targets outside
+the travel are silently clipped; M114 reports the last target and M114 R the real position; an emergency stop ends
+motion without slowing down; the motors are released after two idle minutes unless set otherwise; and a killed
+controller is silent until it is restarted.
 """
 
 import re
-from collections import deque
 from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
+from faintfield.rig.simulation.controller.gcode import words
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
 from faintfield.rig.simulation.controller.wire import Wire
-from faintfield.rig.stages.settings import ProtocolName
 
+# Motions that the planner holds.
 _PLANNER_BLOCKS = 16
+
+# Interval in s of the busy messages while a command is executed.
 _BUSY_EVERY_S = 2.0
-_WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
-_BUMP_MM = 5.0
+
+# Idle time in s after which the motors are released.
+_RELEASE_AFTER_S = 120.0
+
+# Speed of homing in mm/s, and how far in mm it backs off a switch before it approaches again.
+_SEEK_MM_PER_S, _BUMP_MM = 25.0, 5.0
 
 
-class SimulatedMarlin:
-    """The firmware, its settings memory and the mechanics it drives.
+class SimulatedMarlin(SimulatedFirmware):
+    """Firmware, settings and mechanics of a Marlin stage.
 
     Parameters
     ----------
     clock : SimulatedClock
-        The world's time.
+        The simulated time.
     wire : Wire
-        Where it talks.
+        The serial line to the host.
     travel_mm : (float, float)
-        Lengths of the axes; coordinates run from zero, where the switches are, upwards.
+        Lengths of the axes; coordinates run upwards from zero, where the switches are.
     boot_s : float
-        Time from a restart to the first word.
+        Time from a restart to the first line.
     play_mm : float
         Play in both drives.
     realtime_position : bool
-        Whether M114 R tells the real position.
+        Whether M114 R reports the real position.
     """
 
-    protocol: ProtocolName = "marlin"
+    protocol = "marlin"
+    _line_end = b"\n"
 
     def __init__(
         self,
@@ -54,37 +62,21 @@ class SimulatedMarlin:
         play_mm: float = 0.0,
         realtime_position: bool = True,
     ) -> None:
-        self.clock = clock
-        self.wire = wire
         self.travel_mm = travel_mm
-        self.boot_s = boot_s
-        self.homing_slowdown = 1.0
         self.settings = {"M92": 80.0, "M203": 100.0, "M201": 500.0, "M204": 500.0}
-        self.seek_mm_per_s = 25.0
         self._realtime_position = realtime_position
-        axes = [Axis(-2.0, length + 5.0, 0.5 * length, play_mm) for length in travel_mm]
-        self.mechanics = Mechanics(
-            clock, (axes[0], axes[1]), 1.0 / self.settings["M92"], (0.0, 0.0), switch_at_high_end=False
-        )
-        self.mechanics.on_idle = self._motion_ended
-        self._boot: Event | None = None
-        self._pause: Event | None = None
-        self._motors_off: Event | None = None
-        self.restart()
+        self._motors_off: ScheduledEvent | None = None
+        x, y = (Axis(-2.0, length + 5.0, 0.5 * length, play_mm) for length in travel_mm)
+        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings["M92"], (0.0, 0.0), switch_at_high_end=False)
+        super().__init__(clock, wire, mechanics, boot_s)
 
-    def restart(self) -> None:
-        """Start anew, as after power-up: the count is lost, the settings stay."""
-        self.mechanics.stop_dead()
-        self.mechanics.set_count((0.0, 0.0))
-        self.wire.clear()
-        for event in (self._boot, self._pause, self._motors_off):
-            if event is not None:
-                event.cancel()
-        self.alive, self.homed, self._idle_limit_s = False, [False, False], 120.0
+    def _reset_state(self) -> None:
+        """Forget homing, modes and line numbers, and ignore the host until the greeting."""
+        if self._motors_off is not None:
+            self._motors_off.cancel()
+        self.alive, self.homed, self._idle_limit_s = False, [False, False], _RELEASE_AFTER_S
         self._relative, self._last_line = False, 0
-        self._line, self._waiting = bytearray(), deque[str]()
         self._awaited: Callable[[], bool] | None = None
-        self._boot = self.clock.after(self.boot_s, self._booted)
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host."""
@@ -102,26 +94,22 @@ class SimulatedMarlin:
                 self._waiting.append(line)
         self._run_lines()
 
-    def say(self, text: str) -> None:
-        """Send one line."""
-        self.wire.to_host(text.encode("ascii", errors="replace") + b"\n")
-
     def kill(self, reason: str) -> None:
-        """Stop for good, as after a failure of the hardware."""
+        """Halt until a restart, as after a failure of the hardware."""
         self.mechanics.stop_dead()
         self.say(f"Error:{reason}")
         self.say("Error:Printer halted. kill() called!")
         self.alive = False
 
     def _booted(self) -> None:
-        """Finish starting."""
+        """Send the greeting."""
         self.alive = True
         for text in ("start", "echo:Marlin 2.1.2.4", "echo: Last Updated: 2024-06-01", "echo:EEPROM OK"):
             self.say(text)
         self._watch_idle()
 
     def _run_lines(self) -> None:
-        """Run lines as long as there are some and nothing is waited for."""
+        """Run waiting lines until one has to wait for a motion or the planner is full."""
         while self._waiting and self.alive and self._awaited is None:
             if self.mechanics.queued() >= _PLANNER_BLOCKS:
                 return
@@ -131,7 +119,7 @@ class SimulatedMarlin:
                 self._run(command)
 
     def _checked(self, line: str) -> str | None:
-        """Return the command in a line, None if it has to be sent again."""
+        """Return the command in a line, or None after asking for the line again."""
         found = re.fullmatch(r"N(\d+) (.*)\*(\d+)", line)
         if not found:
             if not line.startswith("N"):
@@ -143,7 +131,7 @@ class SimulatedMarlin:
             return None
         number, command = int(found[1]), found[2]
         if command.startswith("M110"):
-            self._last_line = int(dict(_WORD.findall(command)).get("N", number))
+            self._last_line = int(words(command).get("N", number))
             return command
         if number != self._last_line + 1:
             self._ask_again("Line Number is not Last Line Number+1")
@@ -152,7 +140,7 @@ class SimulatedMarlin:
         return command
 
     def _ask_again(self, why: str) -> None:
-        """Say that a line was not understood and which is wanted."""
+        """Report a damaged line and ask for the next number."""
         self._waiting.clear()
         self.say(f"Error:{why}, Last Line: {self._last_line}")
         self.say(f"Resend: {self._last_line + 1}")
@@ -161,7 +149,7 @@ class SimulatedMarlin:
     def _run(self, command: str) -> None:
         """Run one command and answer it."""
         name = command.split(" ", 1)[0]
-        words = {letter: float(value) for letter, value in _WORD.findall(command)[1:]}
+        parameters = words(command[len(name) :])
         blocking: dict[str, Callable[[], None]] = {
             "G28": lambda: self._home([i for i in (0, 1) if "XY"[i] in command[3:]] or [0, 1]),
             "M400": lambda: self._await(lambda: not self.mechanics.moving),
@@ -170,11 +158,11 @@ class SimulatedMarlin:
             blocking[name]()
             return
         immediate: dict[str, Callable[[], None]] = {
-            "G0": lambda: self._move(words),
-            "G1": lambda: self._move(words),
+            "G0": lambda: self._move(parameters),
+            "G1": lambda: self._move(parameters),
             "G90": lambda: setattr(self, "_relative", False),
             "G91": lambda: setattr(self, "_relative", True),
-            "M84": lambda: self._release_after(words.get("S")),
+            "M84": lambda: self._release_after(parameters.get("S")),
             "M114": lambda: self._tell_position(real="R" in command),
             "M115": self._tell_capabilities,
             "M118": lambda: self.say(command[5:]),
@@ -188,20 +176,20 @@ class SimulatedMarlin:
             self.say(f'echo:Unknown command: "{command}"')
         self.say("ok")
 
-    def _move(self, words: dict[str, float]) -> None:
+    def _move(self, parameters: dict[str, float]) -> None:
         """Plan a straight motion, clipped to the travel of homed axes."""
         start = self.mechanics.planned_mm()
         target = []
         for i, axis in enumerate("XY"):
-            value = start[i] if axis not in words else words[axis] + (start[i] if self._relative else 0.0)
+            value = parameters[axis] + (start[i] if self._relative else 0.0) if axis in parameters else start[i]
             target.append(min(max(value, 0.0), self.travel_mm[i]) if self.homed[i] else value)
-        speed = min(words.get("F", 6000.0) / 60.0, along([self.settings["M203"]] * 2, start, target))
+        speed = min(parameters.get("F", 6000.0) / 60.0, along([self.settings["M203"]] * 2, start, target))
         acceleration = min(self.settings["M204"], along([self.settings["M201"]] * 2, start, target))
         self.mechanics.queue(target, speed, acceleration)
         self._watch_idle()
 
     def _home(self, axes: list[int]) -> None:
-        """Begin homing, one axis after the other: seek, back off, seek slowly."""
+        """Start homing, one axis after the other: seek, back off, seek slowly."""
         seconds = 0.0
         distances = self.mechanics.homing_distances_mm()
         lost = False
@@ -209,14 +197,14 @@ class SimulatedMarlin:
             stuck = self.mechanics.axes[axis].stuck
             lost = lost or stuck
             distance = 1.5 * self.travel_mm[axis] if stuck else distances[axis]
-            seconds += (distance + _BUMP_MM) / self.seek_mm_per_s + 2.0 * _BUMP_MM / self.seek_mm_per_s
+            seconds += (distance + _BUMP_MM) / _SEEK_MM_PER_S + 2.0 * _BUMP_MM / _SEEK_MM_PER_S
         self._awaited = lambda: False
         finish = (lambda: self.kill("Homing Failed")) if lost else (lambda: self._homed(axes))
-        self._pause = self.clock.after(self.homing_slowdown * seconds, finish)
+        self._start_homing(seconds, finish)
         self._say_busy()
 
     def _homed(self, axes: list[int]) -> None:
-        """End homing: the axes stand at their switches, counted as zero."""
+        """End homing: the axes stand at their switches, which are zero."""
         for axis in axes:
             self.mechanics.set_homed(axis, 0.0, 0.0)
             self.homed[axis] = True
@@ -226,7 +214,7 @@ class SimulatedMarlin:
         self._run_lines()
 
     def _await(self, done: Callable[[], bool]) -> None:
-        """Answer when something is done, saying meanwhile that it is not."""
+        """Answer when `done`, and report busy until then."""
         if done():
             self.say("ok")
             return
@@ -234,7 +222,7 @@ class SimulatedMarlin:
         self._say_busy()
 
     def _say_busy(self) -> None:
-        """Say every two seconds that a command is at work."""
+        """Report at intervals that a command is still being executed."""
 
         def again() -> None:
             if self._awaited is not None and self.alive:
@@ -244,7 +232,7 @@ class SimulatedMarlin:
         self.clock.after(_BUSY_EVERY_S, again)
 
     def _motion_ended(self) -> None:
-        """Note that nothing moves any more."""
+        """Answer the command that waits for the end of the last motion."""
         self._watch_idle()
         if self._awaited is not None and self._awaited():
             self._awaited = None
@@ -252,7 +240,7 @@ class SimulatedMarlin:
         self._run_lines()
 
     def _release_after(self, seconds: float | None) -> None:
-        """Set after how long motors let go; 0 is never, none is now."""
+        """Set the idle time until the motors are released: 0 means never, None at once."""
         if seconds is None:
             self.release_motors()
             return
@@ -260,7 +248,7 @@ class SimulatedMarlin:
         self._watch_idle()
 
     def _watch_idle(self) -> None:
-        """Let the motors go when nothing moves for the limit."""
+        """Release the motors when nothing has moved for the idle limit."""
         if self._motors_off is not None:
             self._motors_off.cancel()
             self._motors_off = None
@@ -268,15 +256,14 @@ class SimulatedMarlin:
             self._motors_off = self.clock.after(self._idle_limit_s, self.release_motors)
 
     def release_motors(self) -> None:
-        """Let the motors go: the carriages sag by a millimetre, and nobody counts it."""
+        """Release the motors: the carriages sag by a millimetre, which is not counted."""
         self.homed = [False, False]
         for axis in self.mechanics.axes:
             axis.slip_mm += 1.0
 
     def _tell_position(self, *, real: bool) -> None:
         """Answer M114."""
-        told = self.mechanics.commanded_mm() if real and self._realtime_position else self.mechanics.planned_mm()
-        x, y = told
+        x, y = self.mechanics.commanded_mm() if real and self._realtime_position else self.mechanics.planned_mm()
         counts = [round(value * self.settings["M92"]) for value in self.mechanics.commanded_mm()]
         self.say(f"X:{x:.2f} Y:{y:.2f} Z:0.00 E:0.00 Count X:{counts[0]} Y:{counts[1]} Z:0")
 

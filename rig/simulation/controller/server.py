@@ -1,4 +1,4 @@
-"""A simulated controller on a pseudo-terminal in real time, for programs that run beside it."""
+"""Serves a simulated controller on a pseudo-terminal in real time, for other programs."""
 
 import os
 import select
@@ -8,27 +8,28 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from faintfield.rig.simulation.controller.bench import Firmware
 from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import Wire
 
-_LONGEST_NAP_S = 0.05
+# Longest wait in s between two looks at the port.
+_MAX_WAIT_S = 0.05
 
 
 @dataclass
 class Server:
-    """A simulated controller and the port by which it is reached.
+    """A simulated controller and its port.
 
     Parameters
     ----------
     port : str
-        What other programs open.
+        Device that other programs open.
     """
 
     port: str
     _clock: SimulatedClock
     _wire: Wire
-    _firmware: Firmware
+    _firmware: SimulatedFirmware
     _far: int
 
     def run(self, speed: float = 1.0) -> None:
@@ -37,17 +38,17 @@ class Server:
         Parameters
         ----------
         speed : float
-            How many simulated seconds pass in one real one.
+            Simulated seconds per real second.
         """
         begun_s = time.monotonic()
         while True:
             self.turn(speed * (time.monotonic() - begun_s))
             next_s = self._clock.next_event_s()
-            nap_s = _LONGEST_NAP_S if next_s is None else (next_s - self._clock.now_s()) / speed
-            select.select([self._far], [], [], min(_LONGEST_NAP_S, max(0.0, nap_s)))
+            wait_s = _MAX_WAIT_S if next_s is None else (next_s - self._clock.now_s()) / speed
+            select.select([self._far], [], [], min(_MAX_WAIT_S, max(0.0, wait_s)))
 
     def turn(self, now_s: float) -> None:
-        """Let the simulated time reach `now_s`, and pass on what either side has to say."""
+        """Advance simulated time to `now_s`, and pass on the bytes in both directions."""
         self._clock.sleep_s(max(0.0, now_s - self._clock.now_s()))
         if self._wire.arrived():
             os.write(self._far, self._wire.take())
@@ -56,8 +57,8 @@ class Server:
 
 
 @contextmanager
-def serving(firmware: Callable[[SimulatedClock, Wire], Firmware]) -> Iterator[Server]:
-    """Open a pseudo-terminal with a simulated controller behind it, and close it in the end.
+def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
+    """Open a pseudo-terminal with a simulated controller behind it, and close it at the end.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def serving(firmware: Callable[[SimulatedClock, Wire], Firmware]) -> Iterator[Se
     far, near = os.openpty()
     tty.setraw(near)
     try:
-        # The near end stays open here, so that programs can come and go.
+        # The near end stays open, so that programs can connect again.
         yield Server(os.ttyname(near), clock, wire, firmware(clock, wire), far)
     finally:
         os.close(far)

@@ -1,67 +1,70 @@
-"""The serial wire between host and controller: its pace, and what happens to bytes on the way."""
+"""The simulated serial wire: its speed, and filters that change bytes on the way."""
 
 from collections.abc import Callable
 
-from faintfield.rig.simulation.controller.clock import Event, SimulatedClock
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 
+# At 115200 baud; a byte takes ten bits.
 _SECONDS_PER_BYTE = 10.0 / 115200.0
+
+# Time in s until the controller's first byte is on the wire.
 _LATENCY_S = 0.002
 
-type Spoil = Callable[[bytes], bytes]
-"""Turns bytes that pass into those that arrive."""
+type ByteFilter = Callable[[bytes], bytes]
+"""Returns the bytes that arrive for the bytes that were sent."""
 
 
 class Wire:
-    """Carries bytes both ways, at 115200 baud, through whatever spoils them.
+    """Carries bytes in both directions at 115200 baud, through filters.
 
     Parameters
     ----------
     clock : SimulatedClock
-        The world's time.
+        The simulated time.
 
     Attributes
     ----------
-    spoil_to_controller, spoil_to_host : list
-        What happens to bytes on the way, in order; faults add to it.
+    filters_to_controller, filters_to_host : list
+        Filters of the bytes, in order; faults add filters.
     connected : bool
-        Whether the cable is in.
+        Whether the cable is plugged in.
     """
 
     def __init__(self, clock: SimulatedClock) -> None:
-        self.spoil_to_controller: list[Spoil] = []
-        self.spoil_to_host: list[Spoil] = []
+        self.filters_to_controller: list[ByteFilter] = []
+        self.filters_to_host: list[ByteFilter] = []
         self.connected = True
         self._clock = clock
         self._free_at_s = 0.0
         self._arrived = bytearray()
-        self._under_way: list[Event] = []
+        self._under_way: list[ScheduledEvent] = []
 
     def to_controller(self, data: bytes) -> bytes:
-        """Return what arrives at the controller of what the host sends."""
-        return _spoilt(data, self.spoil_to_controller)
+        """Return the bytes that arrive at the controller when the host sends `data`."""
+        return _filtered(data, self.filters_to_controller)
 
     def to_host(self, data: bytes) -> None:
-        """Put what the controller says on the wire, behind what is on it."""
+        """Send `data` to the host, after what is already on the wire."""
         now_s = self._clock.now_s()
         self._free_at_s = max(self._free_at_s, now_s + _LATENCY_S) + len(data) * _SECONDS_PER_BYTE
         self._under_way.append(self._clock.after(self._free_at_s - now_s, lambda: self._arrive(data)))
 
     def hold_up(self, duration_s: float) -> None:
-        """Let nothing more through to the host for a while; it arrives afterwards."""
+        """Delay all further bytes to the host by `duration_s`."""
         self._free_at_s = self._clock.now_s() + duration_s
 
     def arrived(self) -> bool:
-        """Return whether bytes wait for the host."""
+        """Return whether bytes have arrived at the host."""
         return bool(self._arrived)
 
     def take(self) -> bytes:
-        """Return the bytes that have arrived at the host."""
+        """Return and remove the bytes that have arrived at the host."""
         data = bytes(self._arrived)
         self._arrived.clear()
         return data
 
     def clear(self) -> None:
-        """Lose what is under way or not yet read."""
+        """Discard the bytes that are under way or not yet read."""
         for event in self._under_way:
             event.cancel()
         self._under_way.clear()
@@ -69,14 +72,14 @@ class Wire:
         self._free_at_s = 0.0
 
     def _arrive(self, data: bytes) -> None:
-        """Let the host have `data`, if the cable is in."""
+        """Deliver `data` to the host, if the cable is plugged in."""
         del self._under_way[0]
         if self.connected:
-            self._arrived += _spoilt(data, self.spoil_to_host)
+            self._arrived += _filtered(data, self.filters_to_host)
 
 
-def _spoilt(data: bytes, spoils: list[Spoil]) -> bytes:
-    """Return `data` after everything that happens to it."""
-    for spoil in tuple(spoils):
-        data = spoil(data)
+def _filtered(data: bytes, filters: list[ByteFilter]) -> bytes:
+    """Return `data` after all filters."""
+    for apply in tuple(filters):
+        data = apply(data)
     return data

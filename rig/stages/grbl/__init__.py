@@ -1,1 +1,1 @@
-"""GRBL 1.1 and grblHAL."""
+"""The driver for GRBL 1.1 and grblHAL."""

@@ -1,11 +1,13 @@
-"""The lines that GRBL 1.1 sends, each read strictly into one kind of message.
+"""Parses the lines that GRBL 1.1 sends, each into one type of message.
 
-Responses (`ok`, `error:N`) answer commands; everything else is pushed and answers nothing. A line that is not exactly
-of a known form is `Unknown`: a damaged line must never pass for an answer.
+Responses (`ok`, `error:N`) answer commands; GRBL sends all other lines unasked. A line that does not match a known form
+exactly is `Unknown`, so that a damaged line is never taken for a response.
 """
 
 import re
 from dataclasses import dataclass
+
+from faintfield.rig.stages.messages import Ok, Unknown
 
 _NUMBER = r"-?\d{1,7}(?:\.\d{1,6})?"
 _VECTOR = rf"{_NUMBER}(?:,{_NUMBER}){{1,5}}"
@@ -22,13 +24,8 @@ _PINS = re.compile(r"\|Pn:([A-Z]+)(?=\||$)")
 
 
 @dataclass(frozen=True, slots=True)
-class Ok:
-    """The command was parsed and accepted; motion may still be under way."""
-
-
-@dataclass(frozen=True, slots=True)
-class Error:
-    """The command was refused."""
+class ErrorCode:
+    """The controller has refused a command."""
 
     code: int
 
@@ -49,7 +46,7 @@ class Banner:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class GrblSetting:
     """One `$` setting."""
 
     number: int
@@ -58,7 +55,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """A bracketed message: its kind (`MSG`, `VER`, `OPT`, ...) and text."""
+    """A message in brackets: its kind (`MSG`, `VER`, `OPT`, ...) and text."""
 
     kind: str
     text: str
@@ -73,13 +70,15 @@ class Report:
     state : str
         Machine state, such as `Idle` or `Jog`.
     substate : int or None
-        Number after the state; `Hold:0` is a finished hold.
+        Number after the state; `Hold:0` means that the stage has come to rest.
     position : tuple of float
-        Machine position where `is_machine`, otherwise work position.
+        Machine position if `is_machine`, otherwise work position (mm).
+    is_machine : bool
+        Whether `position` is in machine coordinates.
     offset : tuple of float or None
-        Work coordinate offset, in those reports that carry it: machine = work + offset.
+        Work coordinate offset (mm), which only some reports carry: machine = work + offset.
     pins : str
-        Letters of the inputs that are active; an axis letter is its limit switch.
+        Letters of the active inputs; the letter of an axis stands for its limit switch.
     """
 
     state: str
@@ -90,28 +89,21 @@ class Report:
     pins: str
 
 
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """Anything else, damaged lines included."""
-
-    text: str
-
-
-type Message = Ok | Error | Alarm | Banner | Setting | Feedback | Report | Unknown
+type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report | Unknown
 
 
 def parse(line: str) -> Message:
-    """Return what `line` says."""
+    """Return `line` as a message."""
     if line == "ok":
         return Ok()
     if found := _REPORT.fullmatch(line):
         return _report(found)
     if found := _ERROR.fullmatch(line):
-        return Error(int(found[1]))
+        return ErrorCode(int(found[1]))
     if found := _ALARM.fullmatch(line):
         return Alarm(int(found[1]))
     if found := _SETTING.fullmatch(line):
-        return Setting(int(found[1]), found[2])
+        return GrblSetting(int(found[1]), found[2])
     if found := _FEEDBACK.fullmatch(line):
         return Feedback(found[1], found[2])
     if found := _BANNER.fullmatch(line):
@@ -120,7 +112,7 @@ def parse(line: str) -> Message:
 
 
 def _report(found: re.Match[str]) -> Report:
-    """Return the status report that the expression has taken apart."""
+    """Return the status report of a match of `_REPORT`."""
     state, substate, frame, position, fields = found.groups()
     offset, pins = _OFFSET.search(fields), _PINS.search(fields)
     return Report(
@@ -134,5 +126,5 @@ def _report(found: re.Match[str]) -> Report:
 
 
 def _vector(text: str) -> tuple[float, ...]:
-    """Return comma-separated numbers."""
+    """Return the numbers of a comma-separated list."""
     return tuple(float(number) for number in text.split(","))

@@ -1,15 +1,19 @@
-"""What GRBL's settings mean for the stage: travel, rates, tolerance, and settings that cannot be driven."""
+"""Derives travel, rates and tolerances from GRBL's settings, and refuses settings that make positions unsafe."""
 
 import re
 from dataclasses import dataclass
 
 from faintfield.rig.errors import WrongFirmware
-from faintfield.rig.stages.motion import patience_s
+from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 
-# Reports and commands carry three decimals: each rounds by half a micrometre.
+# Reports and commands have three decimals, and each rounds by up to half a micrometre.
 _ROUNDING_MM = 0.001
-_SHORTEST_HOMING_BOUND_S = 240.0
+
+# Homing may take this long (s) even where the settings predict less: a slow stage must not fail half way.
+_MIN_HOMING_BOUND_S = 240.0
+
+# The value of $1 that keeps the motors on between motions.
 _KEEP_MOTORS_ON = 255
 
 
@@ -29,7 +33,7 @@ class GrblSettings:
     build: dict[str, str]
 
     def identity(self, axes: tuple[int, ...]) -> Identity:
-        """Return what the stage needs to know of the controller.
+        """Return firmware, travel, rates and tolerances of the controller.
 
         Parameters
         ----------
@@ -39,7 +43,7 @@ class GrblSettings:
         Raises
         ------
         WrongFirmware
-            It is not GRBL 1.1, or a setting makes positions unsafe; the message says what to set.
+            The firmware is not GRBL 1.1, or a setting makes positions unsafe; the message says what to set.
         """
         version = self.build.get("VER", "")
         if not re.match(r"v?1\.1", version):
@@ -71,7 +75,7 @@ class GrblSettings:
             raise WrongFirmware("$13=1: positions are reported in inches; set $13=0")
 
     def _warnings(self) -> list[str]:
-        """Return what should be changed, each with what to do."""
+        """Return settings that should be changed, each with its remedy."""
         warnings = []
         if self._number(20) == 0:
             warnings.append("$20=0: the controller itself does not keep to its travel; set $20=1")
@@ -82,29 +86,30 @@ class GrblSettings:
     def _travel(self, axis: int) -> tuple[float, float]:
         """Return the machine coordinates of the ends of `axis`.
 
-        Homing sets the end that it finds to zero and the travel runs down from there, whichever end it is, unless the
-        firmware was built to make the switch the origin (option Z) and homes to the lower end ($23).
+        Homing sets the end with the switch to zero, and the travel extends to negative coordinates from there. It
+        extends to positive ones if the firmware was built with the switch as origin (option Z) and homes to the lower
+        end ($23).
         """
         length_mm = self._number(130 + axis)
         homes_low = bool(int(self._number(23)) >> axis & 1)
         return (0.0, length_mm) if "Z" in self._options() and homes_low else (-length_mm, 0.0)
 
     def _tolerance(self, axis: int) -> float:
-        """Return half a motor step plus the rounding of reports."""
+        """Return half a motor step plus the rounding of reports, in mm."""
         return 0.5 / self._number(100 + axis) + _ROUNDING_MM
 
     def _homing_bound_s(self, axes: tuple[int, ...]) -> float:
-        """Return a bound for homing: across the travel at the seek rate, and twice the slow search."""
+        """Return a bound for homing: the whole travel at the seek rate, and twice the slow search."""
         seek_s = 60.0 * max(self._number(130 + axis) for axis in axes) / self._number(25)
         locate_s = 4.0 * 60.0 * self._number(27) / self._number(24)
-        return max(_SHORTEST_HOMING_BOUND_S, patience_s(seek_s + locate_s))
+        return max(_MIN_HOMING_BOUND_S, timeout_s(seek_s + locate_s))
 
     def _options(self) -> str:
         """Return the letters of the compile-time options."""
         return self.build.get("OPT", "").partition(",")[0]
 
     def _number(self, setting: int) -> float:
-        """Return a setting; raises `WrongFirmware` when it was not reported or cannot be."""
+        """Return a setting; raises `WrongFirmware` if it was not reported or has an impossible value."""
         value = float(self.values.get(setting, "nan"))
         if not (value > 0.0 or (value == 0.0 and setting < 100 and setting not in (24, 25))):
             raise WrongFirmware(

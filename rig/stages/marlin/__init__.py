@@ -1,1 +1,1 @@
-"""Marlin."""
+"""The driver for Marlin."""

@@ -1,12 +1,14 @@
-"""The lines that Marlin sends, each read strictly into one kind of message, and the lines that it is sent.
+"""Parses the lines that Marlin sends, each into one type of message, and numbers the lines sent to it.
 
-A line that is not exactly of a known form is `Unknown`: a damaged line must never pass for an answer.
+A line that does not match a known form exactly is `Unknown`, so that a damaged line is never taken for an answer.
 """
 
 import re
 from dataclasses import dataclass, field
 from functools import reduce
 from operator import xor
+
+from faintfield.rig.stages.messages import Ok, Unknown
 
 _NUMBER = r"-?\d{1,7}(?:\.\d{1,16})?"
 _AXES = rf"X:\s?{_NUMBER} Y:\s?{_NUMBER}(?: Z:\s?{_NUMBER})?"
@@ -27,18 +29,13 @@ _SWITCH = re.compile(r"([xyz]_(?:min|max)): (open|TRIGGERED)")
 _SETTING = re.compile(rf"(?:echo:)?\s*([MG]\d{{1,4}})((?: [A-Z]{_NUMBER})+)(?: ;.*)?")
 _REFUSAL = re.compile(r"echo:(Unknown command:.*|Home .*First.*)", re.IGNORECASE)
 _START = re.compile(r"start")
-# Errors about a line that arrived damaged: the controller asks for it again and has not executed it.
+# Errors about a damaged line, which the controller has not executed and asks for again.
 _TRANSMISSION = re.compile(r"checksum|line number|expected line", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
-class Ok:
-    """The command was taken, and the next may come."""
-
-
-@dataclass(frozen=True, slots=True)
 class PositionReport:
-    """Where the controller says it is, per axis letter; `is_ok` when the line is the answer as well."""
+    """A position in mm by axis letter; `is_ok` if the line is also the answer to a command."""
 
     axes_mm: dict[str, float]
     is_ok: bool
@@ -46,14 +43,14 @@ class PositionReport:
 
 @dataclass(frozen=True, slots=True)
 class Resend:
-    """The controller waits for the line with this number; the `ok` that follows acknowledges nothing."""
+    """The controller asks for the line with this number; the `ok` that follows acknowledges nothing."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class Busy:
-    """Still at work on the last command."""
+    """The controller is still executing the last command."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +59,8 @@ class Start:
 
 
 @dataclass(frozen=True, slots=True)
-class Error:
-    """An error; `in_transmission` when a line was damaged on its way and nothing else is wrong."""
+class ErrorText:
+    """An error; `in_transmission` if only a line was damaged on its way."""
 
     text: str
     in_transmission: bool
@@ -71,7 +68,7 @@ class Error:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """The command was not executed, although an `ok` will follow."""
+    """The command was not executed, although an `ok` follows."""
 
     text: str
 
@@ -85,7 +82,7 @@ class Firmware:
 
 @dataclass(frozen=True, slots=True)
 class Capability:
-    """Something that the firmware was built with or without."""
+    """A feature that the firmware was built with or without."""
 
     name: str
     present: bool
@@ -93,7 +90,7 @@ class Capability:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The reachable positions: lower and upper x and y."""
+    """The reachable positions: lower and upper end along x and y."""
 
     x_mm: tuple[float, float]
     y_mm: tuple[float, float]
@@ -108,39 +105,32 @@ class Switch:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class MarlinSetting:
     """One line of the settings report: a command and its parameters."""
 
     command: str
     parameters: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class Unknown:
-    """Anything else, damaged lines included."""
-
-    text: str
-
-
 type Message = (
-    Ok | PositionReport | Resend | Busy | Start | Error | Refusal
-    | Firmware | Capability | Limits | Switch | Setting | Unknown
+    Ok | PositionReport | Resend | Busy | Start | ErrorText | Refusal
+    | Firmware | Capability | Limits | Switch | MarlinSetting | Unknown
 )  # fmt: skip
 
 
 def parse(line: str) -> Message:
-    """Return what `line` says."""
+    """Return `line` as a message."""
     return _parse_answer(line) or _parse_description(line) or Unknown(line)
 
 
 def numbered(number: int, command: str) -> bytes:
-    """Return `command` as a line that arrives whole or is asked for again: its number and the XOR of its bytes."""
+    """Return `command` with its line number and the XOR of its bytes, so that Marlin recognises a damaged line."""
     line = f"N{number} {command}".encode("ascii")
     return line + b"*%d\n" % reduce(xor, line)
 
 
 def _parse_answer(line: str) -> Message | None:
-    """Return `line` as one of the messages that drive the exchange."""
+    """Return `line` as a message that answers a command or reports a problem, or None."""
     if _OK.fullmatch(line):
         return Ok()
     if found := _POSITION.fullmatch(line):
@@ -155,12 +145,12 @@ def _parse_answer(line: str) -> Message | None:
     if found := _REFUSAL.fullmatch(line):
         return Refusal(found[1])
     if found := _ERROR.fullmatch(line):
-        return Error(found[1], in_transmission=_TRANSMISSION.search(found[1]) is not None)
+        return ErrorText(found[1], in_transmission=_TRANSMISSION.search(found[1]) is not None)
     return None
 
 
 def _parse_description(line: str) -> Message | None:
-    """Return `line` as one of the messages by which the controller describes itself."""
+    """Return `line` as a message that describes the controller, or None."""
     if found := _FIRMWARE.fullmatch(line):
         return Firmware(found[1])
     if found := _CAPABILITY.fullmatch(line):
@@ -171,5 +161,5 @@ def _parse_description(line: str) -> Message | None:
     if found := _SWITCH.fullmatch(line):
         return Switch(found[1], found[2] == "TRIGGERED")
     if found := _SETTING.fullmatch(line):
-        return Setting(found[1], {word[0]: float(word[1:]) for word in found[2].split()})
+        return MarlinSetting(found[1], {word[0]: float(word[1:]) for word in found[2].split()})
     return None

@@ -1,4 +1,4 @@
-"""What Marlin's settings mean for the stage: travel, rates, tolerance."""
+"""Derives travel, rates and tolerances from what Marlin reports."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,26 +6,28 @@ from functools import reduce
 from typing import Self
 
 from faintfield.rig.errors import WrongFirmware
-from faintfield.rig.stages.marlin import messages as marlin
+from faintfield.rig.stages.marlin.messages import Capability, Firmware, Limits, MarlinSetting, Message
 from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 
-# Reports carry two decimals, commands three: each rounds by half of its last.
+# Reports have two decimals and commands three; each rounds by up to half of its last digit.
 _ROUNDING_MM = 0.0055
+
+# Homing may take this long (s); the settings that are read contain no homing speed to compute it from.
 _HOMING_BOUND_S = 240.0
 
 
 @dataclass(frozen=True)
 class MarlinSettings:
-    """What one controller said of itself.
+    """What one controller has reported.
 
     Parameters
     ----------
     firmware : str
         Name and version.
     capabilities : dict
-        What it was built with (M115).
+        Features that it was built with or without (M115).
     parameters : dict
-        Command to parameters, from the settings report (M503).
+        Parameters by command, from the settings report (M503).
     limits : tuple of Limits
         Reachable positions (M115, M211).
     """
@@ -33,34 +35,34 @@ class MarlinSettings:
     firmware: str
     capabilities: dict[str, bool]
     parameters: dict[str, dict[str, float]]
-    limits: tuple[marlin.Limits, ...]
+    limits: tuple[Limits, ...]
 
     @classmethod
-    def from_messages(cls, messages: Iterable[marlin.Message]) -> Self:
-        """Collect what concerns the stage from all that was said."""
-        said = tuple(messages)
-        names = [m.name for m in said if isinstance(m, marlin.Firmware)]
+    def from_messages(cls, messages: Iterable[Message]) -> Self:
+        """Collect the settings from messages."""
+        received = tuple(messages)
+        names = [m.name for m in received if isinstance(m, Firmware)]
         return cls(
             firmware=names[0] if names else "",
-            capabilities={m.name: m.present for m in said if isinstance(m, marlin.Capability)},
-            parameters={m.command: m.parameters for m in said if isinstance(m, marlin.Setting)},
-            limits=tuple(m for m in said if isinstance(m, marlin.Limits)),
+            capabilities={m.name: m.present for m in received if isinstance(m, Capability)},
+            parameters={m.command: m.parameters for m in received if isinstance(m, MarlinSetting)},
+            limits=tuple(m for m in received if isinstance(m, Limits)),
         )
 
     def identity(self, axes: tuple[str, str], travel_mm: Box | None) -> Identity:
-        """Return what the stage needs to know of the controller.
+        """Return firmware, travel, rates and tolerances of the controller.
 
         Parameters
         ----------
         axes : (str, str)
             The controller's letters for the two axes.
         travel_mm : Box, optional
-            The travel, for firmware that does not tell it.
+            The travel, for firmware that does not report it.
 
         Raises
         ------
         WrongFirmware
-            It is not Marlin, or does not tell what is needed.
+            The firmware is not Marlin, or does not report a setting that is needed.
         """
         if "marlin" not in self.firmware.lower():
             raise WrongFirmware(
@@ -88,36 +90,38 @@ class MarlinSettings:
         )
 
     def _travel(self, axes: tuple[str, str], configured: Box | None) -> Box:
-        """Return the positions that every source of limits allows."""
+        """Return the positions that all reported limits allow."""
         boxes = [Box(limits.x_mm, limits.y_mm) for limits in self.limits] if axes == ("X", "Y") else []
         if boxes:
             return reduce(Box.intersection, boxes)
         if configured is None:
-            raise WrongFirmware("the controller does not tell its travel (M115, M211); set stage.travel_mm")
+            raise WrongFirmware("the controller does not report its travel (M115, M211); set stage.travel_mm")
         return configured
 
     def _warnings(self) -> list[str]:
-        """Return what should be changed, each with what to do."""
+        """Return settings that should be changed, each with its remedy."""
         warnings = []
         if not self.limits:
-            warnings.append("the controller tells no limits: those in stage.travel_mm are all there is; check them")
+            warnings.append(
+                "the controller reports no limits: only stage.travel_mm keeps the stage inside its travel; check it"
+            )
         if not self.capabilities.get("EMERGENCY_PARSER", False):
             warnings.append("no emergency parser: a motion cannot be stopped half way; enable EMERGENCY_PARSER")
         return warnings
 
     def _tolerance(self, axis: str) -> float:
-        """Return half a motor step plus the rounding of reports."""
+        """Return half a motor step plus the rounding of reports, in mm."""
         return 0.5 / self._number("M92", axis) + _ROUNDING_MM
 
     def _as_text(self) -> dict[str, str]:
-        """Return the settings as they would be typed, by command."""
+        """Return the parameters as text, by command."""
         return {
             command: " ".join(f"{letter}{value:g}" for letter, value in parameters.items())
             for command, parameters in sorted(self.parameters.items())
         }
 
     def _number(self, command: str, letter: str) -> float:
-        """Return one parameter; raises `WrongFirmware` when it was not reported or cannot be."""
+        """Return one parameter; raises `WrongFirmware` if it was not reported or has an impossible value."""
         value = self.parameters.get(command, {}).get(letter)
         if value is None or value <= 0.0:
             raise WrongFirmware(

@@ -1,4 +1,4 @@
-"""The contract of a camera, which every implementation must keep."""
+"""The contract of a camera, which every implementation must meet."""
 
 import pytest
 
@@ -7,15 +7,15 @@ from faintfield.rig.errors import CameraError
 
 
 def check_camera(camera: Camera, exposure_s: float) -> None:
-    """Take a closed camera through its whole life.
+    """Check a closed camera, from opening to closing.
 
-    `exposure_s` must be a time that it offers.
+    `exposure_s` must be one of its exposure times.
     """
     _check_closed(camera, exposure_s)
     camera.open()
     _check_report(camera, exposure_s)
     _check_exposures(camera, exposure_s)
-    camera.open()  # opening anew is how a capture goes on after a failure
+    camera.open()  # a capture opens the camera again after a failure
     _check_exposures(camera, exposure_s)
     camera.close()
     camera.close()

@@ -1,4 +1,4 @@
-"""Every camera keeps the contract; gphoto2 and Micro-Manager with the real libraries and their own virtual cameras."""
+"""Every camera meets the contract; gphoto2 and Micro-Manager with the real libraries and their virtual cameras."""
 
 import importlib
 import math
@@ -16,8 +16,8 @@ from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
-from faintfield.rig.cameras.simulated import TRUE_POSE, SimulatedCamera
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
+from faintfield.rig.simulation.camera import TRUE_POSE, SimulatedCamera
 from faintfield.rig.simulation.controller.clock import SimulatedClock
 from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.protocol import Point
@@ -38,7 +38,7 @@ def test_the_simulated_camera() -> None:
 
 
 class Incoming(SimulatedClock):
-    """A clock under which files grow, as a camera's program writes them."""
+    """A clock that writes files while time passes, as a camera's program does."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -56,13 +56,13 @@ class Incoming(SimulatedClock):
             del self.coming[:1]
 
     def announce(self, *pieces: bytes) -> None:
-        """Let a new file come, piece by piece."""
+        """Write a new file, piece by piece."""
         self.files += 1
         self.coming = [(f"IMG_{self.files}.NEF", piece) for piece in pieces]
 
 
 class TriggeredFolder(FolderCamera):
-    """A folder whose program takes a picture whenever it is waited for."""
+    """A folder whose program saves a file at each exposure."""
 
     clock: Incoming
 
@@ -92,7 +92,7 @@ def test_a_file_is_taken_only_when_it_has_stopped_growing(incoming: Incoming) ->
     camera = folder_camera(incoming)
     incoming.announce(b"one ", b"", b"two ", b"", b"", b"three")
     exposure = camera.expose(0.1, 1)
-    assert exposure.content == b"one two "  # quiet for three looks; `wait` longer for slower programs
+    assert exposure.content == b"one two "  # the size has not changed in three listings
     assert exposure.suffix == ".nef"
     assert exposure.metadata["camera_file"] == "IMG_1.NEF"
 
@@ -130,7 +130,7 @@ def test_a_file_that_never_ends_and_two_files_at_once(incoming: Incoming) -> Non
 
 
 def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match="is no folder; create it"):
+    with pytest.raises(CameraError, match="is not a folder; create it"):
         FolderCamera(FolderSettings(str(tmp_path / "absent")), SimulatedClock()).open()
 
 
@@ -183,7 +183,7 @@ def test_a_missing_extra_says_what_to_install(
 
 @pytest.fixture(scope="module")
 def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Return the only picture on the card of gphoto2's own virtual camera, which reads its card once per process."""
+    """The only file on the card of gphoto2's virtual camera, which reads its card once per process."""
     gphoto2 = pytest.importorskip("gphoto2", reason="python-gphoto2 is not installed here: its camera is not tried")
     library = Path(gphoto2.__file__).parent / "libgphoto2"
     if not (library / "vusb").is_dir():
@@ -225,7 +225,7 @@ def test_gphoto2_faults(card: Path) -> None:
         GPhoto2Camera(GPhoto2Settings(answer_s=1e-6)).open()
     camera = GPhoto2Camera(GPhoto2Settings())
     camera.open()
-    away = card.rename(card.with_suffix(".away"))  # nothing left to take a picture of: the card is out
+    away = card.rename(card.with_suffix(".away"))  # without its file the virtual camera cannot expose
     with pytest.raises(CameraError, match="failed at an exposure"):
         camera.expose(0.1, 1)
     away.rename(card)

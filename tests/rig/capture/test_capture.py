@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.checks import check_frame
@@ -186,7 +186,7 @@ def test_what_cannot_be_done_is_refused_before_anything_moves() -> None:
         open_rig(real_stage)
 
 
-BOARD = Board("large", 9, 6, 40.0, 30.0)
+BOARD = BoardSettings("large", 9, 6, 40.0, 30.0)
 SWINGING = msgspec.structs.replace(
     SMALL_RIG,
     camera=SimulatedSettings(size_px=(160, 120)),

@@ -1,4 +1,4 @@
-"""The simulated lens against its own forward model, against OpenCV's, and against the cosine law."""
+"""The simulated lens, compared with its forward model, with OpenCV's, and with the cosine law."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""The renderer against closed forms, against rays cast one by one, and against the operator's own code path."""
+"""The renderer, compared with closed forms, with rays cast one by one, and with the operator of `recon`."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane import PlaneOperator
 from faintfield.rig.simulation.optics import SimulatedOptics
-from faintfield.rig.simulation.scene import TexturedPlane, View, render
+from faintfield.rig.simulation.scene import RenderedView, TexturedPlane, render
 
 PINHOLE = SimulatedOptics((41, 31), 100.0, 100.0, 20.0, 15.0, vignetting=False)
 AT_REFERENCE = np.zeros(6)
@@ -49,7 +49,7 @@ def view_of(
     optics: SimulatedOptics = PINHOLE,
     pose: NDArray[np.float64] = AT_REFERENCE,
     samples_per_px: int = 4,
-) -> View:
+) -> RenderedView:
     (view,) = render(planes, optics, pose[np.newaxis], samples_per_px=samples_per_px)
     return view
 

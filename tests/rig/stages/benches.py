@@ -1,13 +1,18 @@
-"""What the tests of drivers share: a stage that is ready, and an ear on the wire."""
+"""What the tests of drivers share: a homed stage, and a record of the serial traffic."""
 
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.settings import StageSettings
 
+type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
+
+CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
+
 
 class Traffic:
-    """A `TrafficLog` that keeps what passes on the wire."""
+    """A `TrafficLog` that keeps all entries."""
 
     def __init__(self) -> None:
         self.entries: list[tuple[float, str, bytes]] = []

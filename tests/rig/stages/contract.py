@@ -1,15 +1,16 @@
-"""The contract of a stage, which every implementation must keep."""
+"""The contract of a stage, which every implementation must meet."""
 
 import math
 
 import pytest
 
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.protocol import Point, Stage
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.protocol import Point
 
 
-def check_stage(stage: Stage) -> None:
-    """Take an unconnected stage through its whole life."""
+def check_stage(stage: Gantry) -> None:
+    """Check an unconnected stage, from connecting to closing."""
     _check_unconnected(stage)
     stage.connect()
     _check_identity(stage)
@@ -22,13 +23,13 @@ def check_stage(stage: Stage) -> None:
     _check_close(stage)
 
 
-def inside(stage: Stage, share_x: float, share_y: float) -> Point:
-    """Return a point at shares of the travel, in hundredths of a millimetre."""
+def inside(stage: Gantry, share_x: float, share_y: float) -> Point:
+    """Return the point at these fractions of the travel, rounded to 0.01 mm."""
     (x0, x1), (y0, y1) = stage.travel().x_mm, stage.travel().y_mm
     return Point(round(x0 + share_x * (x1 - x0), 2), round(y0 + share_y * (y1 - y0), 2))
 
 
-def _check_unconnected(stage: Stage) -> None:
+def _check_unconnected(stage: Gantry) -> None:
     for act in (stage.identify, stage.travel, stage.home, stage.position, stage.switches):
         with pytest.raises(StageLost):
             act()
@@ -37,7 +38,7 @@ def _check_unconnected(stage: Stage) -> None:
     assert not stage.trusted
 
 
-def _check_identity(stage: Stage) -> None:
+def _check_identity(stage: Gantry) -> None:
     identity = stage.identify()
     assert identity.firmware
     assert all(0.0 < tolerance < 0.1 for tolerance in identity.tolerance_mm)
@@ -46,7 +47,7 @@ def _check_identity(stage: Stage) -> None:
     assert identity.homing_bound_s >= 240.0
 
 
-def _check_unhomed(stage: Stage) -> None:
+def _check_unhomed(stage: Gantry) -> None:
     assert not stage.trusted
     target = inside(stage, 0.5, 0.5)
     with pytest.raises(NotHomed):
@@ -55,7 +56,7 @@ def _check_unhomed(stage: Stage) -> None:
         stage.verify_at(*target)
 
 
-def _check_homed(stage: Stage) -> None:
+def _check_homed(stage: Gantry) -> None:
     homing = stage.home()
     assert stage.trusted
     assert homing.position.trusted
@@ -65,7 +66,7 @@ def _check_homed(stage: Stage) -> None:
     assert stage.switches() <= {0, 1}
 
 
-def _check_moves(stage: Stage) -> None:
+def _check_moves(stage: Gantry) -> None:
     for shares in ((0.25, 0.25), (0.5, 0.25), (0.25, 0.5), (0.26, 0.26)):
         target = inside(stage, *shares)
         assert stage.move_to(*target).is_at(target)
@@ -73,7 +74,7 @@ def _check_moves(stage: Stage) -> None:
         assert stage.position().is_at(target)
 
 
-def _check_refusals(stage: Stage) -> None:
+def _check_refusals(stage: Gantry) -> None:
     before = stage.position()
     (x0, x1), (y0, y1) = stage.travel().x_mm, stage.travel().y_mm
     for outside in ((x1 + 0.01, y0 + 5.0), (x0 + 5.0, y0 - 0.01), (math.nan, y0 + 5.0), (math.inf, y1)):
@@ -83,7 +84,7 @@ def _check_refusals(stage: Stage) -> None:
     assert stage.position() == before
 
 
-def _check_distrust(stage: Stage) -> None:
+def _check_distrust(stage: Gantry) -> None:
     x_mm, y_mm = stage.position().point
     with pytest.raises(PositionLost):
         stage.verify_at(x_mm + 2.0 * max(stage.identify().tolerance_mm), y_mm)
@@ -97,7 +98,7 @@ def _check_distrust(stage: Stage) -> None:
     assert stage.trusted
 
 
-def _check_hold_and_recover(stage: Stage) -> None:
+def _check_hold_and_recover(stage: Gantry) -> None:
     stage.recover()
     assert stage.trusted
     stage.hold()
@@ -106,7 +107,7 @@ def _check_hold_and_recover(stage: Stage) -> None:
     assert stage.move_to(*inside(stage, 0.3, 0.3)).trusted
 
 
-def _check_close(stage: Stage) -> None:
+def _check_close(stage: Gantry) -> None:
     stage.close()
     stage.close()
     assert not stage.trusted

@@ -1,10 +1,10 @@
-"""OctoPrint's virtual printer on a TCP port, for a Python that has OctoPrint; it runs as a process of its own.
+"""Serves OctoPrint's virtual printer on a TCP port; runs as a process of its own, in a Python with OctoPrint.
 
     python octoprint_server.py '{"resend_ratio": 0}'
 
-The port's number is the first line on standard output. Every connection meets a printer that has just started. Lines
-on standard input go to the printer as if they had come over the connection: its `!!DEBUG:` commands. Each is answered
-by a line on standard output when the printer has it.
+The first line on standard output is the port's number. Every connection gets a printer that has just started. Lines on
+standard input, such as `!!DEBUG:` commands, go to the printer as if they had come over the connection; each is answered
+by a line on standard output.
 """
 
 import importlib
@@ -19,14 +19,14 @@ PROFILE = {"volume": {"width": 400, "depth": 400, "height": 100, "origin": "lowe
 
 
 class Profiles:
-    """The one printer profile there is."""
+    """The only printer profile."""
 
     def get_current_or_default(self) -> dict[str, Any]:
         return PROFILE
 
 
-class Bench:
-    """Makes printers and connects the newest to whoever has connected."""
+class PrinterServer:
+    """Makes a printer for each connection."""
 
     def __init__(self, changes: dict[str, Any]) -> None:
         self.folder = tempfile.mkdtemp(prefix="octoprint-")
@@ -41,7 +41,7 @@ class Bench:
         self.printer: Any = None
 
     def serve(self, connection: socket.socket) -> None:
-        """Let one connection have a printer of its own until it ends."""
+        """Serve one connection with a printer of its own."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         printer = self.printer = self.make(self.settings, Profiles(), self.folder, read_timeout=0.05)
         threading.Thread(target=self.listen, args=(connection, printer), daemon=True).start()
@@ -55,7 +55,7 @@ class Bench:
         connection.close()
 
     def listen(self, connection: socket.socket, printer: Any) -> None:
-        """Pass what arrives to the printer."""
+        """Pass the lines of a connection to the printer."""
         try:
             # The printer takes one line per write, as OctoPrint itself sends them.
             for line in connection.makefile("rb"):
@@ -66,7 +66,7 @@ class Bench:
         printer.outgoing = None
 
     def obey(self) -> None:
-        """Pass lines of standard input to the printer, and say so."""
+        """Pass lines of standard input to the printer, and confirm each."""
         for line in sys.stdin:
             self.printer.write(line.encode("ascii"))
             sys.stdout.write("passed on\n")
@@ -74,8 +74,8 @@ class Bench:
 
 
 def main() -> None:
-    """Serve until the parent goes away."""
-    bench = Bench(json.loads(sys.argv[1]))
+    """Serve until the parent process ends."""
+    server = PrinterServer(json.loads(sys.argv[1]))
     listener = socket.create_server(("127.0.0.1", 0))
     sys.stdout.write(f"{listener.getsockname()[1]}\n")
     sys.stdout.flush()
@@ -83,10 +83,10 @@ def main() -> None:
     def accept() -> None:
         while True:
             connection, _ = listener.accept()
-            threading.Thread(target=bench.serve, args=(connection,), daemon=True).start()
+            threading.Thread(target=server.serve, args=(connection,), daemon=True).start()
 
     threading.Thread(target=accept, daemon=True).start()
-    bench.obey()
+    server.obey()
 
 
 if __name__ == "__main__":

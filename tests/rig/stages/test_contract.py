@@ -1,22 +1,19 @@
-"""Every stage keeps the contract, over every kind of connection."""
+"""Every stage meets the contract, over every kind of connection."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink, SocketLink
-from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink
 from faintfield.rig.stages.conformance import conformance
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
+from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.contract import check_stage
+from tests.rig.stages.socket_link import SocketLink
 
-type MakeBench = Callable[[], Bench]
-
-CONTROLLERS = [SimulatedGrbl, SimulatedMarlin]
 LINKS = [DirectLink, PtyLink, SocketLink]
 
 
@@ -29,13 +26,13 @@ def link(request: pytest.FixtureRequest) -> Iterator[Link]:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_contract(controller: type[SimulatedGrbl] | type[SimulatedMarlin], link: Link) -> None:
+def test_contract(controller: Controller, link: Link) -> None:
     check_stage(Bench(controller, link).stage())
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_contract_with_a_board_that_keeps_running(
-    controller: type[SimulatedGrbl] | type[SimulatedMarlin],
+    controller: Controller,
 ) -> None:
     check_stage(Bench(controller, resets_on_open=False).stage())
 
@@ -46,9 +43,7 @@ def test_contract_of_what_open_stage_returns(port: str) -> None:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_grid_of_7_by_7_within_a_minute_of_simulated_time(
-    controller: type[SimulatedGrbl] | type[SimulatedMarlin], link: Link
-) -> None:
+def test_a_grid_of_7_by_7_within_a_minute_of_simulated_time(controller: Controller, link: Link) -> None:
     bench = Bench(controller, link)
     stage = bench.stage()
     stage.connect()
@@ -66,7 +61,7 @@ def test_a_grid_of_7_by_7_within_a_minute_of_simulated_time(
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_conformance(controller: type[SimulatedGrbl] | type[SimulatedMarlin]) -> None:
+def test_conformance(controller: Controller) -> None:
     stage = Bench(controller).stage()
     stage.connect()
     checks = list(conformance(stage))

@@ -1,4 +1,4 @@
-"""Lost steps are found by homing again, and what was visited before stays doubtful."""
+"""Homing again finds lost steps, and what was recorded before stays doubtful."""
 
 from functools import partial
 
@@ -13,10 +13,7 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.recovery import recover
-
-type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
-
-CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
+from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
 def watched(bench: Bench, limit_mm: float = 0.5) -> tuple[Gantry, DriftWatch]:
@@ -77,7 +74,7 @@ def test_only_what_came_after_the_last_good_check_is_doubtful(controller: Contro
     assert watch.doubtful == ("late",)
 
 
-def test_without_a_beginning_nothing_is_vouched_for() -> None:
+def test_a_check_without_begin_is_refused() -> None:
     stage = Bench(SimulatedGrbl).stage()
     stage.connect()
     stage.home()
@@ -103,7 +100,7 @@ def test_a_disturbance_while_homing_was_timed_is_found_at_once(controller: Contr
                 bench.clock.after(1.0, lambda: bench.wire.hold_up(8.0))
         return data
 
-    bench.wire.spoil_to_controller.append(late_on_the_third)
+    bench.wire.filters_to_controller.append(late_on_the_third)
     with pytest.raises(PositionDrifted):
         DriftWatch(stage).begin()
 

@@ -1,4 +1,4 @@
-"""What is peculiar to GRBL, on a simulated controller: each trap of the protocol, and the driver's way around it."""
+"""The GRBL driver on a simulated controller: one test for each peculiarity of the protocol."""
 
 from functools import partial
 from itertools import pairwise
@@ -60,7 +60,7 @@ def test_one_idle_report_does_not_end_a_wait() -> None:
             return data.replace(b"<Jog", b"<Idle")
         return data
 
-    bench.wire.spoil_to_host.append(idle_while_it_moves)
+    bench.wire.filters_to_host.append(idle_while_it_moves)
     grbl(bench).settings[110] = "3000.000"  # slower than the driver was told, so that it polls too soon
     assert stage.move_to(-350.0, -350.0).is_at(Point(-350.0, -350.0))
     assert told
@@ -91,10 +91,10 @@ def test_settings_that_should_be_changed_are_told() -> None:
 def test_the_wrong_firmware_is_refused() -> None:
     bench = Bench(SimulatedGrbl)
     for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
-        bench.wire.spoil_to_host[:] = [partial(_replace, b"[VER:1.1h.20190830:]", version)]
+        bench.wire.filters_to_host[:] = [partial(_replace, b"[VER:1.1h.20190830:]", version)]
         with pytest.raises(WrongFirmware, match=r"1\.1 or grblHAL is needed"):
             bench.stage().connect()
-    bench.wire.spoil_to_host.clear()
+    bench.wire.filters_to_host.clear()
     marlin = bench.stage(StageSettings(protocol="marlin", port="simulated"))
     with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):
         marlin.connect()
@@ -102,7 +102,7 @@ def test_the_wrong_firmware_is_refused() -> None:
 
 def test_travel_follows_the_homing_direction_where_the_switch_is_the_origin() -> None:
     bench = Bench(partial(SimulatedGrbl, settings={23: "1"}))
-    bench.wire.spoil_to_host.append(lambda data: data.replace(b"[OPT:V,", b"[OPT:VZ,"))
+    bench.wire.filters_to_host.append(lambda data: data.replace(b"[OPT:V,", b"[OPT:VZ,"))
     stage = bench.stage()
     stage.connect()
     assert stage.travel() == Box((0.0, 400.0), (-400.0, 0.0))
@@ -161,7 +161,7 @@ def test_settings_that_change_while_read_are_not_believed() -> None:
             return b"$130=4400.000\r\n"
         return data
 
-    bench.wire.spoil_to_host.append(double_a_digit_once)
+    bench.wire.filters_to_host.append(double_a_digit_once)
     with pytest.raises(StageLost, match=r"\$130 read differently"):
         bench.stage().connect()
 

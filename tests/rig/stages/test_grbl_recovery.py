@@ -1,4 +1,4 @@
-"""GRBL after something has gone wrong: what keeps the position, what loses it, and how it comes back."""
+"""GRBL after a fault: what keeps the position, what loses it, and how it is recovered."""
 
 from functools import partial
 
@@ -54,7 +54,7 @@ def test_a_hard_limit_stops_the_stage_and_the_reset_is_repeated_until_taken() ->
     assert not stage.trusted
 
 
-def test_failed_homing_is_not_taken_for_done_although_it_answers_ok() -> None:
+def test_failed_homing_is_an_alarm_although_it_answers_ok() -> None:
     bench = Bench(SimulatedGrbl)
     stage = bench.stage()
     stage.connect()
@@ -191,7 +191,7 @@ def test_a_restart_after_alarm_2_loses_the_position_whether_it_was_seen_or_not(s
         stage.position()
     assert stage.trusted
     if not seen:
-        bench.wire.spoil_to_host.append(lambda data: b"" if b"Grbl" in data else data)
+        bench.wire.filters_to_host.append(lambda data: b"" if b"Grbl" in data else data)
     bench.firmware.restart()
     bench.clock.sleep_s(2.0)
     stage.recover()
@@ -208,13 +208,13 @@ def test_hold_waits_as_long_as_slow_brakes_need() -> None:
     assert not bench.firmware.mechanics.moving
 
 
-def test_a_path_of_which_the_second_part_is_refused_is_not_followed() -> None:
+def test_a_path_whose_second_part_is_refused_is_not_followed() -> None:
     bench = Bench(SimulatedGrbl)
     stage = homed(bench)
-    bench.wire.spoil_to_controller.append(lambda data: data.replace(b"$J=G90 G21 G53 X-300.000", b"$Q"))
+    bench.wire.filters_to_controller.append(lambda data: data.replace(b"$J=G90 G21 G53 X-300.000", b"$Q"))
     with pytest.raises(StageRejected, match=r"refused .* nothing moved by it"):
         stage.move_to(-300.0, -300.0)
-    bench.wire.spoil_to_controller.clear()
+    bench.wire.filters_to_controller.clear()
     bench.clock.sleep_s(1.0)
     assert not bench.firmware.mechanics.moving
     assert bench.true_position().x_mm > -50.0
@@ -235,7 +235,7 @@ def test_a_restart_that_somebody_else_unlocked_and_moved_on_from_loses_the_posit
     assert not stage.trusted
 
 
-def test_what_is_left_of_a_damaged_line_does_not_spoil_the_recovery() -> None:
+def test_the_rest_of_a_damaged_line_does_not_disturb_the_recovery() -> None:
     bench = Bench(SimulatedGrbl)
     stage = homed(bench)
     bench.firmware.receive(b";")

@@ -1,4 +1,4 @@
-"""What is peculiar to Marlin, on a simulated controller: each trap of the protocol, and the driver's way around it."""
+"""The Marlin driver on a simulated controller: one test for each peculiarity of the protocol."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,11 +14,11 @@ from tests.rig.stages.benches import homed
 
 
 def without(*starts: bytes) -> Callable[[bytes], bytes]:
-    """Return what keeps lines with these beginnings from the host."""
+    """Return a filter that removes lines with these beginnings."""
     return lambda data: b"" if data.startswith(starts) else data
 
 
-def test_motors_do_not_let_go_however_long_nothing_moves() -> None:
+def test_motors_stay_on_however_long_nothing_moves() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
     stage.move_to(100.0, 100.0)
@@ -37,16 +37,16 @@ def test_damaged_lines_are_sent_again_and_executed_once() -> None:
         sent += 1
         return data.replace(b"1", b"7", 1) if sent % 3 == 0 else data
 
-    bench.wire.spoil_to_controller.append(damage_every_third)
+    bench.wire.filters_to_controller.append(damage_every_third)
     for target in (Point(100.0, 100.0), Point(50.0, 150.0), Point(11.0, 11.0)):
         assert stage.move_to(*target).is_at(target)
         assert bench.true_position() == pytest.approx(target, abs=0.01)
 
 
-def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
+def test_an_unseen_restart_shows_at_the_next_command() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
-    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.wire.filters_to_host.append(without(b"start"))
     bench.firmware.restart()
     bench.clock.sleep_s(5.0)
     with pytest.raises(StageLost, match="waits for line 1 "):
@@ -59,28 +59,28 @@ def test_a_restart_that_nobody_saw_shows_at_the_next_command() -> None:
     assert stage.trusted
 
 
-def test_recovery_notices_a_restart_that_nobody_saw() -> None:
+def test_recovery_notices_an_unseen_restart() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
     stage.recover()
     assert stage.trusted
-    bench.wire.spoil_to_host.append(without(b"start"))
+    bench.wire.filters_to_host.append(without(b"start"))
     bench.firmware.restart()
     bench.clock.sleep_s(5.0)
     stage.recover()
     assert not stage.trusted
 
 
-def test_a_position_is_not_taken_from_an_answer_that_has_none() -> None:
+def test_an_answer_without_a_position_is_an_error() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
-    bench.wire.spoil_to_host.append(without(b"X:"))
+    bench.wire.filters_to_host.append(without(b"X:"))
     with pytest.raises(StageTimeout, match="without a position"):
         stage.position()
     assert not stage.trusted
 
 
-def test_firmware_that_tells_only_projected_positions_is_waited_for() -> None:
+def test_the_end_of_a_motion_is_awaited_without_real_time_positions() -> None:
     bench = Bench(partial(SimulatedMarlin, realtime_position=False))
     stage = homed(bench)
     stage.move_to(200.0, 200.0)
@@ -152,14 +152,14 @@ def test_travel_is_what_all_sources_allow() -> None:
     stage = bench.stage()
     stage.connect()
     assert stage.travel() == Box((0.0, 400.0), (0.0, 400.0))
-    bench.wire.spoil_to_host.append(lambda data: data.replace(b"Max:  X400.00", b"Max:  X350.00"))
+    bench.wire.filters_to_host.append(lambda data: data.replace(b"Max:  X400.00", b"Max:  X350.00"))
     stage.connect()
     assert stage.travel() == Box((0.0, 350.0), (0.0, 400.0))
 
 
-def test_travel_that_is_not_told_has_to_be_configured() -> None:
+def test_travel_that_is_not_reported_must_be_configured() -> None:
     bench = Bench(SimulatedMarlin)
-    bench.wire.spoil_to_host.append(without(b"area:", b"echo:Soft"))
+    bench.wire.filters_to_host.append(without(b"area:", b"echo:Soft"))
     with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
         bench.stage().connect()
     travel = Box((0.0, 300.0), (0.0, 300.0))
@@ -178,15 +178,15 @@ def test_settings_that_change_while_read_are_not_believed() -> None:
             return data.replace(b"X80", b"X8")
         return data
 
-    bench.wire.spoil_to_host.append(lose_a_digit_once)
+    bench.wire.filters_to_host.append(lose_a_digit_once)
     with pytest.raises(StageLost, match="read differently"):
         bench.stage().connect()
 
 
 @pytest.mark.parametrize("line", [b"FIRMWARE_NAME", b"echo: M92", b"echo: M203", b"echo: M201", b"echo: M204"])
-def test_firmware_that_does_not_tell_what_is_needed_is_refused(line: bytes) -> None:
+def test_firmware_that_does_not_report_a_needed_setting_is_refused(line: bytes) -> None:
     bench = Bench(SimulatedMarlin)
-    bench.wire.spoil_to_host.append(without(line))
+    bench.wire.filters_to_host.append(without(line))
     with pytest.raises(WrongFirmware):
         bench.stage().connect()
 

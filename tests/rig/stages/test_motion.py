@@ -1,4 +1,4 @@
-"""Times of motions, the one-sided way, and where the stage may go."""
+"""Durations of motions, one-sided paths, and allowed positions."""
 
 import math
 
@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.simulation.controller.kinematics import Profile
-from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s, patience_s
+from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s, timeout_s
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
-from faintfield.rig.stages.workspace import Workspace, segment_meets
+from faintfield.rig.stages.workspace import StageWorkspace, segment_meets
 
 LIMITS = MotionLimits((100.0, 50.0), (500.0, 200.0))
 coordinates = st.floats(-300.0, 300.0).map(lambda value: round(value, 3))
@@ -24,7 +24,7 @@ def test_a_long_and_a_short_motion() -> None:
     assert duration_s(start, Point(0.0, 2.0), LIMITS) == pytest.approx(0.2)
     assert duration_s(start, Point(50.0, 0.0), LIMITS, feed_mm_per_s=10.0) == pytest.approx(5.02)
     assert duration_s(start, start, LIMITS) == 0.0
-    assert patience_s(10.0) == 17.0
+    assert timeout_s(10.0) == 17.0
 
 
 @settings(deadline=None)
@@ -70,7 +70,7 @@ def test_a_segment_meets_a_box_where_a_sample_of_it_lies(
 
 
 def test_paths_outside_the_travel_or_through_a_keep_out_are_refused() -> None:
-    workspace = Workspace(Box((0.0, 400.0), (0.0, 400.0)), (Box((100.0, 120.0), (100.0, 120.0)),))
+    workspace = StageWorkspace(Box((0.0, 400.0), (0.0, 400.0)), (Box((100.0, 120.0), (100.0, 120.0)),))
     workspace.check_path([Point(0.0, 0.0), Point(400.0, 0.0), Point(400.0 + 1e-9, 400.0)])
     with pytest.raises(OutsideTravel, match=r"\(401\.000, 0\.000\) mm is outside the travel \[0, 400\]"):
         workspace.check_path([Point(0.0, 0.0), Point(401.0, 0.0)])

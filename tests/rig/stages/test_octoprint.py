@@ -1,4 +1,4 @@
-"""The Marlin driver against an implementation by others: the virtual printer of OctoPrint, in its own process."""
+"""The Marlin driver with an independent implementation: the virtual printer of OctoPrint, in its own process."""
 
 import json
 import subprocess
@@ -26,7 +26,7 @@ type Command = Callable[[str], None]
 
 @pytest.fixture
 def printer(request: pytest.FixtureRequest) -> Iterator[tuple[Gantry, Command]]:
-    """A stage connected to a virtual printer, and a way to give the printer commands from outside."""
+    """A stage connected to a virtual printer, and a function that sends commands to the printer."""
     changes = getattr(request, "param", {})
     with subprocess.Popen(
         [PYTHON, SERVER, json.dumps(changes)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -78,14 +78,14 @@ def test_faults(printer: tuple[Gantry, Command], fault: str, failure: type[Excep
     stage.home()
     command(f"!!DEBUG:{fault}")
     with pytest.raises(failure):
-        _wander(stage)
+        _move_in_steps(stage)
     assert not stage.trusted
     stage.recover()
     stage.home()
     assert stage.move_to(30.0, 30.0).trusted
 
 
-def _wander(stage: Gantry) -> None:
-    """Move about for a while."""
+def _move_in_steps(stage: Gantry) -> None:
+    """Move in many small steps."""
     for x_mm in range(10, 200, 10):
         stage.move_to(x_mm, 20.0)

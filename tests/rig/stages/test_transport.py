@@ -1,4 +1,4 @@
-"""Lines over pyserial: bounded waits, every byte in the log, and dead connections named."""
+"""Lines over pyserial: bounded waits, every byte in the log, and named failures for lost connections."""
 
 from collections.abc import Iterator
 
@@ -9,10 +9,11 @@ from faintfield.rig.errors import StageLost, StageTimeout
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.clock import SimulatedClock
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import DirectLink, PtyLink, SocketLink
+from faintfield.rig.simulation.controller.link import DirectLink, PtyLink
 from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.transport import LineTransport, NoTrafficLog, SerialPort
+from faintfield.rig.stages.transport import LineTransport, SerialPort
 from tests.rig.stages.benches import Traffic
+from tests.rig.stages.socket_link import SocketLink
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def pty() -> Iterator[PtyLink]:
 
 
 def line_over(link: DirectLink) -> LineTransport:
-    return LineTransport(link.open, SimulatedClock(), NoTrafficLog())
+    return LineTransport(link.open, SimulatedClock())
 
 
 @pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x", ""])
@@ -33,7 +34,7 @@ def test_a_port_that_cannot_be_opened_is_named_in_one_line_with_those_that_exist
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_is_taken_alone(pty: PtyLink) -> None:
+def test_a_port_is_opened_exclusively(pty: PtyLink) -> None:
     first = pty.open()
     with pytest.raises(StageLost, match="no other program"):
         pty.open()
@@ -52,14 +53,14 @@ def test_bytes_pass_and_an_unplugged_port_is_lost(pty: PtyLink) -> None:
     assert data == b"ok\r\n"
     assert port.read(0.0) == b""
     pty.unplug()
-    with pytest.raises(StageLost, match="connection is gone"):
+    with pytest.raises(StageLost, match="connection is lost"):
         port.read(1.0)
-    with pytest.raises(StageLost, match="connection is gone"):
+    with pytest.raises(StageLost, match="connection is lost"):
         port.write(b"?")
     port.close()
 
 
-def test_lines_are_cut_stripped_and_decoded_without_fail() -> None:
+def test_lines_are_split_stripped_and_decoded_whatever_they_contain() -> None:
     link = DirectLink()
     line = line_over(link)
     line.open()
@@ -113,8 +114,8 @@ def test_every_byte_and_its_time_is_in_the_log(pty: PtyLink) -> None:
         return data
 
     stage = bench.stage(traffic=traffic)
-    bench.wire.spoil_to_controller.append(lambda data: watch("sent", data))
-    bench.wire.spoil_to_host.append(lambda data: watch("received", data))
+    bench.wire.filters_to_controller.append(lambda data: watch("sent", data))
+    bench.wire.filters_to_host.append(lambda data: watch("received", data))
     stage.connect()
     stage.home()
     stage.move_to(-100.0, -100.0)
@@ -148,7 +149,7 @@ def test_an_unplugged_stage_comes_back_by_the_same_name(link: type[PtyLink] | ty
 
 def test_a_mute_controller_does_not_hang_the_connection() -> None:
     bench = Bench(SimulatedGrbl)
-    bench.wire.spoil_to_host.append(lambda data: b"")
+    bench.wire.filters_to_host.append(lambda data: b"")
     with pytest.raises(StageTimeout, match="no answer"):
         bench.stage().connect()
     assert bench.clock.now_s() < 10.0

@@ -1,4 +1,4 @@
-"""The simulated controllers answer as the real ones do: tests of the tester, line by line."""
+"""The simulated controllers answer as the real ones do."""
 
 from typing import Any
 
@@ -12,12 +12,13 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.server import serving
 from faintfield.rig.simulation.controller.wire import Wire
 from faintfield.rig.stages.transport import SerialPort
+from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
-class Terminal:
-    """A person at the keyboard."""
+class ControllerTerminal:
+    """Types lines to a simulated controller and returns its answers."""
 
-    def __init__(self, firmware: type[SimulatedGrbl] | type[SimulatedMarlin], **options: Any) -> None:
+    def __init__(self, firmware: Controller, **options: Any) -> None:
         self.clock = SimulatedClock()
         self.wire = Wire(self.clock)
         self.firmware = firmware(self.clock, self.wire, **options)
@@ -32,14 +33,14 @@ class Terminal:
         return [line.strip() for line in self.wait(wait_s)]
 
 
-def homed_grbl() -> Terminal:
-    terminal = Terminal(SimulatedGrbl)
+def homed_grbl() -> ControllerTerminal:
+    terminal = ControllerTerminal(SimulatedGrbl)
     assert terminal.type(b"$H\n", 120.0) == ["ok"]
     return terminal
 
 
 def test_grbl_starts_locked() -> None:
-    terminal = Terminal(SimulatedGrbl)
+    terminal = ControllerTerminal(SimulatedGrbl)
     assert [line.strip() for line in terminal.greeting] == ["Grbl 1.1h ['$' for help]", "[MSG:'$H'|'$X' to unlock]"]
     assert terminal.type(b"$J=G91X1F100\n") == ["error:9"]
     assert terminal.type(b"?")[0].startswith("<Alarm|MPos:0.000,0.000,0.000")
@@ -55,7 +56,7 @@ def test_grbl_ok_means_parsed_not_moved() -> None:
 
 
 def test_grbl_answers_nothing_while_homing() -> None:
-    terminal = Terminal(SimulatedGrbl)
+    terminal = ControllerTerminal(SimulatedGrbl)
     assert terminal.type(b"$H\n", 1.0) == []
     assert terminal.type(b"?") == []
     assert terminal.wait(120.0) == ["ok\r"]
@@ -96,7 +97,7 @@ def test_grbl_reset_in_motion_is_alarm_3_and_at_rest_is_none() -> None:
 
 
 def test_grbl_tells_the_work_offset_now_and_then() -> None:
-    terminal = Terminal(SimulatedGrbl, settings={10: "0"})
+    terminal = ControllerTerminal(SimulatedGrbl, settings={10: "0"})
     terminal.type(b"$H\n", 120.0)
     reports = [terminal.type(b"?")[0] for _ in range(30)]
     with_offset = [index for index, report in enumerate(reports) if "WCO" in report]
@@ -113,7 +114,7 @@ def test_grbl_keeps_its_settings_through_a_restart() -> None:
 
 
 def test_marlin_asks_again_for_damaged_lines() -> None:
-    terminal = Terminal(SimulatedMarlin)
+    terminal = ControllerTerminal(SimulatedMarlin)
     assert terminal.greeting[0] == "start"
     assert terminal.type(b"N0 M110 N0*125\n") == ["ok"]
     assert terminal.type(b"N1 G21*26\n") == ["Error:checksum mismatch, Last Line: 0", "Resend: 1", "ok"]
@@ -123,7 +124,7 @@ def test_marlin_asks_again_for_damaged_lines() -> None:
 
 
 def test_marlin_is_busy_while_it_waits_and_projects_positions() -> None:
-    terminal = Terminal(SimulatedMarlin)
+    terminal = ControllerTerminal(SimulatedMarlin)
     assert terminal.type(b"G28\n", 60.0)[-1] == "ok"
     assert terminal.type(b"G1 X300 F3000\n") == ["ok"]
     assert terminal.type(b"M114\n")[0].startswith("X:300.00")
@@ -131,8 +132,8 @@ def test_marlin_is_busy_while_it_waits_and_projects_positions() -> None:
     assert terminal.type(b"M400\n", 10.0) == ["echo:busy: processing", "echo:busy: processing", "ok"]
 
 
-def test_marlin_clips_targets_and_lets_its_motors_go() -> None:
-    terminal = Terminal(SimulatedMarlin)
+def test_marlin_clips_targets_and_releases_its_motors() -> None:
+    terminal = ControllerTerminal(SimulatedMarlin)
     terminal.type(b"G28\n", 60.0)
     terminal.type(b"G1 X900 F6000\n", 20.0)
     assert terminal.firmware.mechanics.true_mm()[0] == 400.0
@@ -142,20 +143,20 @@ def test_marlin_clips_targets_and_lets_its_motors_go() -> None:
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(st.binary(max_size=40), max_size=8))
-@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
-def test_no_bytes_crash_a_controller(firmware: type[SimulatedGrbl] | type[SimulatedMarlin], typed: list[bytes]) -> None:
-    terminal = Terminal(firmware)
+@pytest.mark.parametrize("firmware", CONTROLLERS)
+def test_no_bytes_crash_a_controller(firmware: Controller, typed: list[bytes]) -> None:
+    terminal = ControllerTerminal(firmware)
     for data in typed:
         terminal.type(data)
-    # Ends whatever line was begun and, on GRBL, whatever state was reached
+    # Ends an unfinished line and, on GRBL, any state
     terminal.type(b"\n\x18\n", 2000.0)
     answer = terminal.type(b"?" if firmware is SimulatedGrbl else b"M115\n")
     assert any("<" in line or "FIRMWARE_NAME" in line for line in answer)
 
 
-@pytest.mark.parametrize("firmware", [SimulatedGrbl, SimulatedMarlin])
+@pytest.mark.parametrize("firmware", CONTROLLERS)
 def test_a_served_controller_answers_whoever_opens_its_port(
-    firmware: type[SimulatedGrbl] | type[SimulatedMarlin],
+    firmware: Controller,
 ) -> None:
     with serving(firmware) as server:
         port = SerialPort(server.port, 115200)

@@ -1,4 +1,4 @@
-"""The simulated mechanics obey their own physics: tests of the tester."""
+"""The simulated mechanics obey the physics of motors, play and switches."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def test_half_way_a_motion_is_half_done_and_at_full_speed() -> None:
     assert not stage.moving
 
 
-def test_braking_takes_the_way_that_physics_says() -> None:
+def test_the_braking_distance_is_that_of_constant_deceleration() -> None:
     clock = SimulatedClock()
     stage = mechanics(clock)
     stage.queue((300.0, 0.0), 100.0, 500.0)

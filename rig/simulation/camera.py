@@ -1,4 +1,4 @@
-"""A camera in the simulated lab; its exposures take simulated time."""
+"""The camera of the simulated lab."""
 
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import SimulatedSettings
@@ -6,26 +6,30 @@ from faintfield.rig.clock import Clock
 from faintfield.rig.errors import CameraError
 from faintfield.rig.simulation.lab import SimulatedLab
 
-# Under this name the record of a frame has the pose that only a simulated world can know.
+# Key of the true pose in a frame's metadata.
 TRUE_POSE = "true_rt_cam_ref"
 
+# Time to read a frame.
 _READOUT_S = 0.05
-# Of the cooled sensor, whose dark current does not drift.
+
+# Temperature of the cooled sensor, recorded with each frame.
 _TEMPERATURE_C = -20.0
+
+# Upper estimate of what a TIFF file holds besides its pixels.
 _TIFF_HEADER_BYTES = 512
 
 
 class SimulatedCamera:
-    """A `Camera` that renders what it would see.
+    """A `Camera` that renders its frames; exposures take simulated time.
 
     Parameters
     ----------
     settings : SimulatedSettings
         The `[camera]` table.
     clock : Clock
-        The simulated world's.
+        The simulated clock.
     lab : SimulatedLab
-        What it looks at.
+        Renders the frames.
     """
 
     def __init__(self, settings: SimulatedSettings, clock: Clock, lab: SimulatedLab) -> None:
@@ -45,7 +49,7 @@ class SimulatedCamera:
         return CameraReport("simulated camera", 2 * width * height + _TIFF_HEADER_BYTES, readout_s=_READOUT_S)
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
-        """Render the scene from where the camera is when the exposure begins."""
+        """Render the scene from the camera's pose at the beginning of the exposure."""
         self._require_open()
         truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
         pixels = self._lab.expose(exposure_s, number)
@@ -61,6 +65,6 @@ class SimulatedCamera:
         self._open = False
 
     def _require_open(self) -> None:
-        """Raise before `open` and after `close`."""
+        """Raise `CameraError` before `open` and after `close`."""
         if not self._open:
             raise CameraError("the camera is not connected; open it first")

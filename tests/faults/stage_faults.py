@@ -1,6 +1,6 @@
-"""Faults to order: what goes wrong with stages, each as a function that makes it happen on a bench, now.
+"""Faults of stages, for tests: each makes one thing go wrong on a bench, at once.
 
-A fault strikes once and leaves the world as it would be: a byte is lost, a cable is out, an axis is stuck.
+A fault strikes once and its effect remains: a byte is lost, a cable is unplugged, an axis is stuck.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import Literal
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.controller.wire import Spoil
+from faintfield.rig.simulation.controller.wire import ByteFilter
 from faintfield.rig.stages.settings import ProtocolName
 
 type Nature = Literal["wire", "controller", "mechanics"]
@@ -23,13 +23,13 @@ class Fault:
     Parameters
     ----------
     name : str
-        What to call it.
+        Name of the fault.
     nature : str
-        Where it strikes. Faults of the mechanics show in no report: only a drift check finds them.
+        Part that it affects. Faults of the mechanics show in no report; only a drift check finds them.
     strike : callable
         Makes it happen on a bench.
     protocols : tuple of str
-        Controllers that know it.
+        Controllers that can have it.
     """
 
     name: str
@@ -55,50 +55,50 @@ def _flip(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0x04]) + data[middle + 1 :] if data else data
 
 
-def _next_only(spoils: list[Spoil], spoil: Spoil, applies: Callable[[bytes], bool] = bool) -> None:
-    """Spoil the next bytes that `applies` holds for, and no others."""
+def _filter_once(filters: list[ByteFilter], change: ByteFilter, applies: Callable[[bytes], bool] = bool) -> None:
+    """Change only the next bytes to which `applies`."""
 
     def once(data: bytes) -> bytes:
         if not applies(data):
             return data
-        spoils.remove(once)
-        return spoil(data)
+        filters.remove(once)
+        return change(data)
 
-    spoils.append(once)
+    filters.append(once)
 
 
-def _for_a_while(bench: Bench, spoils: list[Spoil], duration_s: float) -> None:
-    """Lose everything for `duration_s`."""
+def _silence(bench: Bench, filters: list[ByteFilter], duration_s: float) -> None:
+    """Lose all bytes for `duration_s`."""
 
     def nothing(data: bytes) -> bytes:
         return b""
 
-    spoils.append(nothing)
-    bench.clock.after(duration_s, lambda: spoils.remove(nothing))
+    filters.append(nothing)
+    bench.clock.after(duration_s, lambda: filters.remove(nothing))
 
 
-def _to_controller(spoil: Spoil) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.spoil_to_controller, spoil)
+def _to_controller(change: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _filter_once(bench.wire.filters_to_controller, change)
 
 
-def _to_host(spoil: Spoil) -> Callable[[Bench], None]:
-    return lambda bench: _next_only(bench.wire.spoil_to_host, spoil)
+def _to_host(change: ByteFilter) -> Callable[[Bench], None]:
+    return lambda bench: _filter_once(bench.wire.filters_to_host, change)
 
 
 def _lose_ok(bench: Bench) -> None:
-    _next_only(bench.wire.spoil_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
+    _filter_once(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
 
 
 def _mute(bench: Bench) -> None:
-    bench.wire.spoil_to_host.append(lambda data: b"")
+    bench.wire.filters_to_host.append(lambda data: b"")
 
 
 def _deaf(bench: Bench) -> None:
-    bench.wire.spoil_to_controller.append(lambda data: b"")
+    bench.wire.filters_to_controller.append(lambda data: b"")
 
 
 def _babble(bench: Bench) -> None:
-    """Talk nonsense a hundred times a second for a minute."""
+    """Send nonsense a hundred times a second for a minute."""
     for line in range(6000):
         bench.clock.after(0.01 * line, lambda: bench.firmware.say("<Jog|MPos:0.0"))
 
@@ -109,7 +109,7 @@ def _answer_late(bench: Bench) -> None:
 
 def _restart_unseen(bench: Bench) -> None:
     bench.firmware.restart()
-    _for_a_while(bench, bench.wire.spoil_to_host, bench.firmware.boot_s + 0.1)
+    _silence(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
 
 def _unplug_and_return(bench: Bench) -> None:
@@ -149,35 +149,31 @@ def _never_end(bench: Bench) -> None:
 
 
 def _push_by_pendant(bench: Bench) -> None:
-    """Somebody moves the stage by another control."""
+    """Move the stage as if by a hand control."""
     x, y = bench.firmware.mechanics.commanded_mm()
     inward = -3.0 if isinstance(bench.firmware, SimulatedGrbl) else 3.0
     bench.firmware.mechanics.queue((x + inward, y + inward), 20.0, 500.0)
 
 
-def _grbl(act: Callable[[SimulatedGrbl], None]) -> Callable[[Bench], None]:
+def _on[Kind: SimulatedGrbl | SimulatedMarlin](
+    kind: type[Kind], act: Callable[[Kind], None]
+) -> Callable[[Bench], None]:
+    """Return what calls `act` with the controller of a bench, which must be of this kind."""
+
     def strike(bench: Bench) -> None:
-        assert isinstance(bench.firmware, SimulatedGrbl)
-        act(bench.firmware)
-
-    return strike
-
-
-def _marlin(act: Callable[[SimulatedMarlin], None]) -> Callable[[Bench], None]:
-    def strike(bench: Bench) -> None:
-        assert isinstance(bench.firmware, SimulatedMarlin)
+        assert isinstance(bench.firmware, kind)
         act(bench.firmware)
 
     return strike
 
 
 def _alarm(code: int) -> Callable[[Bench], None]:
-    return _grbl(lambda firmware: firmware.alarm(code))
+    return _on(SimulatedGrbl, lambda firmware: firmware.alarm(code))
 
 
 def _early_idle(bench: Bench) -> None:
-    """One report says idle while the stage moves."""
-    _next_only(bench.wire.spoil_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
+    """Report idle once while the stage moves."""
+    _filter_once(bench.wire.filters_to_host, lambda data: data.replace(b"<Jog", b"<Idle"), lambda data: b"<Jog" in data)
 
 
 def _lose_settings(firmware: SimulatedGrbl) -> None:
@@ -186,7 +182,7 @@ def _lose_settings(firmware: SimulatedGrbl) -> None:
 
 
 def _damage_every_line(bench: Bench) -> None:
-    bench.wire.spoil_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
+    bench.wire.filters_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
 
 
 _COMMON = (
@@ -202,7 +198,7 @@ _COMMON = (
     Fault("noise", "wire", lambda bench: bench.wire.to_host(bytes(range(128, 256)) + b"\x00ok\x00\n")),
     Fault("controller mute", "wire", _mute),
     Fault("controller deaf", "wire", _deaf),
-    Fault("silence for a moment", "wire", lambda bench: _for_a_while(bench, bench.wire.spoil_to_host, 0.5)),
+    Fault("silence for a moment", "wire", lambda bench: _silence(bench, bench.wire.filters_to_host, 0.5)),
     Fault("answers late", "wire", _answer_late),
     Fault("babble", "wire", _babble),
     Fault("every line damaged", "wire", _damage_every_line),
@@ -220,18 +216,20 @@ _COMMON = (
 )
 _GRBL = (
     *(Fault(f"alarm {code}", "controller", _alarm(code), ("grbl",)) for code in range(1, 10)),
-    Fault("hold button", "controller", _grbl(SimulatedGrbl.pause), ("grbl",)),
-    Fault("door open", "controller", _grbl(SimulatedGrbl.open_door), ("grbl",)),
+    Fault("hold button", "controller", _on(SimulatedGrbl, SimulatedGrbl.pause), ("grbl",)),
+    Fault("door open", "controller", _on(SimulatedGrbl, SimulatedGrbl.open_door), ("grbl",)),
     Fault("idle told too early", "wire", _early_idle, ("grbl",)),
-    Fault("settings lost", "controller", _grbl(_lose_settings), ("grbl",)),
+    Fault("settings lost", "controller", _on(SimulatedGrbl, _lose_settings), ("grbl",)),
 )
 _MARLIN = (
-    Fault("killed", "controller", _marlin(lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)),
-    Fault("motors released", "mechanics", _marlin(SimulatedMarlin.release_motors), ("marlin",)),
+    Fault(
+        "killed", "controller", _on(SimulatedMarlin, lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)
+    ),
+    Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), ("marlin",)),
 )
 
 FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
-"""Everything that can be made to go wrong."""
+"""All faults."""
 
 
 def faults_of(protocol: ProtocolName) -> tuple[Fault, ...]:

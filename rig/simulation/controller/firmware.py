@@ -1,0 +1,89 @@
+"""What the simulated GRBL and Marlin have in common: restarts, lines in and out, homing that takes time."""
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable
+from typing import ClassVar
+
+from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
+from faintfield.rig.simulation.controller.kinematics import Mechanics
+from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.stages.settings import ProtocolName
+
+
+class SimulatedFirmware(ABC):
+    """A simulated controller.
+
+    Parameters
+    ----------
+    clock : SimulatedClock
+        The simulated time.
+    wire : Wire
+        The serial line to the host.
+    mechanics : Mechanics
+        The motors that it drives.
+    boot_s : float
+        Time from a restart to the first line that it sends.
+
+    Attributes
+    ----------
+    homing_slowdown : float
+        Factor on the time of homing; faults raise it.
+    """
+
+    protocol: ClassVar[ProtocolName]
+    _line_end: ClassVar[bytes]
+
+    def __init__(self, clock: SimulatedClock, wire: Wire, mechanics: Mechanics, boot_s: float) -> None:
+        self.clock = clock
+        self.wire = wire
+        self.mechanics = mechanics
+        self.boot_s = boot_s
+        self.homing_slowdown = 1.0
+        self._line, self._waiting = bytearray(), deque[str]()
+        self._boot: ScheduledEvent | None = None
+        self._homing: ScheduledEvent | None = None
+        mechanics.on_idle = self._motion_ended
+        self.restart()
+
+    def restart(self) -> None:
+        """Restart as after power-up: the step count is lost, the settings stay."""
+        self.mechanics.stop_dead()
+        self.mechanics.set_count((0.0, 0.0))
+        self.wire.clear()
+        self._line, self._waiting = bytearray(), deque[str]()
+        self._cancel_homing()
+        self._reset_state()
+        if self._boot is not None:
+            self._boot.cancel()
+        self._boot = self.clock.after(self.boot_s, self._booted)
+
+    @abstractmethod
+    def receive(self, data: bytes) -> None:
+        """Take bytes from the host."""
+
+    def say(self, text: str) -> None:
+        """Send one line to the host."""
+        self.wire.to_host(text.encode("ascii", errors="replace") + self._line_end)
+
+    @abstractmethod
+    def _reset_state(self) -> None:
+        """Set the state that a restart leaves until `_booted`."""
+
+    @abstractmethod
+    def _booted(self) -> None:
+        """Finish the restart."""
+
+    @abstractmethod
+    def _motion_ended(self) -> None:
+        """React to the end of the last motion."""
+
+    def _start_homing(self, duration_s: float, finish: Callable[[], None]) -> None:
+        """Call `finish` when homing ends."""
+        self._homing = self.clock.after(self.homing_slowdown * duration_s, finish)
+
+    def _cancel_homing(self) -> None:
+        """Interrupt homing."""
+        if self._homing is not None:
+            self._homing.cancel()
+            self._homing = None

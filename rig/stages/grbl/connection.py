@@ -1,0 +1,188 @@
+"""Exchanges commands, responses and status reports with GRBL, and raises its errors, alarms and restarts."""
+
+import re
+
+from faintfield.rig.errors import StageTimeout, WrongFirmware
+from faintfield.rig.stages.grbl import failures
+from faintfield.rig.stages.grbl.messages import Alarm, Banner, ErrorCode, Message, Report, parse
+from faintfield.rig.stages.messages import Ok, restart_failure
+from faintfield.rig.stages.motion import timeout_s
+from faintfield.rig.stages.transport import LineTransport
+
+# GRBL's real-time characters.
+HOLD, CANCEL_JOG, RESET = b"!", b"\x85", b"\x18"
+_STATUS_REQUEST = b"?"
+
+# Between status requests, in s; GRBL's documentation recommends at most five a second.
+POLL_INTERVAL_S = 0.2
+
+# Waits in s: for the banner after the port was opened and the boot loader has run; for the banner after a reset; for
+# the status report of a board that did not restart; for the response to a command.
+_BOOT_S = 3.0
+RESET_S = 0.4
+_FIRST_REPORT_S = 1.0
+_ANSWER_S = timeout_s(0.0)
+
+
+class GrblConnection:
+    """A line transport to GRBL.
+
+    Parameters
+    ----------
+    line : LineTransport
+        The connection.
+
+    Attributes
+    ----------
+    offset : tuple of float or None
+        Last work offset that was reported, in mm.
+    alarm : int or None
+        Code of the last alarm.
+    count_lost : bool
+        Whether the controller may have lost its count of steps since it was homed.
+    homing : bool
+        Whether the last command was to home.
+    """
+
+    def __init__(self, line: LineTransport) -> None:
+        self.offset: tuple[float, ...] | None = None
+        self.alarm: int | None = None
+        self.count_lost = False
+        self.homing = False
+        self._line = line
+        self._clock = line.clock
+        self._next_poll_s = 0.0
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection was opened and has not been lost since."""
+        return self._line.is_open
+
+    def open(self) -> None:
+        """Open the connection and wait for the banner, since most boards restart when the port is opened."""
+        self.offset = self.alarm = None
+        self.count_lost = True
+        self._line.open()
+        if self._await_banner(_BOOT_S):
+            return
+        # Boards with native USB keep running. The newline makes other firmware answer too; GRBL answers it with an ok,
+        # which has to be read here so that the first command does not take it for its own.
+        self._line.send(_STATUS_REQUEST + b"\n")
+        reported = False
+        for text in self._line.lines_until(self._clock.now_s() + _FIRST_REPORT_S):
+            _refuse_other_firmware(text)
+            reported = reported or isinstance(parse(text), Report)
+        if not reported:
+            raise StageTimeout(
+                f"no answer as from GRBL within {_BOOT_S + _FIRST_REPORT_S:g} s; "
+                "check power, baud rate and protocol of the controller"
+            )
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._line.close()
+
+    def send(self, data: bytes) -> None:
+        """Send real-time characters, which GRBL obeys at once and does not answer."""
+        self._line.send(data)
+
+    def command(self, text: str, bound_s: float = _ANSWER_S) -> list[Message]:
+        """Send one command, wait for its response, and return the messages before the response."""
+        self._read_pending()
+        self.homing = text.startswith("$H")
+        self._line.send(text.encode("ascii") + b"\n")
+        deadline_s = self._clock.now_s() + bound_s
+        messages: list[Message] = []
+        while (message := self._receive(deadline_s)) is not None:
+            if isinstance(message, Ok):
+                return messages
+            if isinstance(message, ErrorCode):
+                if message.code == failures.LOCKED_ERROR:
+                    report = self.poll()
+                    if report.state not in ("Idle", "Jog", "Run"):
+                        raise failures.state_failure(report, self.alarm)
+                raise failures.error_failure(text, message.code)
+            messages.append(message)
+        raise StageTimeout(
+            f"no answer to {text!r} within {bound_s:g} s; check cable and power, then recover and home the stage"
+        )
+
+    def poll(self) -> Report:
+        """Request a status report and return it."""
+        self._read_pending()
+        while self._clock.now_s() < self._next_poll_s:
+            self._receive(self._next_poll_s)
+        self._next_poll_s = self._clock.now_s() + POLL_INTERVAL_S
+        self._line.send(_STATUS_REQUEST)
+        deadline_s = self._clock.now_s() + _ANSWER_S
+        while (message := self._receive(deadline_s)) is not None:
+            if isinstance(message, Report):
+                return message
+        raise StageTimeout(
+            f"no status report within {_ANSWER_S:g} s; check cable and power, then recover and home the stage"
+        )
+
+    def poll_despite_failures(self) -> Report | None:
+        """Request a status report without raising alarms and restarts; return None if none comes."""
+        self._line.send(_STATUS_REQUEST)
+        self._next_poll_s = self._clock.now_s() + POLL_INTERVAL_S
+        newest: Report | None = None
+        for text in self._line.lines_until(self._next_poll_s):
+            message = parse(text)
+            self._note(message)
+            if isinstance(message, Report):
+                newest = message
+        return newest
+
+    def read_until(self, deadline_s: float) -> None:
+        """Read messages until the clock reaches `deadline_s`, and raise alarms and restarts."""
+        while self._receive(deadline_s) is not None:
+            pass
+
+    def reset(self) -> None:
+        """Reset GRBL and wait briefly for its banner."""
+        self._line.send(RESET)
+        self._await_banner(RESET_S)
+
+    def _read_pending(self) -> None:
+        """Read what has arrived unasked, so that it is not taken for the answer to the next command."""
+        self.read_until(self._clock.now_s())
+
+    def _receive(self, deadline_s: float) -> Message | None:
+        """Return the next message, None at the deadline; raise an alarm or a restart, which can come at any time."""
+        text = self._line.next_line(deadline_s)
+        if text is None:
+            return None
+        message = parse(text)
+        self._note(message)
+        if isinstance(message, Alarm):
+            raise failures.alarm_failure(message.code)
+        if isinstance(message, Banner):
+            raise restart_failure()
+        return message
+
+    def _note(self, message: Message) -> None:
+        """Update the attributes from a message."""
+        if isinstance(message, Report) and message.offset is not None:
+            self.offset = message.offset
+        elif isinstance(message, Banner):
+            self.count_lost = True
+        elif isinstance(message, Alarm):
+            self.alarm = message.code
+            self.count_lost = self.count_lost or message.code != failures.SOFT_LIMIT_ALARM
+
+    def _await_banner(self, within_s: float) -> bool:
+        """Return whether the controller reports a start within `within_s`."""
+        for text in self._line.lines_until(self._clock.now_s() + within_s):
+            _refuse_other_firmware(text)
+            message = parse(text)
+            if isinstance(message, Banner):
+                return True
+            self._note(message)
+        return False
+
+
+def _refuse_other_firmware(text: str) -> None:
+    """Raise `WrongFirmware` for a line that only other firmware sends."""
+    if re.search(r"marlin|echo:unknown command|^start$", text, re.IGNORECASE):
+        raise WrongFirmware(f"the controller answers as Marlin ({text[:60]!r}); use protocol 'marlin'")

@@ -1,0 +1,245 @@
+"""Drives Marlin: numbered lines with checksums, motion awaited with M400, the position read with M114.
+
+The line numbers also reveal a restart that was not seen: after one, Marlin asks for line 1 at the next command.
+"""
+
+import re
+from collections.abc import Sequence
+from contextlib import suppress
+
+from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
+from faintfield.rig.stages.marlin import messages as marlin
+from faintfield.rig.stages.marlin.settings import MarlinSettings
+from faintfield.rig.stages.messages import Ok, restart_failure
+from faintfield.rig.stages.motion import timeout_s
+from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
+from faintfield.rig.stages.transport import LineTransport
+
+# Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
+# the echo of a marker.
+_BOOT_S = 3.0
+_ANSWER_S = timeout_s(0.0)
+_ECHO_S = 0.7
+
+# A controller that has sent nothing for this long (s) has finished its greeting.
+_QUIET_S = 0.2
+
+# Answers that are under way when a motion is aborted arrive within this time (s).
+_DISCARD_S = 0.1
+
+# Attempts: to send a line, and to start counting lines.
+_MAX_SENDINGS = 6
+_MAX_STARTS = 3
+
+
+class MarlinController:
+    """A `Controller` that speaks Marlin.
+
+    Parameters
+    ----------
+    line : LineTransport
+        The connection.
+    axes : (str, str)
+        The controller's letters for the two axes.
+    travel_mm : Box, optional
+        The travel, for firmware that does not report it.
+    """
+
+    def __init__(self, line: LineTransport, axes: tuple[str, str], travel_mm: Box | None) -> None:
+        self._line = line
+        self._clock = line.clock
+        self._axes = axes
+        self._travel_mm = travel_mm
+        self._line_number = 0
+        self._markers = 0
+
+    def connect(self) -> None:
+        """Open the connection and wait for the end of the greeting, since most boards restart when it is opened."""
+        self._line.open()
+        self._await_start()
+        self._start_counting()
+
+    def identify(self) -> Identity:
+        """Read capabilities and settings, the settings twice since answers have no checksum."""
+        about = self._command("M115")
+        first, second = self._read_settings(), self._read_settings()
+        if first != second:
+            raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
+        return MarlinSettings.from_messages((*about, *first)).identity(self._axes, self._travel_mm)
+
+    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
+        """Home the named axis or both, and no others, such as a focus drive."""
+        started_s = self._clock.now_s()
+        axes = self._axes if axis is None else (self._axes[axis],)
+        self._command(f"G28 {' '.join(axes)}", bound_s)
+        taken_s = self._clock.now_s() - started_s
+        self._command("M400")
+        return taken_s
+
+    def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
+        """Queue one motion per point, wait for the last to end, and read the position."""
+        x, y = self._axes
+        for point in path:
+            self._command(f"G1 {x}{point.x_mm:.3f} {y}{point.y_mm:.3f} F{60.0 * feed_mm_per_s:.1f}")
+        self._command("M400", timeout_s(predicted_s))
+        return self.read_position()
+
+    def jog(self, by: Point, feed_mm_per_s: float, predicted_s: float, *, unlock: bool) -> Point:
+        """Move by a distance, as an absolute motion so that no relative mode remains set; Marlin has no lock."""
+        here = self.read_position()
+        return self.follow((Point(here.x_mm + by.x_mm, here.y_mm + by.y_mm),), feed_mm_per_s, predicted_s)
+
+    def read_position(self) -> Point:
+        """Return the real position (R) if the firmware reports it, otherwise the last target."""
+        for message in self._command("M114 R"):
+            if isinstance(message, marlin.PositionReport):
+                try:
+                    return Point(*(message.axes_mm[axis] for axis in self._axes))
+                except KeyError as missing:
+                    raise WrongFirmware(f"M114 reports no position of axis {missing}; set stage.axes") from missing
+        raise StageTimeout("M114 was answered without a position: answers are out of step; recover and home the stage")
+
+    def switches(self) -> frozenset[AxisIndex]:
+        """Return the axes with a closed limit switch."""
+        messages = self._command("M119")
+        closed = {
+            message.name[0].upper() for message in messages if isinstance(message, marlin.Switch) and message.closed
+        }
+        return frozenset(index for index in (0, 1) if self._axes[index] in closed)
+
+    def stop(self) -> bool:
+        """Stop dead: Marlin does not slow down, so steps may be lost."""
+        self.abort()
+        self._command("M400")
+        return False
+
+    def abort(self) -> bool:
+        """Send the emergency stop, which firmware with an emergency parser obeys at once."""
+        with suppress(StageLost):  # a stage that cannot be reached cannot be stopped
+            self._line.send(b"M410\n")
+            # Its ok belongs to no numbered line and must not be taken for the next answer.
+            self._discard_input()
+        return False
+
+    def recover(self) -> bool:
+        """Make Marlin answer again; a killed controller restarts when the port is opened again."""
+        if self._line.is_open:
+            self._discard_input()
+            keeps_count = self._keeps_count()
+            if keeps_count is not None:
+                self._start_counting()
+                return keeps_count
+        self.connect()
+        return False
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._line.close()
+
+    def _discard_input(self) -> None:
+        """Ignore all lines for a moment."""
+        for _ in self._line.lines_until(self._clock.now_s() + _DISCARD_S):
+            pass
+
+    def _start_counting(self) -> None:
+        """Restart the line numbers, and set what every motion relies on: mm, absolute positions, motors kept on.
+
+        Answers to earlier commands may still be under way. They end where the controller echoes a marker, and the next
+        `ok` is the first that counts.
+        """
+        for _ in range(_MAX_STARTS):
+            marker = self._new_marker()
+            self._line.send(marlin.numbered(0, "M110 N0") + f"M118 {marker}\n".encode("ascii"))
+            echoed = False
+            for text in self._line.lines_until(self._clock.now_s() + _ECHO_S):
+                if echoed and isinstance(marlin.parse(text), Ok):
+                    self._line_number = 0
+                    for command in ("G21", "G90", "M84 S0"):
+                        self._command(command)
+                    return
+                echoed = echoed or marker in text
+        raise StageTimeout(
+            f"no answer as from Marlin to {_MAX_STARTS} attempts; check power, baud rate and protocol of the controller"
+        )
+
+    def _keeps_count(self) -> bool | None:
+        """Return whether the controller accepts the next line number, as none does after a restart; None if mute."""
+        marker = self._new_marker()
+        self._line_number += 1
+        self._line.send(marlin.numbered(self._line_number, f"M118 {marker}"))
+        answered = None
+        for text in self._line.lines_until(self._clock.now_s() + _QUIET_S):
+            if marker in text:
+                return True
+            answered = False
+        return answered
+
+    def _new_marker(self) -> str:
+        """Return a word that was not used before, for the controller to echo."""
+        self._markers += 1
+        return f"faintfield-{self._markers}."
+
+    def _await_start(self) -> None:
+        """Wait until the controller has started and fallen silent, or did not restart."""
+        deadline_s = last_s = self._clock.now_s() + _BOOT_S
+        started = False
+        while (text := self._line.next_line(deadline_s)) is not None:
+            if re.match(r"Grbl", text, re.IGNORECASE):
+                raise WrongFirmware(f"the controller answers as GRBL ({text[:60]!r}); use protocol 'grbl'")
+            if not started and isinstance(marlin.parse(text), marlin.Start):
+                started, last_s = True, self._clock.now_s() + 2.0 * _QUIET_S
+            if started:
+                deadline_s = min(self._clock.now_s() + _QUIET_S, last_s)
+
+    def _read_settings(self) -> list[marlin.Message]:
+        """Return the messages about settings and limits."""
+        messages = [*self._command("M503"), *self._command("M211")]
+        return [message for message in messages if isinstance(message, marlin.MarlinSetting | marlin.Limits)]
+
+    def _command(self, command: str, bound_s: float = _ANSWER_S) -> list[marlin.Message]:
+        """Send one command, again if it arrives damaged, and return the messages before its `ok`."""
+        for text in self._line.lines_until(self._clock.now_s()):
+            self._check(marlin.parse(text), command)
+        self._line_number += 1
+        for _ in range(_MAX_SENDINGS):
+            self._line.send(marlin.numbered(self._line_number, command))
+            messages = self._await_ok(command, bound_s)
+            if messages is not None:
+                return messages
+        raise StageLost(
+            f"line {self._line_number} arrived damaged {_MAX_SENDINGS} times in a row; use a shorter or shielded cable"
+        )
+
+    def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
+        """Return the messages up to the `ok`, or None if the controller asks for the line again."""
+        deadline_s = self._clock.now_s() + bound_s
+        messages: list[marlin.Message] = []
+        while (text := self._line.next_line(deadline_s)) is not None:
+            message = marlin.parse(text)
+            self._check(message, command)
+            messages.append(message)
+            if isinstance(message, Ok) or (isinstance(message, marlin.PositionReport) and message.is_ok):
+                if any(isinstance(earlier, marlin.Resend) for earlier in messages):
+                    return None
+                refusals = [earlier for earlier in messages if isinstance(earlier, marlin.Refusal)]
+                if refusals:
+                    raise StageRejected(f"the controller refused {command!r}: {refusals[0].text}; home the stage first")
+                return messages
+        raise StageTimeout(
+            f"no answer to {command!r} within {bound_s:.1f} s; look whether the stage still moves, "
+            "check cable and power, then recover and home it"
+        )
+
+    def _check(self, message: marlin.Message, command: str) -> None:
+        """Raise for a message that the controller has restarted or stopped."""
+        if isinstance(message, marlin.Start):
+            raise restart_failure()
+        if isinstance(message, marlin.Resend) and message.number != self._line_number:
+            raise StageLost(
+                f"the controller waits for line {message.number} and was sent {self._line_number}: it has restarted, "
+                "and its position is lost; recover and home it"
+            )
+        if isinstance(message, marlin.ErrorText) and not message.in_transmission:
+            raise StageAlarm(
+                f"the controller says {message.text!r} to {command!r}; look for the cause, then recover and home it"
+            )
