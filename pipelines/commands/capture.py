@@ -13,12 +13,12 @@ from faintfield.pipelines.console import console, progress, say
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.rig_file import decoded, read_rig
-from faintfield.pipelines.live.panel import Panel
+from faintfield.pipelines.live.panel import CapturePanel
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.session.access import has_session, opened, read_plan, refuse_other_rig
+from faintfield.rig.session.access import has_session, opened, read_plan, check_same_rig
 from faintfield.rig.session.session import FrozenPlan, is_sealed
 from faintfield.rig.settings import RigSettings
 
@@ -46,17 +46,17 @@ def capture(rig: Path, session: Path, /, *, yes: bool = False, page: bool = Fals
     if is_sealed(session):
         say(f"{session}: is complete; there is nothing left to capture")
         return {"session": str(session), "complete": True, "taken": 0}
-    panel = Panel(unattended=yes)
+    panel = CapturePanel(unattended=yes)
     with ExitStack() as stack:
         open_session = stack.enter_context(opened(session, frozen, lambda frames: progress(list(frames), "comparing")))
         before = len(open_session.valid())
         if before:
             say(f"{session}: {before} of {len(open_session.frames)} frames are there; going on")
         if page:
-            from faintfield.pipelines.live.capture_page import serving_page
+            from faintfield.pipelines.live.capture_page import serve_page
 
-            say(f"page: {stack.enter_context(serving_page(panel))}")
-        stack.enter_context(TerminalView(panel).showing())
+            say(f"page: {stack.enter_context(serve_page(panel))}")
+        stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         Capture(open_session, open_rig(settings, open_session.journal), panel, decoded).run()
         taken = len(open_session.valid()) - before
@@ -68,18 +68,18 @@ def _planned(settings: RigSettings, session: Path) -> FrozenPlan:
     """Return the plan of a session that was begun, or lay one down after looking at the rig."""
     if has_session(session):
         frozen = read_plan(session)
-        refuse_other_rig(frozen, settings)
+        check_same_rig(frozen, settings)
         return frozen
     found = survey(open_rig(settings), settings)
     for warning in found.stage.warnings:
         say(f"warning: {warning}")
     require_room(session, round(ROOM_FACTOR * found.plan.disk_bytes()))
-    say(f"{found.plan.frames()} frames, {time_in_words(found.duration_s, settings.stage)}")
+    say(f"{found.plan.frame_count()} frames, {time_in_words(found.duration_s, settings.stage)}")
     return FrozenPlan(found.plan, settings)
 
 
 @contextmanager
-def _stop_on_interrupt(panel: Panel) -> Iterator[None]:
+def _stop_on_interrupt(panel: CapturePanel) -> Iterator[None]:
     """Let the first Ctrl-C press the stop button, and the second interrupt."""
 
     def stop(number: int, frame: FrameType | None) -> None:

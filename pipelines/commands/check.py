@@ -9,7 +9,7 @@ from faintfield.pipelines.console import say
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.rig_file import read_rig
-from faintfield.rig.capture.guide import spoken_duration
+from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import is_simulated, open_rig
 from faintfield.rig.stages.settings import StageSettings
@@ -44,7 +44,7 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
     elif not stored.exists():
         say("the stage's settings are not stored yet; with --remember, later checks say what has changed")
     return {
-        "frames": found.plan.frames(),
+        "frames": found.plan.frame_count(),
         "disk_bytes": found.plan.disk_bytes(),
         "duration_s": found.duration_s,
         "stage": found.stage.firmware,
@@ -56,7 +56,7 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
 
 def time_in_words(duration_s: float, stage: StageSettings) -> str:
     """Return how long a capture takes, and by whose clock if that is not the one on the wall."""
-    words = f"{spoken_duration(duration_s)} without prompts"
+    words = f"{format_duration(duration_s)} without prompts"
     return f"{words} by the simulated stage's clock, far less by yours" if is_simulated(stage) else words
 
 
@@ -68,7 +68,7 @@ def _lines(found: Survey, stage: StageSettings, rig: Path, need: int) -> list[st
     return [
         f"stage: {found.stage.firmware}, travel {travel}; all {len(plan.path())} points of the way are allowed",
         f"camera: {found.camera.name}; all exposure times are offered",
-        f"plan: {plan.frames()} frames in {len(plan.steps)} steps, {time_in_words(found.duration_s, stage)}",
+        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {time_in_words(found.duration_s, stage)}",
         f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
     ]
 

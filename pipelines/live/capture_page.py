@@ -22,9 +22,9 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import WISHES, Panel, Shown
-from faintfield.pipelines.live.terminal import MEANINGS, levels
-from faintfield.rig.capture.guide import spoken_duration
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.terminal import LABELS, display_levels
+from faintfield.rig.capture.guide import format_duration
 
 _HOST = "127.0.0.1"
 _PICTURE_PX = 960
@@ -47,11 +47,11 @@ class _Press(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @contextmanager
-def serving_page(panel: Panel) -> Iterator[str]:
+def serve_page(panel: CapturePanel) -> Iterator[str]:
     """Serve the page of `panel` while the block runs, and yield its address."""
     token = secrets.token_urlsafe(24)
     listener = socket.create_server((_HOST, 0))
-    config = uvicorn.Config(page_of(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(page_application(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
     thread.start()
@@ -63,7 +63,7 @@ def serving_page(panel: Panel) -> Iterator[str]:
         listener.close()
 
 
-def page_of(panel: Panel, token: str) -> Starlette:
+def page_application(panel: CapturePanel, token: str) -> Starlette:
     """Return the page as an application; without the token there is nothing to be found."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
@@ -71,12 +71,12 @@ def page_of(panel: Panel, token: str) -> Starlette:
         return HTMLResponse(html, headers=_HEADERS)
 
     async def state(_: Request) -> Response:
-        return JSONResponse(state_of(panel), headers=_HEADERS)
+        return JSONResponse(page_state(panel), headers=_HEADERS)
 
     async def picture(_: Request) -> Response:
         if panel.shown is None:
             return Response(status_code=404, headers=_HEADERS)
-        return Response(picture_of(panel.shown), media_type="image/png", headers=_HEADERS)
+        return Response(frame_png(panel.shown), media_type="image/png", headers=_HEADERS)
 
     async def press(request: Request) -> Response:
         try:
@@ -84,7 +84,7 @@ def page_of(panel: Panel, token: str) -> Starlette:
             pressed = msgspec.json.decode(body[:_LONGEST_PRESS_BYTES], type=_Press)
         except msgspec.DecodeError as failure:
             return JSONResponse({"error": str(failure)}, status_code=400, headers=_HEADERS)
-        if pressed.word not in MEANINGS:
+        if pressed.word not in LABELS:
             return JSONResponse({"error": "no such button"}, status_code=400, headers=_HEADERS)
         panel.press(pressed.word, pressed.prompt)
         return JSONResponse({}, headers=_HEADERS)
@@ -102,27 +102,27 @@ def page_of(panel: Panel, token: str) -> Starlette:
     )
 
 
-def state_of(panel: Panel) -> dict[str, Any]:
+def page_state(panel: CapturePanel) -> dict[str, Any]:
     """Return all that the page shows, except the picture."""
     asked, status, shown = panel.asked, panel.status, panel.shown
-    words = list(WISHES) if asked is None else list(asked.prompt.answers)
+    words = list(REQUESTS) if asked is None else list(asked.prompt.answers)
     return {
         "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
         "status": None if status is None else msgspec.to_builtins(status),
-        "to_go": "" if status is None else spoken_duration(status.to_go_s),
-        "buttons": [{"word": word, "label": MEANINGS[word]} for word in words],
+        "to_go": "" if status is None else format_duration(status.to_go_s),
+        "buttons": [{"word": word, "label": LABELS[word]} for word in words],
         "frame": None if shown is None else _frame_state(shown),
     }
 
 
-def picture_of(shown: Shown) -> bytes:
+def frame_png(shown: ShownFrame) -> bytes:
     """Return a frame as PNG, in red alone."""
-    grey = levels(shown.pixels, _PICTURE_PX)
+    grey = display_levels(shown.pixels, _PICTURE_PX)
     zero = np.zeros_like(grey)
     return encoded(np.dstack([grey, zero, zero]), ".png")
 
 
-def _frame_state(shown: Shown) -> dict[str, Any]:
+def _frame_state(shown: ShownFrame) -> dict[str, Any]:
     """Return name, figures and histogram of a frame."""
     counts, edges = np.histogram(shown.pixels, bins=_BINS)
     return {

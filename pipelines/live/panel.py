@@ -12,27 +12,27 @@ from typing import NamedTuple, get_args
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Answer, Prompt, Status, Wish
+from faintfield.rig.capture.guide import Answer, Prompt, Status, OperatorRequest
 from faintfield.rig.session.frames import PlannedFrame
 
-WISHES: tuple[Wish, ...] = get_args(Wish.__value__)
+REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
 
 
-class Pressed(NamedTuple):
+class ButtonPress(NamedTuple):
     """A button or key: the word on it, and the number of the prompt that it was meant for, if for one."""
 
     word: str
     prompt: int | None
 
 
-class Asked(Struct, frozen=True):
+class OpenPrompt(Struct, frozen=True):
     """A prompt that waits for its answer; `number` tells it from earlier ones."""
 
     number: int
     prompt: Prompt
 
 
-class Shown(Struct, frozen=True):
+class ShownFrame(Struct, frozen=True):
     """A frame as it is looked at."""
 
     frame: PlannedFrame
@@ -40,8 +40,8 @@ class Shown(Struct, frozen=True):
     values: Mapping[str, float]
 
 
-class Panel:
-    """An `Operator` that others look at and press buttons of.
+class CapturePanel:
+    """An `OperatorInterface` that others look at and press buttons of.
 
     Parameters
     ----------
@@ -57,23 +57,23 @@ class Panel:
     """
 
     def __init__(self, *, unattended: bool) -> None:
-        self.asked: Asked | None = None
+        self.asked: OpenPrompt | None = None
         self.status: Status | None = None
-        self.shown: Shown | None = None
+        self.shown: ShownFrame | None = None
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
-        self._pressed: SimpleQueue[Pressed] = SimpleQueue()
+        self._pressed: SimpleQueue[ButtonPress] = SimpleQueue()
         self._numbers = itertools.count(1)
 
     def press(self, word: str, prompt: int | None = None) -> None:
         """Press a button, from any thread or a signal handler."""
-        self._pressed.put(Pressed(word, prompt))
+        self._pressed.put(ButtonPress(word, prompt))
 
     def ask(self, prompt: Prompt) -> Answer:
         """Wait for an answer to `prompt` from wherever it comes."""
         if self.unattended:
             return prompt.unattended
-        self.asked = Asked(next(self._numbers), prompt)
+        self.asked = OpenPrompt(next(self._numbers), prompt)
         self._changed()
         while True:
             pressed = self._pressed.get()
@@ -82,15 +82,15 @@ class Panel:
                 self._changed()
                 return pressed.word
 
-    def wish(self) -> Wish | None:
+    def wish(self) -> OperatorRequest | None:
         """Return the latest of what was wished for since the last call."""
-        latest: Wish | None = None
+        latest: OperatorRequest | None = None
         while True:
             try:
                 pressed = self._pressed.get_nowait()
             except Empty:
                 return latest
-            if pressed.word in WISHES and pressed.prompt is None:
+            if pressed.word in REQUESTS and pressed.prompt is None:
                 latest = pressed.word
 
     def show_status(self, status: Status) -> None:
@@ -100,7 +100,7 @@ class Panel:
 
     def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
         """Show the frame just taken."""
-        self.shown = Shown(frame, pixels, values)
+        self.shown = ShownFrame(frame, pixels, values)
         self._changed()
 
     def _changed(self) -> None:

@@ -16,12 +16,12 @@ from rich.live import Live
 from rich.text import Text
 
 from faintfield.pipelines.console import console, say
-from faintfield.pipelines.live.panel import Panel, Shown
+from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Prompt, Status, spoken_duration
+from faintfield.rig.capture.guide import Prompt, Status, format_duration
 
 KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
-MEANINGS = {
+LABELS = {
     "go": "go on",
     "again": "try again",
     "keep": "keep as it is",
@@ -39,18 +39,18 @@ class TerminalView:
 
     Parameters
     ----------
-    panel : Panel
+    panel : CapturePanel
         What to show.
     """
 
-    def __init__(self, panel: Panel) -> None:
+    def __init__(self, panel: CapturePanel) -> None:
         self._panel = panel
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._said: set[str] = set()
         self._asked = 0
 
     @contextmanager
-    def showing(self) -> Iterator[None]:
+    def show(self) -> Iterator[None]:
         """Show the panel while the block runs."""
         self._panel.on_change.append(self._refresh)
         if not console.is_terminal:
@@ -82,7 +82,7 @@ class TerminalView:
             parts += [frame_picture(self._panel.shown.pixels), Text(values_line(self._panel.shown), style="dim")]
         if self._panel.status is not None:
             parts.append(Text(status_line(self._panel.status)))
-        wishes = "  ".join(f"[{KEYS[word]}] {MEANINGS[word]}" for word in ("pause", "retake", "skip", "stop"))
+        wishes = "  ".join(f"[{KEYS[word]}] {LABELS[word]}" for word in ("pause", "retake", "skip", "stop"))
         if self._panel.asked is None:
             parts.append(Text(wishes, style="dim"))
         return Group(*parts)
@@ -90,22 +90,22 @@ class TerminalView:
 
 def prompt_lines(prompt: Prompt) -> list[str]:
     """Return a prompt as lines of text."""
-    answers = "   ".join(f"[{KEYS[answer]}] {MEANINGS[answer]}" for answer in prompt.answers)
+    answers = "   ".join(f"[{KEYS[answer]}] {LABELS[answer]}" for answer in prompt.answers)
     return [
         "",
         prompt.title,
         *(f"  {line}" for line in prompt.lines),
-        f"  {answers}   (Enter: {MEANINGS[prompt.answers[0]]})",
+        f"  {answers}   (Enter: {LABELS[prompt.answers[0]]})",
     ]
 
 
 def status_line(status: Status) -> str:
     """Return the status in a line."""
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
-    return f"{status.done} of {status.total} frames, {spoken_duration(status.to_go_s)} to go;{node}: {status.doing}"
+    return f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
 
 
-def values_line(shown: Shown) -> str:
+def values_line(shown: ShownFrame) -> str:
     """Return the name of a frame and its histogram, and in a second line what was measured in it."""
     values = "  ".join(f"{name} {value:g}" for name, value in shown.values.items())
     return f"{shown.frame.name}  {histogram_bars(shown.pixels)}\n{values}"
@@ -118,7 +118,7 @@ def histogram_bars(pixels: Pixels, bins: int = 24) -> str:
     return "".join(_BARS[round(height * (len(_BARS) - 1))] for height in heights)
 
 
-def levels(pixels: Pixels, width_px: int) -> Pixels:
+def display_levels(pixels: Pixels, width_px: int) -> Pixels:
     """Return a frame as 8-bit levels (row, column), reduced to a width, from its 1 % to its 99.8 % quantile."""
     grey = np.asarray(pixels if pixels.ndim == 2 else pixels.mean(axis=2), np.float32)
     scale = min(1.0, width_px / grey.shape[1])
@@ -129,7 +129,7 @@ def levels(pixels: Pixels, width_px: int) -> Pixels:
 
 def frame_picture(pixels: Pixels) -> Text:
     """Return a frame in half blocks, red on black: what does not spoil eyes that are used to the dark."""
-    picture = levels(pixels, _PICTURE_COLUMNS)
+    picture = display_levels(pixels, _PICTURE_COLUMNS)
     text = Text()
     for top, bottom in zip(picture[:-1:2], picture[1::2], strict=True):
         for upper, lower in zip(top, bottom, strict=True):
@@ -139,7 +139,7 @@ def frame_picture(pixels: Pixels) -> Text:
 
 
 @contextmanager
-def _keys(panel: Panel) -> Iterator[None]:
+def _keys(panel: CapturePanel) -> Iterator[None]:
     """Let single keys press the panel's buttons while the block runs."""
     if not sys.stdin.isatty():
         yield

@@ -12,7 +12,7 @@ from faintfield.pipelines import cli
 from faintfield.pipelines.commands.check import time_in_words
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.rig.session.access import taken_frames
-from faintfield.rig.session.disk import locked
+from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.settings import StageSettings
@@ -255,7 +255,7 @@ def test_a_session_stays_with_its_rig_and_with_one_capture(shell: Shell) -> None
     with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
     assert "Interrupted" in shell.words
-    with locked(shell.session):
+    with lock_session(shell.session):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
         assert "SessionBusy" in shell.words
         assert shell.run("verify", shell.session) == 1

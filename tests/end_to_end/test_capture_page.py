@@ -14,15 +14,15 @@ import cv2
 import numpy as np
 import pytest
 
-from faintfield.pipelines.live.capture_page import serving_page
-from faintfield.pipelines.live.panel import Panel
+from faintfield.pipelines.live.capture_page import serve_page
+from faintfield.pipelines.live.panel import CapturePanel
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, RigError
-from faintfield.rig.session.access import opened
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import CHROMIUM, Tab, browsing
@@ -36,13 +36,13 @@ class Running:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.panel = Panel(unattended=False)
+        self.panel = CapturePanel(unattended=False)
         self.failure: RigError | None = None
         self._stack = ExitStack()
         self._thread = threading.Thread(target=self._capture)
 
     def __enter__(self) -> "Running":
-        self.address = self._stack.enter_context(serving_page(self.panel))
+        self.address = self._stack.enter_context(serve_page(self.panel))
         self._thread.start()
         return self
 
@@ -60,7 +60,7 @@ class Running:
     def _capture(self) -> None:
         plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
         try:
-            with opened(self.folder, plan) as session, TerminalView(self.panel).showing():
+            with open_session(self.folder, plan) as session, TerminalView(self.panel).show():
                 Capture(session, open_rig(SMALL_RIG, session.journal), self.panel, lambda path: None).run()
         except RigError as failure:
             self.failure = failure
@@ -177,5 +177,5 @@ def test_nonsense_presses_no_button(running: Running, body: bytes) -> None:
 
 
 def test_one_page_has_another_token_than_the_next() -> None:
-    with serving_page(Panel(unattended=True)) as one, serving_page(Panel(unattended=True)) as other:
+    with serve_page(CapturePanel(unattended=True)) as one, serve_page(CapturePanel(unattended=True)) as other:
         assert urllib.parse.urlsplit(one).path != urllib.parse.urlsplit(other).path

@@ -18,8 +18,8 @@ from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid
 from faintfield.rig.session import disk, session
-from faintfield.rig.session.access import opened
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
@@ -52,8 +52,8 @@ STEPS: Mapping[str, tuple[Any, str]] = {
 def capture_small(folder: Path, settings: RigSettings = SMALL_RIG) -> None:
     """Begin or resume a session without a person, and finish it."""
     frozen = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
-    with opened(folder, frozen) as open_session:
-        Capture(open_session, open_rig(settings, open_session.journal), Unattended(), lambda path: None).run()
+    with open_session(folder, frozen) as begun:
+        Capture(begun, open_rig(settings, begun.journal), Unattended(), lambda path: None).run()
 
 
 def capture_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:

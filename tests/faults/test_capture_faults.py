@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
-from faintfield.rig.capture.guide import Answer, Operator, Prompt, Unattended
+from faintfield.rig.capture.guide import Answer, OperatorInterface, Prompt, Unattended
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
-from faintfield.rig.session.access import opened, read_plan, taken_frames
-from faintfield.rig.session.disk import file_of
+from faintfield.rig.session.access import read_plan, taken_frames
+from faintfield.rig.session.disk import encode_exposure
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, is_sealed
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, RigSettings
@@ -74,12 +75,12 @@ class Lab:
     def run(
         self,
         prepare: Callable[[Bench, TruthfulCamera], None] = lambda bench, camera: None,
-        operator: Operator | None = None,
+        operator: OperatorInterface | None = None,
     ) -> RigError | None:
         """Capture; return how it failed, None when it did not."""
         frozen = read_plan(self.folder) if (self.folder / "plan.json").exists() else self.plan()
         try:
-            with opened(self.folder, frozen) as session:
+            with open_session(self.folder, frozen) as session:
                 bench = Bench(CONTROLLERS[self.protocol])
                 camera = TruthfulCamera(bench)
                 rig = Rig(bench.stage(traffic=session.journal), camera, bench.clock, lambda kind, sweep: None)
@@ -237,7 +238,7 @@ def capture_read_only(folder: Path, place: str) -> None:
     from faintfield.rig.devices import open_rig
 
     plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
-    with opened(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
+    with open_session(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
         Capture(session, open_rig(SMALL_RIG, session.journal), Interfering(), lambda path: None).run()
 
 
@@ -253,4 +254,4 @@ def test_a_folder_made_read_only(tmp_path: Path) -> None:
 
 
 def test_frames_are_kept_as_the_camera_made_them() -> None:
-    assert file_of(Exposure(".nef", content=b"raw")) == b"raw"
+    assert encode_exposure(Exposure(".nef", content=b"raw")) == b"raw"

@@ -2,13 +2,15 @@
 
 import pytest
 
-from faintfield.rig.capture.sweeps import board_doubts
-from faintfield.rig.plan import CapturePlan, Grid, Step
+from faintfield.rig.capture.sweeps import board_warnings
+from faintfield.rig.plan import CapturePlan, CaptureStep, Grid
 from faintfield.rig.session.frames import planned_frames
 from faintfield.rig.stages.protocol import Point
 
 _GRID = Grid(3, 3, 50.0, Point(0.0, 0.0))
-_PLAN = CapturePlan.of(_GRID, [Step("charuco", (0.1,)), Step("charuco", (0.1,))], approach_mm=1.0, frame_bytes=1)
+_PLAN = CapturePlan.of(
+    _GRID, [CaptureStep("charuco", (0.1,)), CaptureStep("charuco", (0.1,))], approach_mm=1.0, frame_bytes=1
+)
 FRAMES = planned_frames(_PLAN)
 
 
@@ -18,7 +20,7 @@ def _said(corners: list[int]) -> list[str]:
     said: list[str] = []
     for number in known:
         upto = {key: value for key, value in known.items() if key <= number}
-        said += board_doubts(FRAMES[number], FRAMES, upto, 6)
+        said += board_warnings(FRAMES[number], FRAMES, upto, 6)
     return said
 
 

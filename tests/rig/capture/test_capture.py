@@ -13,16 +13,17 @@ from faintfield.rig.boards import Board
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.checks import check_frame
-from faintfield.rig.capture.guide import TITLES, Answer, Prompt, Status, Wish, spoken_duration, step_prompt
+from faintfield.rig.capture.guide import TITLES, Answer, OperatorRequest, Prompt, Status, format_duration, step_prompt
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.settling import measure_settling
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
 from faintfield.rig.plan import Grid
-from faintfield.rig.session.access import opened, taken_frames
+from faintfield.rig.session.access import taken_frames
 from faintfield.rig.session.frames import PlannedFrame, planned_frames
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
@@ -41,7 +42,7 @@ class Person:
     """
 
     def __init__(
-        self, answers: Mapping[str, Sequence[Answer]] | None = None, wishes: Mapping[int, Wish] | None = None
+        self, answers: Mapping[str, Sequence[Answer]] | None = None, wishes: Mapping[int, OperatorRequest] | None = None
     ) -> None:
         self.answers = {key: list(values) for key, values in (answers or {}).items()}
         self.wishes = dict(wishes or {})
@@ -57,7 +58,7 @@ class Person:
         assert answer in prompt.answers
         return answer
 
-    def wish(self) -> Wish | None:
+    def take_request(self) -> OperatorRequest | None:
         return self.wishes.pop(len(self.seen), None)
 
     def show_status(self, status: Status) -> None:
@@ -72,7 +73,7 @@ def run(folder: Path, person: Person, settings: RigSettings = SMALL_RIG) -> RigE
     """Capture; return why it ended early, if it did."""
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     try:
-        with opened(folder, plan) as session:
+        with open_session(folder, plan) as session:
             Capture(session, open_rig(settings, session.journal), person, lambda path: None).run()
     except RigError as failure:
         return failure
@@ -108,14 +109,14 @@ def test_every_frame_has_its_record(tmp_path: Path) -> None:
     assert run(tmp_path / "session", Person()) is None
     for frame, committed, path in taken_frames(tmp_path / "session"):
         assert path.is_file()
-        assert committed.detail["position_mm"] == pytest.approx(list(frame.stop.target), abs=0.02)
-        assert committed.detail["exposure_s"] == frame.exposure_s
-        assert committed.detail["camera"]["camera"] == "simulated camera"
-        assert "median_dn" in committed.detail["checks"]
+        assert committed.record.position_mm == pytest.approx(list(frame.stop.target), abs=0.02)
+        assert committed.record.exposure_s == frame.exposure_s
+        assert committed.record.camera["camera"] == "simulated camera"
+        assert "median_dn" in committed.record.checks
 
 
 @pytest.mark.parametrize(("wish", "answer"), [("stop", None), ("pause", "stop")])
-def test_stop_and_go_on(tmp_path: Path, wish: Wish, answer: Answer | None) -> None:
+def test_stop_and_go_on(tmp_path: Path, wish: OperatorRequest, answer: Answer | None) -> None:
     person = Person({"paused": [answer]} if answer else {}, {4: wish})
     failure = run(tmp_path / "session", person)
     assert isinstance(failure, CaptureStopped)
@@ -277,7 +278,7 @@ def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> 
     )
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     person, told = Person(), list[tuple[float, float]]()
-    with opened(tmp_path / "session", plan) as session:
+    with open_session(tmp_path / "session", plan) as session:
         rig = open_rig(settings, session.journal)
         person.on_status = lambda status: told.append((rig.clock.now_s(), status.to_go_s))
         Capture(session, rig, person, lambda path: None).run()
@@ -311,7 +312,7 @@ def test_the_guide_has_words_for_every_kind() -> None:
     ],
 )
 def test_durations_as_one_says_them(duration_s: float, words: str) -> None:
-    assert spoken_duration(duration_s) == words
+    assert format_duration(duration_s) == words
 
 
 def scene(kind: str, **changes: float) -> Pixels:
