@@ -120,7 +120,7 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"step.at = {self.at!r}; give 'grid' or 'centre'")
         if self.photons_per_s is not None and not (self.kind == "flat" and 0.0 < self.photons_per_s < math.inf):
             raise ValueError(
-                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give a positive number, in flats only"
+                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give a positive number, in flats"
             )
         self.step()
 

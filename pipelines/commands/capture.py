@@ -9,7 +9,7 @@ from types import FrameType
 from typing import Any
 
 from faintfield.pipelines.commands.check import ROOM_FACTOR, time_in_words
-from faintfield.pipelines.console import console, progress, say
+from faintfield.pipelines.console import console, progress, inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.rig_file import decoded, read_rig
@@ -44,23 +44,23 @@ def capture(rig: Path, session: Path, /, *, yes: bool = False, page: bool = Fals
     settings = read_rig(rig)
     frozen = _planned(settings, session)
     if is_sealed(session):
-        say(f"{session}: is complete; there is nothing left to capture")
+        inform(f"{session}: is complete; there is nothing left to capture")
         return {"session": str(session), "complete": True, "taken": 0}
     panel = CapturePanel(unattended=yes)
     with ExitStack() as stack:
         open_session = stack.enter_context(opened(session, frozen, lambda frames: progress(list(frames), "comparing")))
         before = len(open_session.valid())
         if before:
-            say(f"{session}: {before} of {len(open_session.frames)} frames are there; going on")
+            inform(f"{session}: {before} of {len(open_session.frames)} frames are there; going on")
         if page:
             from faintfield.pipelines.live.capture_page import serve_page
 
-            say(f"page: {stack.enter_context(serve_page(panel))}")
+            inform(f"page: {stack.enter_context(serve_page(panel))}")
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         Capture(open_session, open_rig(settings, open_session.journal), panel, decoded).run()
         taken = len(open_session.valid()) - before
-    say(f"{session}: complete, {taken} frames taken; faintfield verify {session} compares every byte")
+    inform(f"{session}: complete, {taken} frames taken; faintfield verify {session} compares every byte")
     return {"session": str(session), "complete": True, "taken": taken}
 
 
@@ -72,9 +72,9 @@ def _planned(settings: RigSettings, session: Path) -> FrozenPlan:
         return frozen
     found = survey(open_rig(settings), settings)
     for warning in found.stage.warnings:
-        say(f"warning: {warning}")
+        inform(f"warning: {warning}")
     require_room(session, round(ROOM_FACTOR * found.plan.disk_bytes()))
-    say(f"{found.plan.frame_count()} frames, {time_in_words(found.duration_s, settings.stage)}")
+    inform(f"{found.plan.frame_count()} frames, {time_in_words(found.duration_s, settings.stage)}")
     return FrozenPlan(found.plan, settings)
 
 

@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.rig_file import read_rig
@@ -35,14 +35,14 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
     need = round(ROOM_FACTOR * found.plan.disk_bytes())
     require_room(rig, need)
     for line in _lines(found, settings.stage, rig, need):
-        say(line)
+        inform(line)
     for warning in (*found.stage.warnings, *changed):
-        say(f"warning: {warning}")
+        inform(f"warning: {warning}")
     if remember:
         write_json(stored, found.stage.settings)
-        say(f"stored the stage's settings in {stored}")
+        inform(f"stored the stage's settings in {stored}")
     elif not stored.exists():
-        say("the stage's settings are not stored yet; with --remember, later checks say what has changed")
+        inform("the stage's settings are not stored yet; with --remember, later checks say what has changed")
     return {
         "frames": found.plan.frame_count(),
         "disk_bytes": found.plan.disk_bytes(),

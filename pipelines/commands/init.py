@@ -4,7 +4,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import write_whole
 
@@ -20,5 +20,5 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
     if rig.exists():
         raise OutputExists(f"{rig}: is there already and is not overwritten; name another file, or edit this one")
     write_whole(rig, files("faintfield.pipelines.formats").joinpath("rig_template.toml").read_text(encoding="utf-8"))
-    say(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
+    inform(f"wrote {rig}; describe your rig in it, then: faintfield check {rig}")
     return {"rig": str(rig)}

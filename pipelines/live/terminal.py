@@ -15,7 +15,7 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from faintfield.pipelines.console import console, say
+from faintfield.pipelines.console import console, inform
 from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Prompt, Status, format_duration
@@ -65,13 +65,13 @@ class TerminalView:
         if asked is not None and asked.number != self._asked:
             self._asked = asked.number
             for line in prompt_lines(asked.prompt):
-                say(line)
+                inform(line)
         if status is not None:
             title = [status.title] if self._panel.unattended else []
             for line in (*title, *(f"warning: {it}" for it in status.warnings)):
                 if line not in self._said:
                     self._said.add(line)
-                    say(line)
+                    inform(line)
         if console.is_terminal:
             self._live.update(self._picture(), refresh=True)
 

@@ -1,0 +1,263 @@
+"""The records of planes and reconstructions: one type per JSON file, for its writer, its readers and its tests.
+
+Keys stand in a file in the order of the fields; a field that is UNSET is left out.
+"""
+
+from typing import Annotated, Literal
+
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
+
+# Methods that reconstruct all planes together.
+JOINT_METHODS: tuple[Method, ...] = ("joint", "occlusion")
+
+
+class Certificate(Struct, frozen=True, kw_only=True):
+    """How far an iteration came.
+
+    PMLEM to its optimum: `value` bounds the relative distance to the optimum (`stationarity` and `slack` are its
+    parts), and `reached` says whether it is below `tolerance`. One-step-late: `relative_change` of the last pass.
+    """
+
+    kind: str
+    value: float | UnsetType = UNSET
+    stationarity: float | UnsetType = UNSET
+    slack: float | UnsetType = UNSET
+    tolerance: float | UnsetType = UNSET
+    reached: bool | UnsetType = UNSET
+    passes: int | UnsetType = UNSET
+    inner_steps: int | UnsetType = UNSET
+    relative_change: float | UnsetType = UNSET
+    settled: bool | UnsetType = UNSET
+    oscillates: bool | UnsetType = UNSET
+    kept_at_start: int | UnsetType = UNSET
+
+
+class WeightScore(Struct, frozen=True):
+    """A penalty weight that was tried: the negative log-likelihood of the held-out views."""
+
+    weight: float
+    held_out: float
+
+
+class PenaltyRecord(Struct, frozen=True):
+    """The penalty, with its smoothing in electrons."""
+
+    name: str
+    smoothing_e: float
+
+
+class PlaneRecord(Struct, frozen=True, kw_only=True):
+    """One colour of one plane, in reconstruction.json and in the plane's own record.
+
+    A plane given by a pose has a `name` and `rt_ref_plane`. Lengths are in mm, light in electrons.
+    """
+
+    name: str | UnsetType = UNSET
+    depth_mm: float
+    rt_ref_plane: tuple[float, float, float, float, float, float] | UnsetType = UNSET
+    method: Method
+    channel: str
+    file: str
+    shape: tuple[int, int]
+    pitch_mm: float
+    origin_mm: tuple[float, float]
+    penalty_weight: float | None
+    penalty_weight_chosen: str
+    epsilon_e2: float | None
+    passes: int
+    objective: float | None
+    certificate: Certificate | None
+    mean_e: float
+    passes_before: float | UnsetType = UNSET
+    penalty_weight_curve: list[WeightScore] | None | UnsetType = UNSET
+    penalty: PenaltyRecord | UnsetType = UNSET
+    likelihood: str | UnsetType = UNSET
+    occlusion: bool | UnsetType = UNSET
+    occlusion_left_out: str | UnsetType = UNSET
+    flux_e: float
+    sigma_file: str | UnsetType = UNSET
+    opacity_file: str | UnsetType = UNSET
+
+
+class FocusPoint(Struct, frozen=True):
+    """The power of detail on a plane, and its standard deviation."""
+
+    detail_e2: float
+    sigma_e2: float
+
+
+class FocusCurve(Struct, frozen=True):
+    """Focus against depth, and the depths at which it peaks."""
+
+    depth_mm: list[float]
+    detail_e2: list[float]
+    sigma_e2: list[float]
+    sharp_mm: list[float]
+
+
+class BestFocusRecord(Struct, frozen=True):
+    """How `--depth-mm auto` found its depths."""
+
+    depth_mm: list[float]
+    searched_mm: list[tuple[float, float]]
+    depths_per_search: int
+    bins_px: int
+    share_of_sure: list[float]
+
+
+class DepthMapRecord(Struct, frozen=True):
+    """The maps of a sweep: their files, unit and how much of them is known."""
+
+    file: str
+    confidence: str
+    all_in_focus: str
+    unit: Literal["mm", "px"]
+    bins_px: int
+    sure_above: float
+    sure_share: float
+    median: float | None
+
+
+class ReconstructionOptions(Struct, frozen=True):
+    """The options of `faintfield reconstruct` as they took effect."""
+
+    method: Method
+    depth_mm: list[float]
+    penalty_weight: float | Literal["auto"]
+    penalty: str
+    likelihood: str
+    uncertainty: bool
+    passes: int | None
+    pitch_mm: float | None
+    focus: bool
+    depth_map: Literal["mm", "px"] | None
+    plane_pose: dict[str, list[float]]
+    poses: str
+
+
+class PlaneFileRecord(Struct, frozen=True, kw_only=True):
+    """The record beside a plane (`plane_00500.0.json`), which vouches for its files."""
+
+    format: Literal[1] = 1
+    planes: list[PlaneRecord]
+    focus: list[FocusPoint | None]
+    sha256: dict[str, str]
+    command: str
+    options: ReconstructionOptions
+    inputs: dict[str, str]
+    versions: dict[str, str]
+
+
+class DepthMapFileRecord(Struct, frozen=True, kw_only=True):
+    """`depth_map.json`, which vouches for the maps beside it."""
+
+    format: Literal[1] = 1
+    depth_map: DepthMapRecord
+    sha256: dict[str, str]
+    command: str
+    options: ReconstructionOptions
+    inputs: dict[str, str]
+    versions: dict[str, str]
+
+
+class ReconstructionRecord(Struct, frozen=True, kw_only=True):
+    """`reconstruction.json`: all planes of one method, and how they were made."""
+
+    format: Literal[1] = 1
+    planes: Annotated[list[PlaneRecord], Meta(min_length=1)]
+    focus: FocusCurve | None
+    best_focus: BestFocusRecord | None
+    depth_map: DepthMapRecord | None
+    wall_time_s: float
+    command: str
+    options: ReconstructionOptions
+    inputs: dict[str, str]
+    versions: dict[str, str]
+
+
+class PlaneErrors(Struct, frozen=True):
+    """The errors of one plane against the truth, the object scaled to 0…1."""
+
+    depth_mm: float
+    method: Method
+    poses: str
+    object: str
+    mse_bright: float
+    mse_texture: float
+    mse_plane: float
+    psnr_db: float | None
+
+
+class SnrRecord(Struct, frozen=True):
+    """The SNR of eq. (4): asked of the simulator, and measured."""
+
+    asked: float
+    measured: float | None
+
+
+class PhotonsRecord(Struct, frozen=True):
+    """Photons per pixel of the reference view, by three definitions."""
+
+    linear: float
+    from_moments: float
+    on_object: float
+
+
+class GeometryErrors(Struct, frozen=True):
+    """How far the measured poses are off the true ones."""
+
+    nodes: int
+    centre_rms_mm: float
+    centre_rms_axes_mm: tuple[float, float, float]
+    rotation_rms_mdeg: float
+
+
+class KnownValue(Struct, frozen=True):
+    """A measured number, its standard error, and the truth."""
+
+    value: float | None
+    se: float | None
+    truth: float
+
+
+class Metrics(Struct, frozen=True, kw_only=True):
+    """`metrics.json`: the errors of planes whose truth is known; a demo adds those of its calibration."""
+
+    geometry: GeometryErrors | UnsetType = UNSET
+    noise: dict[str, KnownValue] | UnsetType = UNSET
+    planes: list[PlaneErrors]
+    snr: SnrRecord
+    photons_per_px: PhotonsRecord
+
+
+class BrightnessRecord(Struct, frozen=True):
+    """The SNR and photon figures of a set's reference view; see `reconstruction.brightness`."""
+
+    region: str
+    noise_from: str
+    snr: float | None
+    electrons_linear: float | None
+    electrons_from_moments: float | None
+    mean_signal_e: float
+    photons_linear: float | None
+    photons_from_moments: float | None
+
+
+class Overview(Struct, frozen=True):
+    """`overview.json`: a set at a glance, beside its pictures."""
+
+    set: str
+    views: int
+    grid: tuple[int, int] | None
+    poses: str
+    size_px: tuple[int, int]
+    exposure_s: float
+    frames_per_view: int
+    read_noise_e: float
+    has_noise_reference: bool
+    quantum_efficiency: float | None
+    dark_e: float
+    grey_scale_dn: tuple[float, float]
+    brightness: BrightnessRecord
