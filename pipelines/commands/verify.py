@@ -1,4 +1,4 @@
-"""`faintfield verify`: every frame against its hash, the journal against the plan."""
+"""`faintfield verify`: compare every frame of a session with its hash, and the journal with the plan."""
 
 from pathlib import Path
 from typing import Any
@@ -7,9 +7,10 @@ import msgspec
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.rig.errors import SessionCorrupt
-from faintfield.rig.session.verify import verify as verdict_of
+from faintfield.rig.session.verify import verify as verify_session
 
-_SHOWN = 10
+# Problems printed one by one; the failure gives their number.
+_MAX_SHOWN = 10
 
 
 def verify(session: Path, /) -> dict[str, Any]:
@@ -20,8 +21,8 @@ def verify(session: Path, /) -> dict[str, Any]:
     session
         Its folder.
     """
-    verdict = verdict_of(session, lambda paths: progress(list(paths), "hashing"))
-    for problem in verdict.problems[:_SHOWN]:
+    verdict = verify_session(session, lambda paths: progress(list(paths), "hashing"))
+    for problem in verdict.problems[:_MAX_SHOWN]:
         inform(f"problem: {problem}")
     if verdict.problems:
         raise SessionCorrupt(

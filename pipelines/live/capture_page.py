@@ -1,6 +1,6 @@
-"""The capture as a local web page: what the terminal shows, and its keys as buttons, dim red on black.
+"""Serve a capture as a local web page: what the terminal shows, with its keys as buttons, dim red on black.
 
-Served to this computer alone, at an address that nobody can guess: its first part is a random token.
+The page is served to this computer only, at an address that cannot be guessed: its path begins with a random token.
 """
 
 import secrets
@@ -27,9 +27,11 @@ from faintfield.pipelines.live.terminal import LABELS, display_levels
 from faintfield.rig.capture.guide import format_duration
 
 _HOST = "127.0.0.1"
+# Width of the frame's picture in pixels.
 _PICTURE_PX = 960
-_BINS = 64
-_LONGEST_PRESS_BYTES = 1000
+_HISTOGRAM_BINS = 64
+# Longer requests are not read: a press is far shorter.
+_MAX_PRESS_BYTES = 1000
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -39,8 +41,8 @@ _HEADERS = {
 }
 
 
-class _Press(msgspec.Struct, forbid_unknown_fields=True):
-    """What the page sends when a button is pressed."""
+class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
+    """Message from the page when a button is pressed."""
 
     word: str
     prompt: int | None = None
@@ -48,10 +50,12 @@ class _Press(msgspec.Struct, forbid_unknown_fields=True):
 
 @contextmanager
 def serve_page(panel: CapturePanel) -> Iterator[str]:
-    """Serve the page of `panel` while the block runs, and yield its address."""
+    """Serve the page of `panel` while the block runs; yield its address."""
     token = secrets.token_urlsafe(24)
     listener = socket.create_server((_HOST, 0))
-    config = uvicorn.Config(page_application(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
+    config = uvicorn.Config(
+        _application(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
     thread.start()
@@ -63,25 +67,25 @@ def serve_page(panel: CapturePanel) -> Iterator[str]:
         listener.close()
 
 
-def page_application(panel: CapturePanel, token: str) -> Starlette:
-    """Return the page as an application; without the token there is nothing to be found."""
+def _application(panel: CapturePanel, token: str) -> Starlette:
+    """Return the web application; every path of it begins with the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
         return HTMLResponse(html, headers=_HEADERS)
 
     async def state(_: Request) -> Response:
-        return JSONResponse(page_state(panel), headers=_HEADERS)
+        return JSONResponse(_state(panel), headers=_HEADERS)
 
     async def picture(_: Request) -> Response:
         if panel.shown is None:
             return Response(status_code=404, headers=_HEADERS)
-        return Response(frame_png(panel.shown), media_type="image/png", headers=_HEADERS)
+        return Response(_frame_png(panel.shown), media_type="image/png", headers=_HEADERS)
 
     async def press(request: Request) -> Response:
         try:
             body = await request.body()
-            pressed = msgspec.json.decode(body[:_LONGEST_PRESS_BYTES], type=_Press)
+            pressed = msgspec.json.decode(body[:_MAX_PRESS_BYTES], type=_PressRequest)
         except msgspec.DecodeError as failure:
             return JSONResponse({"error": str(failure)}, status_code=400, headers=_HEADERS)
         if pressed.word not in LABELS:
@@ -97,13 +101,13 @@ def page_application(panel: CapturePanel, token: str) -> Starlette:
     ]
     return Starlette(
         routes=[Route(f"/{token}/{path}", handler, methods=[method]) for path, handler, method in handlers],
-        # A page elsewhere whose name is made to point here is turned away
+        # Turn away requests by another host name, which a foreign page could make point to this computer
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST])],
     )
 
 
-def page_state(panel: CapturePanel) -> dict[str, Any]:
-    """Return all that the page shows, except the picture."""
+def _state(panel: CapturePanel) -> dict[str, Any]:
+    """Return what the page shows, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
     words = list(REQUESTS) if asked is None else list(asked.prompt.answers)
     return {
@@ -115,16 +119,16 @@ def page_state(panel: CapturePanel) -> dict[str, Any]:
     }
 
 
-def frame_png(shown: ShownFrame) -> bytes:
-    """Return a frame as PNG, in red alone."""
+def _frame_png(shown: ShownFrame) -> bytes:
+    """Return a frame as PNG, in red only."""
     grey = display_levels(shown.pixels, _PICTURE_PX)
     zero = np.zeros_like(grey)
     return encoded(np.dstack([grey, zero, zero]), ".png")
 
 
 def _frame_state(shown: ShownFrame) -> dict[str, Any]:
-    """Return name, figures and histogram of a frame."""
-    counts, edges = np.histogram(shown.pixels, bins=_BINS)
+    """Return name, measured values and histogram of a frame."""
+    counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
     return {
         "name": shown.frame.name,
         "values": dict(shown.values),

@@ -1,7 +1,7 @@
-"""What terminal and page have in common: one prompt, one status, one queue of pressed buttons.
+"""Hold what terminal and page share: one prompt, one status, one queue of pressed buttons.
 
-Whoever presses first answers; both show the same. The capture runs in the main thread and only looks at the queue, so
-a key, a click and Ctrl-C take the same way.
+Both show the same, and the first answer counts, wherever it comes from. The capture runs in the main thread and reads
+the queue, into which keys, clicks and Ctrl-C are put alike.
 """
 
 import itertools
@@ -12,28 +12,28 @@ from typing import NamedTuple, get_args
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Answer, Prompt, Status, OperatorRequest
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.session.frames import PlannedFrame
 
 REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
 
 
 class ButtonPress(NamedTuple):
-    """A button or key: the word on it, and the number of the prompt that it was meant for, if for one."""
+    """A pressed button or key: its word, and the number of the prompt that it answers, if any."""
 
     word: str
     prompt: int | None
 
 
 class OpenPrompt(Struct, frozen=True):
-    """A prompt that waits for its answer; `number` tells it from earlier ones."""
+    """A prompt that waits for its answer; `number` distinguishes it from earlier ones."""
 
     number: int
     prompt: Prompt
 
 
 class ShownFrame(Struct, frozen=True):
-    """A frame as it is looked at."""
+    """The frame on display, with its measured values by name."""
 
     frame: PlannedFrame
     pixels: Pixels
@@ -41,19 +41,19 @@ class ShownFrame(Struct, frozen=True):
 
 
 class CapturePanel:
-    """An `OperatorInterface` that others look at and press buttons of.
+    """The `OperatorInterface` of a capture; views show its state and press its buttons.
 
     Parameters
     ----------
     unattended : bool
-        Prompts answer themselves; wishes are still heard.
+        Give every prompt its unattended answer; requests are still accepted.
 
     Attributes
     ----------
     asked, status, shown
-        What is to be seen now. Each is replaced as a whole, so any thread may look.
+        Prompt, status and frame to show, or None. Each is replaced as a whole, so any thread may read them.
     on_change : list of callable
-        Told in the capture's thread that something is new.
+        Called in the thread of the capture when any of these has changed.
     """
 
     def __init__(self, *, unattended: bool) -> None:
@@ -70,7 +70,7 @@ class CapturePanel:
         self._pressed.put(ButtonPress(word, prompt))
 
     def ask(self, prompt: Prompt) -> Answer:
-        """Wait for an answer to `prompt` from wherever it comes."""
+        """Show `prompt` and return the first answer to it."""
         if self.unattended:
             return prompt.unattended
         self.asked = OpenPrompt(next(self._numbers), prompt)
@@ -82,8 +82,8 @@ class CapturePanel:
                 self._changed()
                 return pressed.word
 
-    def wish(self) -> OperatorRequest | None:
-        """Return the latest of what was wished for since the last call."""
+    def take_request(self) -> OperatorRequest | None:
+        """Return the latest request since the last call, None if there is none."""
         latest: OperatorRequest | None = None
         while True:
             try:
@@ -94,7 +94,7 @@ class CapturePanel:
                 latest = pressed.word
 
     def show_status(self, status: Status) -> None:
-        """Show where the capture stands."""
+        """Show the state of the capture."""
         self.status = status
         self._changed()
 
@@ -104,6 +104,6 @@ class CapturePanel:
         self._changed()
 
     def _changed(self) -> None:
-        """Tell those who look."""
-        for tell in self.on_change:
-            tell()
+        """Inform the views."""
+        for callback in self.on_change:
+            callback()

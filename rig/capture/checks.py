@@ -61,26 +61,26 @@ def check_frame(
     values: dict[str, float] = {"median_dn": float(np.median(pixels))}
     grey = pixels if pixels.ndim == 2 else pixels.mean(axis=2)
     if kind in LIT_KINDS:
-        values["saturated_share"] = saturated_share(pixels, limits.saturation_dn)
+        values["saturated_share"] = _saturated_share(pixels, limits.saturation_dn)
     if kind in ("charuco", "bright"):
         values["contrast_dn"] = float(np.subtract(*np.quantile(grey, (0.99, 0.01))))
-        values["sharpness"] = sharpness(grey)
+        values["sharpness"] = _sharpness(grey)
     if kind == "charuco":
-        values["board_corners"] = float(count_board_corners(grey, boards))
+        values["board_corners"] = float(_count_board_corners(grey, boards))
     if kind in DARK_KINDS:
-        values["leak_dn"] = leak_dn(grey)
+        values["leak_dn"] = _leak_dn(grey)
     return Findings(
         {name: round(value, 5) for name, value in values.items()}, _warnings(kind, values, limits, earlier_sharpness)
     )
 
 
-def saturated_share(pixels: Pixels, saturation_dn: float | None) -> float:
+def _saturated_share(pixels: Pixels, saturation_dn: float | None) -> float:
     """Return the share of pixels at or above saturation."""
     limit_dn = saturation_dn or (np.iinfo(pixels.dtype).max if pixels.dtype.kind in "iu" else np.inf)
     return float(np.mean(pixels >= limit_dn))
 
 
-def sharpness(grey: Pixels) -> float:
+def _sharpness(grey: Pixels) -> float:
     """Return the standard deviation of the Laplacian relative to that of the image.
 
     Every second row and column is used, so that the pattern of a colour mosaic does not count as detail.
@@ -90,7 +90,7 @@ def sharpness(grey: Pixels) -> float:
     return float(cv2.Laplacian(samples, cv2.CV_32F).std()) / contrast if contrast else 0.0
 
 
-def leak_dn(grey: Pixels) -> float:
+def _leak_dn(grey: Pixels) -> float:
     """Return by how many DN the means of 8 x 8 parts of a frame differ, beyond the range expected from noise."""
     height, width = (length // _LEAK_PARTS for length in grey.shape)
     parts = np.asarray(grey[: height * _LEAK_PARTS, : width * _LEAK_PARTS], float).reshape(
@@ -101,7 +101,7 @@ def leak_dn(grey: Pixels) -> float:
     return max(0.0, float(np.ptp(parts.mean(axis=(1, 3))) - noise))
 
 
-def count_board_corners(grey: Pixels, boards: Sequence[Board]) -> int:
+def _count_board_corners(grey: Pixels, boards: Sequence[Board]) -> int:
     """Return the number of board corners found."""
     white = max(float(np.quantile(grey, 0.99)), 1.0)
     scale = min(1.0, _BOARD_SEARCH_PX / max(grey.shape))

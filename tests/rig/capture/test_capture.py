@@ -1,4 +1,4 @@
-"""The capture loop: the order of a frame, the operator's wishes, settling, pace."""
+"""The capture loop: the order of a frame, requests of the operator, settling, pace."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -38,14 +38,16 @@ from tests.faults.capturing import FRAMES, SMALL_RIG
 class Person:
     """An operator with a plan of their own.
 
-    `answers` are given by prompt key, one after the other; `wishes` by the number of frames that were shown before.
+    `answers` are given by prompt key, one after the other; `requests` by the number of frames that were shown before.
     """
 
     def __init__(
-        self, answers: Mapping[str, Sequence[Answer]] | None = None, wishes: Mapping[int, OperatorRequest] | None = None
+        self,
+        answers: Mapping[str, Sequence[Answer]] | None = None,
+        requests: Mapping[int, OperatorRequest] | None = None,
     ) -> None:
         self.answers = {key: list(values) for key, values in (answers or {}).items()}
-        self.wishes = dict(wishes or {})
+        self.requests = dict(requests or {})
         self.prompts: list[Prompt] = []
         self.statuses: list[Status] = []
         self.seen: list[PlannedFrame] = []
@@ -59,7 +61,7 @@ class Person:
         return answer
 
     def take_request(self) -> OperatorRequest | None:
-        return self.wishes.pop(len(self.seen), None)
+        return self.requests.pop(len(self.seen), None)
 
     def show_status(self, status: Status) -> None:
         self.statuses.append(status)
@@ -115,9 +117,9 @@ def test_every_frame_has_its_record(tmp_path: Path) -> None:
         assert "median_dn" in committed.record.checks
 
 
-@pytest.mark.parametrize(("wish", "answer"), [("stop", None), ("pause", "stop")])
-def test_stop_and_go_on(tmp_path: Path, wish: OperatorRequest, answer: Answer | None) -> None:
-    person = Person({"paused": [answer]} if answer else {}, {4: wish})
+@pytest.mark.parametrize(("wanted", "answer"), [("stop", None), ("pause", "stop")])
+def test_stop_and_go_on(tmp_path: Path, wanted: OperatorRequest, answer: Answer | None) -> None:
+    person = Person({"paused": [answer]} if answer else {}, {4: wanted})
     failure = run(tmp_path / "session", person)
     assert isinstance(failure, CaptureStopped)
     assert str(failure) == f"stopped with 4 of {FRAMES} frames taken; run the same command to go on"
