@@ -25,7 +25,7 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from tests.end_to_end.browser import CHROMIUM, Tab, browsing
+from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 from tests.faults.capturing import FRAMES, SMALL_RIG
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
@@ -74,7 +74,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with browsing(tmp_path_factory.mktemp("browser")) as tab:
+    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
         yield tab
 
 
@@ -126,7 +126,7 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
 
 
 @needs_browser
-def test_it_is_dark(running: Running, browser: Tab) -> None:
+def test_the_page_is_dark_red(running: Running, browser: Tab) -> None:
     browser.call("Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False)
     browser.open(running.address)
     browser.click("go")
@@ -161,7 +161,7 @@ def test_nothing_is_found_without_the_token(running: Running) -> None:
         assert status_of(root + place, b"{}") in (404, 405)
 
 
-def test_a_name_that_was_made_to_point_here_is_turned_away(running: Running) -> None:
+def test_another_host_name_is_refused(running: Running) -> None:
     parts = urllib.parse.urlsplit(running.address)
     connection = http.client.HTTPConnection(parts.netloc)
     connection.request("GET", parts.path + "state", headers={"Host": "evil.example"})

@@ -48,7 +48,7 @@ def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
     assert Grid(2, 4, 50.0, Point(0.0, 0.0)).centre().node == (1, 2) == centre_node(2, 4)
 
 
-def test_frames_and_room() -> None:
+def test_frames_and_disk_space() -> None:
     plan = plan_of()
     assert plan.frame_count() == 49 + 49 + 40
     assert plan.disk_bytes() == plan.frame_count() * 24_000_000

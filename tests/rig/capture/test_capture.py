@@ -200,7 +200,7 @@ SWINGING = msgspec.structs.replace(
 )
 
 
-def test_every_frame_is_rested_for_the_first_ones_too(tmp_path: Path) -> None:
+def test_the_stage_rests_before_every_frame(tmp_path: Path) -> None:
     rested_s: list[float] = []
     expose = SimulatedLab.expose
 
@@ -249,7 +249,7 @@ def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: f
 
 
 @pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
-def test_settling_is_found_where_it_is(rest_s: float) -> None:
+def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
     clock = SimulatedClock()
     expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
     found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05))
@@ -313,7 +313,7 @@ def test_the_guide_has_words_for_every_kind() -> None:
         (7500, "about 2 h 05 min"),
     ],
 )
-def test_durations_as_one_says_them(duration_s: float, words: str) -> None:
+def test_durations_in_words(duration_s: float, words: str) -> None:
     assert format_duration(duration_s) == words
 
 

@@ -116,7 +116,7 @@ def test_frames_that_changed_places_are_found(unsealed: Path) -> None:
 
 
 @pytest.mark.parametrize("sealed", [True, False])
-def test_an_edited_plan_is_found_and_not_gone_on_with(session: Path, sealed: bool) -> None:
+def test_an_edited_plan_is_found_and_not_resumed(session: Path, sealed: bool) -> None:
     if not sealed:
         (session / "SHA256SUMS").unlink()
     plan = session / "plan.json"
@@ -144,7 +144,7 @@ def verify_without_rights(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["plan.json", "journal.sqlite"])
-def test_what_holds_a_session_together_is_not_invented_anew(unsealed: Path, name: str) -> None:
+def test_a_lost_plan_or_journal_is_not_replaced(unsealed: Path, name: str) -> None:
     (unsealed / name).unlink()
     with pytest.raises(SessionCorrupt):
         verify(unsealed)
