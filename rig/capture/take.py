@@ -12,7 +12,7 @@ from faintfield.rig.capture.checks import LIT_KINDS, Findings, check_frame
 from faintfield.rig.capture.dialogue import Dialogue
 from faintfield.rig.capture.drift_checks import DriftChecks
 from faintfield.rig.capture.pace import Pace
-from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.capture.settling import Settling, measure_settling
 from faintfield.rig.capture.sweeps import board_warnings
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError
@@ -144,9 +144,9 @@ class FrameTaker:
     def _find_settling(self, frame: PlannedFrame) -> float:
         """Return the rest in s after a move: measured earlier in this session, measured now, or planned."""
         settings = self._settings.settle
-        measured = self._session.journal.events("settling")
+        measured = self._session.journal.details("settling", Settling)
         if measured:
-            return float(measured[-1].detail["wait_s"])
+            return measured[-1].wait_s
         if not settings.measure:
             return self._session.plan.settle_s
         self._dialogue.show_status(frame, "measuring how long the rig swings")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 from msgspec import Struct
@@ -106,7 +106,25 @@ class JournalEvent(Struct, frozen=True):
     at: str
     kind: str
     frame: int | None
-    detail: dict[str, Any]
+    detail: dict[str, object]
+
+
+class Begun(Struct, frozen=True):
+    """Detail of the event `begun`: the hash of the plan."""
+
+    plan_sha256: str
+
+
+class Suspect(Struct, frozen=True):
+    """Detail of an event `suspect`: the exposures that relied on a stage that lost its scale."""
+
+    intents: tuple[int, ...]
+
+
+class Sealed(Struct, frozen=True):
+    """Detail of the event `sealed`: the frames that were left out, by their index in the plan."""
+
+    skipped: tuple[int, ...]
 
 
 class Journal:
@@ -157,7 +175,7 @@ class Journal:
             with self._transaction():
                 pass
 
-    def event(self, kind: str, *, frame: int | None = None, **detail: Any) -> None:
+    def event(self, kind: str, *, frame: int | None = None, **detail: object) -> None:
         """Record an event."""
         with self._transaction():
             self._db.execute(
@@ -214,6 +232,11 @@ class Journal:
             query = "SELECT id, at, kind, frame, detail FROM event WHERE ?1 IS NULL OR kind = ?1 ORDER BY id"
             rows = self._db.execute(query, (kind,)).fetchall()
             return [JournalEvent(a, b, c, d, msgspec.json.decode(detail)) for a, b, c, d, detail in rows]
+
+    def details[T](self, kind: str, layout: type[T]) -> list[T]:
+        """Return the details of the events of a kind, in order, each as an instance of `layout`."""
+        with self._translate_errors():
+            return [msgspec.convert(event.detail, layout) for event in self.events(kind)]
 
     def traffic(self) -> list[tuple[float, str, bytes]]:
         """Return the traffic of the stage as time in s, direction and bytes."""

@@ -18,7 +18,7 @@ from faintfield.rig.session.disk import (
     translate_errors,
     write_new,
 )
-from faintfield.rig.session.journal import CommittedFrame, Journal
+from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
 from faintfield.rig.session.session import ASIDE, FRAMES, JOURNAL, PLAN, FrozenPlan, Session, is_sealed
 from faintfield.rig.settings import RigSettings
 
@@ -78,12 +78,12 @@ def _begin(folder: Path, plan: FrozenPlan | None) -> None:
 def _check_plan_hash(folder: Path, journal: Journal) -> None:
     """Compare the hash of the plan with the one in the journal, or record it in a new journal."""
     digest = hashlib.sha256((folder / PLAN).read_bytes()).hexdigest()
-    begun = journal.events("begun")
+    begun = journal.details("begun", Begun)
     if not begun:
         if any((folder / FRAMES).glob("*")):
             raise SessionCorrupt(f"{folder / JOURNAL}: is empty but there are frames; restore the journal from a copy")
         journal.event("begun", plan_sha256=digest)
-    elif begun[0].detail["plan_sha256"] != digest:
+    elif begun[0].plan_sha256 != digest:
         raise SessionCorrupt(f"{folder / PLAN}: was changed after the session was begun; restore it from a copy")
     else:
         journal.event("resumed")

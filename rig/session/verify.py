@@ -10,7 +10,7 @@ from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.access import read_plan
 from faintfield.rig.session.disk import lock_session, sha256
 from faintfield.rig.session.frames import PlannedFrame, planned_frames
-from faintfield.rig.session.journal import CommittedFrame, Journal
+from faintfield.rig.session.journal import Begun, CommittedFrame, Journal, Sealed, Suspect
 from faintfield.rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed
 
 
@@ -77,9 +77,9 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     with Journal(folder / JOURNAL, read_only=True) as journal:
         damage = journal.damage()
         committed = journal.committed()
-        begun = [event.detail.get("plan_sha256") for event in journal.events("begun")]
-        sealed = [event.detail.get("skipped", []) for event in journal.events("sealed")]
-        suspects = {intent for event in journal.events("suspect") for intent in event.detail["intents"]}
+        begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
+        sealed = [event.skipped for event in journal.details("sealed", Sealed)]
+        suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
     digests = {path.name: sha256(path) for path in progress(sorted((folder / FRAMES).glob("*")))}
     problems = [] if damage is None else [f"{JOURNAL}: {damage}"]
     if begun != [hashlib.sha256((folder / PLAN).read_bytes()).hexdigest()]:

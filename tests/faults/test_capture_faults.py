@@ -140,7 +140,7 @@ def test_lost_steps_are_found_and_their_frames_taken_again(tmp_path: Path) -> No
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         suspects = journal.events("suspect")
         assert len(suspects) == 1
-        assert "lost its scale" in suspects[0].detail["message"]
+        assert "lost its scale" in str(suspects[0].detail["message"])
         # Everything since the last good check, which was at the end of the first step
         assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
     assert verify(lab.folder).superseded == 6

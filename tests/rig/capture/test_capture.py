@@ -15,7 +15,7 @@ from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.checks import check_frame
 from faintfield.rig.capture.guide import TITLES, Answer, OperatorRequest, Prompt, Status, format_duration, step_prompt
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.capture.settling import Settling, measure_settling
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
@@ -221,16 +221,15 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     assert isinstance(run(folder, Person({}, {2: "stop"}), SWINGING), CaptureStopped)
     assert run(folder, Person(), SWINGING) is None
     with Journal(folder / "journal.sqlite", read_only=True) as journal:
-        found = journal.events("settling")
+        found = journal.details("settling", Settling)
     assert len(found) == 1
-    detail = found[0].detail
-    assert detail["settled"] is True
+    assert found[0].settled
     # The swing of 1.5 mm along both axes, seen at 540 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
     # controller's reports take 0.2 s to 0.4 s of it
     shift_px = 2**0.5 * 1.5 * 200 / 540
     rest_s = 0.25 * np.log(shift_px / SWINGING.settle.limit_px)
-    assert rest_s - 0.4 <= detail["wait_s"] <= rest_s - 0.2 + 0.2
-    shifts = [shift for _, shift in detail["curve"]]
+    assert rest_s - 0.4 <= found[0].wait_s <= rest_s - 0.2 + 0.2
+    shifts = [shift for _, shift in found[0].curve]
     assert shifts[0] > 5 * max(shifts[-10:])
 
 
