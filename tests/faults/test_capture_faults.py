@@ -1,4 +1,4 @@
-"""Cable out, camera gone, disk full, folder made read-only: a named failure or a recovery; the session stays whole."""
+"""A lost cable or camera, a full disk, a read-only folder: a named failure or a recovery; the session stays whole."""
 
 import ctypes
 import resource
@@ -32,12 +32,12 @@ from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
-# Half a step of 1/80 mm and the rounding of reports
+# Tolerance: half a step of 1/80 mm, and the rounding of reports
 ON_TARGET_UM = 12
 
 
 class TruthfulCamera:
-    """A camera whose frames hold the stage's true position in micrometres, and that fails to order."""
+    """A camera whose frames hold the true position of the stage in µm, and which fails on demand."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
@@ -95,7 +95,7 @@ class Lab:
         rig = Rig(bench.stage(), TruthfulCamera(bench), bench.clock, lambda kind, sweep: None)
         return FrozenPlan(survey(rig, self.settings).plan, self.settings)
 
-    def assert_every_frame_from_its_place(self) -> None:
+    def assert_true_positions(self) -> None:
         """Assert that the session is whole and that every frame was taken where the plan says."""
         verdict = verify(self.folder)
         assert verdict.problems == ()
@@ -121,10 +121,10 @@ def test_stage_faults_in_mid_capture(tmp_path: Path, protocol: str, fault: Fault
         assert "; " in str(failure)
         assert not is_sealed(lab.folder)
         assert lab.run() is None
-    lab.assert_every_frame_from_its_place()
+    lab.assert_true_positions()
 
 
-def slipping(bench: Bench, camera: TruthfulCamera) -> None:
+def make_slip(bench: Bench, camera: TruthfulCamera) -> None:
     """Let an axis lose steps in the second step of the plan."""
 
     def slip() -> None:
@@ -135,8 +135,8 @@ def slipping(bench: Bench, camera: TruthfulCamera) -> None:
 
 def test_lost_steps_are_found_and_their_frames_taken_again(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
-    assert lab.run(slipping) is None
-    lab.assert_every_frame_from_its_place()
+    assert lab.run(make_slip) is None
+    lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         suspects = journal.events("suspect")
         assert len(suspects) == 1
@@ -159,7 +159,7 @@ def test_a_stage_that_loses_steps_again_and_again_is_given_up(tmp_path: Path) ->
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("suspect")) == 3
     assert lab.run() is None
-    # What was in doubt when it was given up stays marked, and is there
+    # The frames in doubt when the capture was given up are present and stay marked
     assert verify(lab.folder).problems == ()
 
 
@@ -172,7 +172,7 @@ class Keeping(Unattended):
 
 def test_frames_kept_in_spite_of_lost_steps_stay_marked(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
-    assert lab.run(slipping, Keeping()) is None
+    assert lab.run(make_slip, Keeping()) is None
     verdict = verify(lab.folder)
     assert verdict.problems == ()
     assert verdict.suspect == tuple(committed.file for _, committed, _ in taken_frames(lab.folder)[6:12])
@@ -191,7 +191,7 @@ def test_a_camera_that_fails(tmp_path: Path, failures: int) -> None:
     else:
         assert isinstance(failure, CameraError)
         assert lab.run() is None
-    lab.assert_every_frame_from_its_place()
+    lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("camera_failed")) == failures
         assert len(journal.uncommitted()) == failures

@@ -36,9 +36,9 @@ from tests.faults.capturing import FRAMES, SMALL_RIG
 
 
 class Person:
-    """An operator with a plan of their own.
+    """An operator with prepared answers and requests.
 
-    `answers` are given by prompt key, one after the other; `requests` by the number of frames that were shown before.
+    `answers` holds a list for each prompt key; `requests` is keyed by the number of frames shown before.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Person:
 
 
 def run(folder: Path, person: Person, settings: RigSettings = SMALL_RIG) -> RigError | None:
-    """Capture; return why it ended early, if it did."""
+    """Capture; return the failure, None without one."""
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     try:
         with open_session(folder, plan) as session:
@@ -224,8 +224,8 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
         found = journal.details("settling", Settling)
     assert len(found) == 1
     assert found[0].settled
-    # The swing of 1.5 mm along both axes, seen at 540 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
-    # controller's reports take 0.2 s to 0.4 s of it
+    # The swing of 1.5 mm along both axes, seen at 540 mm, decays by e every 0.25 s; frames are 0.1 s apart, and the
+    # controller's reports take the first 0.2 s to 0.4 s
     shift_px = 2**0.5 * 1.5 * 200 / 540
     rest_s = 0.25 * np.log(shift_px / SWINGING.settle.limit_px)
     assert rest_s - 0.4 <= found[0].wait_s <= rest_s - 0.2 + 0.2

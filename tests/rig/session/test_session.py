@@ -1,4 +1,4 @@
-"""The session on disk: nothing goes unnoticed, nothing is overwritten, nothing is deleted."""
+"""The session on disk: all changes are noticed, nothing is overwritten or deleted."""
 
 import os
 import shutil
@@ -37,13 +37,13 @@ def complete(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def session(complete: Path, tmp_path: Path) -> Path:
-    """Return a complete session of one's own."""
+    """Return a copy of a complete session."""
     return Path(shutil.copytree(complete, tmp_path / "session"))
 
 
 @pytest.fixture
 def unsealed(session: Path) -> Path:
-    """Return a session whose last step, the sealing, is missing."""
+    """Return a complete session that is not sealed."""
     (session / "SHA256SUMS").unlink()
     return session
 
@@ -136,7 +136,7 @@ def test_verify_reads_a_write_protected_session(session: Path) -> None:
 
 
 def verify_without_rights(folder: Path) -> None:
-    """Verify as somebody who is bound by permissions."""
+    """Verify without the privileges that override permissions."""
     from tests.faults.test_capture_faults import drop_rights
 
     drop_rights()
