@@ -39,10 +39,8 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
 
     Raises
     ------
-    RigError
+    RigError, DiskFull
         The plan is not possible, the session cannot be used, or the capture stopped before its end.
-    DiskFull
-        A new session would not fit on the disk.
     """
     frozen = _plan_session(settings, folder)
     if is_sealed(folder):
@@ -55,8 +53,7 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
         if page:
-            # Only a capture with a page needs a web server, whose import takes long
-            from faintfield.pipelines.live.capture_page import serve_page
+            from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
 
             inform(f"page: {stack.enter_context(serve_page(panel))}")
         stack.enter_context(TerminalView(panel).show())

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from faintfield.rig.boards import Board
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Unattended
 from faintfield.rig.capture.loop import Capture
@@ -35,6 +36,7 @@ SMALL_RIG = RigSettings(
     drift=DriftSettings(check=False),
 )
 FRAMES = 2 * 3 + 2 * 3 + 4
+BOARD = Board("large", 9, 6, 40.0, 30.0)
 
 # The steps by which a frame reaches the disk, each with the function before or after which the power may fail
 STEPS: Mapping[str, tuple[Any, str]] = {

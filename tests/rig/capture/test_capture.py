@@ -9,30 +9,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import Board
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.checks import check_frame
-from faintfield.rig.capture.guide import TITLES, Answer, OperatorRequest, Prompt, Status, format_duration, step_prompt
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.settling import Settling, measure_settling
+from faintfield.rig.capture.settling import Settling
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
 from faintfield.rig.plan import Grid
 from faintfield.rig.session.access import taken_frames
-from faintfield.rig.session.frames import PlannedFrame, planned_frames
+from faintfield.rig.session.frames import PlannedFrame
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from faintfield.rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
-from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.settings import RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.simulation.scene import render
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import FRAMES, SMALL_RIG
+from tests.faults.capturing import BOARD, FRAMES, SMALL_RIG
 
 
 class Person:
@@ -189,7 +184,6 @@ def test_what_cannot_be_done_is_refused_before_anything_moves() -> None:
         open_rig(real_stage)
 
 
-BOARD = Board("large", 9, 6, 40.0, 30.0)
 SWINGING = msgspec.structs.replace(
     SMALL_RIG,
     camera=SimulatedSettings(size_px=(160, 120)),
@@ -233,43 +227,6 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     assert shifts[0] > 5 * max(shifts[-10:])
 
 
-def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: float) -> Callable[[float], Pixels]:
-    """Return a camera that sees the paper's scene shifted by a function of time."""
-    planes, optics = paper_experiment(96, 72).grey().planes, paper_experiment(96, 72).optics
-    generator = np.random.default_rng(5)
-
-    def expose(exposure_s: float) -> Pixels:
-        shift_mm = shift_px(clock.now_s()) * 600.0 / optics.fx_px
-        seen = next(render(planes, optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
-        clock.sleep_s(exposure_s + 0.05)
-        return np.asarray(generator.poisson(100.0 + light * seen), np.uint16)
-
-    return expose
-
-
-@pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
-def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
-    clock = SimulatedClock()
-    expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
-    found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05))
-    assert found.settled
-    assert rest_s <= found.wait_s <= rest_s + 0.2
-    shifts = dict(found.curve)
-    assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
-
-
-@pytest.mark.parametrize(
-    ("shift_px", "light"),
-    [(lambda now_s: 0.5 * np.sin(9.0 * now_s), 2e4), (lambda now_s: 0.0, 0.0)],
-    ids=["never at rest", "dark"],
-)
-def test_no_rest_is_not_taken_for_rest(shift_px: Callable[[float], float], light: float) -> None:
-    clock = SimulatedClock()
-    found = measure_settling(shifting(shift_px, clock, light), clock, SettleSettings(exposure_s=0.05))
-    assert not found.settled
-    assert found.wait_s == 3.0
-
-
 @pytest.mark.parametrize("rows", [2, 7])
 def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> None:
     settings = msgspec.structs.replace(
@@ -289,73 +246,3 @@ def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> 
         assert to_go_s == pytest.approx(end_s - now_s, rel=0.1, abs=2.0)
     now_s, to_go_s = told[11]
     assert to_go_s == pytest.approx(end_s - now_s, rel=0.1)
-
-
-def test_the_guide_has_words_for_every_kind() -> None:
-    for kind in TITLES:
-        settings = msgspec.structs.replace(SMALL_RIG, step=(StepSettings(kind, 0.1),), board=(BOARD,))
-        frame = planned_frames(survey(open_rig(settings), settings).plan)[0]
-        prompt = step_prompt(frame, 1, 1, 10, 100.0)
-        assert TITLES[kind] in prompt.title
-        assert len(prompt.lines) >= 3
-        assert all(line.endswith(".") for line in prompt.lines)
-        assert any("10 frames follow, about 2 min" in line for line in prompt.lines)
-
-
-@pytest.mark.parametrize(
-    ("duration_s", "words"),
-    [
-        (0.2, "about 1 s"),
-        (59.6, "about 60 s"),
-        (100, "about 2 min"),
-        (3600, "about 60 min"),
-        (7500, "about 2 h 05 min"),
-    ],
-)
-def test_durations_in_words(duration_s: float, words: str) -> None:
-    assert format_duration(duration_s) == words
-
-
-def scene(kind: str, **changes: float) -> Pixels:
-    """Return a good frame of a kind."""
-    generator = np.random.default_rng(3)
-    noise = generator.normal(100.0, 3.0, (120, 160))
-    if kind == "charuco":
-        picture = np.kron(BOARD.in_opencv().generateImage((160, 106)), np.ones((3, 3)))
-        noise = 100.0 + 20.0 * np.pad(picture, 20, constant_values=255)
-    elif kind in ("bright", "flat"):
-        noise += 2000.0 + (1500.0 * (np.indices(noise.shape).sum(axis=0) % 24 < 12) if kind == "bright" else 0.0)
-    return noise.astype(np.uint16)
-
-
-@pytest.mark.parametrize("kind", TITLES)
-def test_good_frames_give_no_warning(kind: str) -> None:
-    findings = check_frame(scene(kind), kind, CheckSettings(), (BOARD,), [0.1])  # type: ignore[arg-type]
-    assert findings.warnings == ()
-    if kind == "charuco":
-        assert findings.values["board_corners"] == 8 * 5
-
-
-@pytest.mark.parametrize(
-    ("kind", "spoil", "word"),
-    [
-        ("bright", lambda frame: np.where(frame > 3000, 65535, frame), "saturated"),
-        ("bright", lambda frame: frame // 100, "contrast"),
-        ("flat", lambda frame: frame // 10, "median"),
-        ("dark", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[1] > 140), "stray light"),
-        ("noise_reference", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[0] < 20), "stray light"),
-    ],
-)
-def test_bad_frames_give_a_warning(kind: str, spoil: Callable[[Pixels], Pixels], word: str) -> None:
-    frame = np.asarray(spoil(scene(kind)), np.uint16)
-    findings = check_frame(frame, kind, CheckSettings(), (BOARD,), [])  # type: ignore[arg-type]
-    assert any(word in warning and "; " in warning for warning in findings.warnings)
-
-
-def test_a_blurred_frame_is_noticed_beside_sharp_ones() -> None:
-    sharp = scene("bright")
-    blurred = sum(np.roll(sharp.astype(float), shift, axis=1) for shift in range(8)) / 8
-    usual = [check_frame(sharp, "bright", CheckSettings()).values["sharpness"]] * 5
-    assert check_frame(sharp, "bright", CheckSettings(), (), usual).warnings == ()
-    findings = check_frame(np.asarray(blurred, np.uint16), "bright", CheckSettings(), (), usual)
-    assert any("sharpness" in warning for warning in findings.warnings)
