@@ -13,7 +13,8 @@ from faintfield.pipelines.live.guided import capture_session
 def capture(rig: Path, session: Path, /, *, yes: bool = False, page: bool = False) -> dict[str, Any]:
     """Capture a session, step by step; run it again to go on where it stopped.
 
-    Keys: p pause, r take the last frame again, s skip, q stop. Ctrl-C stops after the present frame, a second Ctrl-C at once.
+    Keys: p pause, r take the last frame again, s skip, q stop. Ctrl-C stops after the present frame, a second one at
+    once.
 
     Parameters
     ----------

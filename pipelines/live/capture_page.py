@@ -6,7 +6,7 @@ The page is served to this computer only, at an address that cannot be guessed: 
 import secrets
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
 from typing import Any
@@ -53,10 +53,10 @@ def serve_page(panel: CapturePanel) -> Iterator[str]:
     """Serve the page of `panel` while the block runs; yield its address."""
     token = secrets.token_urlsafe(24)
     listener = socket.create_server((_HOST, 0))
-    config = uvicorn.Config(
-        _application(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1
+    application = _application(panel, token)
+    server = uvicorn.Server(
+        uvicorn.Config(application, log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
     )
-    server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
     thread.start()
     try:
@@ -93,14 +93,13 @@ def _application(panel: CapturePanel, token: str) -> Starlette:
         panel.press(pressed.word, pressed.prompt)
         return JSONResponse({}, headers=_HEADERS)
 
-    handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
-        ("", index, "GET"),
-        ("state", state, "GET"),
-        ("frame.png", picture, "GET"),
-        ("press", press, "POST"),
-    ]
     return Starlette(
-        routes=[Route(f"/{token}/{path}", handler, methods=[method]) for path, handler, method in handlers],
+        routes=[
+            Route(f"/{token}/", index),
+            Route(f"/{token}/state", state),
+            Route(f"/{token}/frame.png", picture),
+            Route(f"/{token}/press", press, methods=["POST"]),
+        ],
         # Turn away requests by another host name, which a foreign page could make point to this computer
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST])],
     )

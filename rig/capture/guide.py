@@ -136,24 +136,6 @@ class OperatorInterface(Protocol):
         ...
 
 
-class Unattended:
-    """Stands in for a person: gives every prompt its unattended answer, and shows nothing."""
-
-    def ask(self, prompt: Prompt) -> Answer:
-        """Return the unattended answer."""
-        return prompt.unattended
-
-    def take_request(self) -> OperatorRequest | None:
-        """Return None: nothing is requested."""
-        return None
-
-    def show_status(self, status: Status) -> None:
-        """Show nothing."""
-
-    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
-        """Show nothing."""
-
-
 def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duration_s: float) -> Prompt:
     """Return the prompt before a step.
 

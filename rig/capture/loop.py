@@ -108,18 +108,11 @@ class Capture:
         while True:
             try:
                 self._taker.take(frame)
-            except (StageError, NotHomed) as failure:
-                answer = self._ask_after_failure("stage", frame, failure)
-                if answer == "again":
-                    self._recover_stage()
-            except CameraError as failure:
-                answer = self._ask_after_failure("camera", frame, failure)
-                if answer == "again":
-                    self._reopen_camera()
+            except (StageError, NotHomed, CameraError) as failure:
+                if self._handle_failure(frame, failure) == "skip":
+                    self._session.skip(frame)
+                    return
             else:
-                return
-            if answer == "skip":
-                self._session.skip(frame)
                 return
 
     def _handle_request(self, frame: PlannedFrame) -> None:
@@ -140,31 +133,28 @@ class Capture:
         if choice == "retake" and self._taker.last is not None:
             self._take(self._taker.last)
 
-    def _ask_after_failure(self, key: str, frame: PlannedFrame, failure: Exception) -> Answer:
-        """Record a failure and ask what to do; re-raise it if the answer is to stop."""
+    def _handle_failure(self, frame: PlannedFrame, failure: Exception) -> Answer:
+        """Record a failure and ask what to do; prepare another try, or re-raise it if the answer is to stop."""
+        device = "camera" if isinstance(failure, CameraError) else "stage"
         self._failures += 1
         self._pace.here = None
-        self._session.journal.event(
-            f"{key}_failed", frame=frame.number, error=type(failure).__name__, message=str(failure)
-        )
+        event = {"error": type(failure).__name__, "message": str(failure)}
+        self._session.journal.event(f"{device}_failed", frame=frame.number, **event)
         self._dialogue.warn(f"{frame.name}: {failure}")
         unattended: Answer = "again" if self._failures < MAX_UNATTENDED_TRIES else "stop"
-        prompt = Prompt(key, f"The {key} failed", (str(failure),), ("again", "skip", "stop"), unattended)
-        answer = self._dialogue.ask(prompt)
+        answers: tuple[Answer, ...] = ("again", "skip", "stop")
+        answer = self._dialogue.ask(Prompt(device, f"The {device} failed", (str(failure),), answers, unattended))
         if answer == "stop":
             raise failure
+        if answer == "again":
+            # If this fails, the next motion or exposure fails as well
+            with suppress(StageError, CameraError):
+                if device == "stage":
+                    recover(self._rig.stage, self._may_home, self._drift.watch)
+                else:
+                    self._rig.camera.close()
+                    self._rig.camera.open()
         return answer
-
-    def _recover_stage(self) -> None:
-        """Make the stage usable again; if this fails, the next motion fails as well."""
-        with suppress(StageError):
-            recover(self._rig.stage, self._may_home, self._drift.watch)
-
-    def _reopen_camera(self) -> None:
-        """Connect to the camera again; if this fails, the next exposure fails as well."""
-        with suppress(CameraError):
-            self._rig.camera.close()
-            self._rig.camera.open()
 
     def _may_home(self, *question: str) -> bool:
         """Ask before the stage moves to its switches."""

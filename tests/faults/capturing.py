@@ -12,13 +12,15 @@ from typing import Any
 from unittest import mock
 
 from faintfield.rig.boards import Board
+from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.guide import Unattended
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid
 from faintfield.rig.session import disk, session
+from faintfield.rig.session.frames import PlannedFrame
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
@@ -49,6 +51,22 @@ STEPS: Mapping[str, tuple[Any, str]] = {
     "file written": (session.Session, "write"),
     "commit": (Journal, "commit"),
 }
+
+
+class Unattended:
+    """Stands in for a person: gives every prompt its unattended answer, and shows nothing."""
+
+    def ask(self, prompt: Prompt) -> Answer:
+        return prompt.unattended
+
+    def take_request(self) -> OperatorRequest | None:
+        return None
+
+    def show_status(self, status: Status) -> None:
+        pass
+
+    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
+        pass
 
 
 def capture_small(folder: Path, settings: RigSettings = SMALL_RIG) -> None:

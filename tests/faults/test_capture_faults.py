@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
-from faintfield.rig.capture.guide import Answer, OperatorInterface, Prompt, Unattended
+from faintfield.rig.capture.guide import Answer, OperatorInterface, Prompt
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import Rig
@@ -28,7 +28,7 @@ from faintfield.rig.simulation.controller.faults import Fault, faults_of
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
+from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, in_process
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
