@@ -12,7 +12,8 @@ from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid
-from faintfield.rig.session.access import opened
+from faintfield.rig.session.journal import FrameRecord
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import RigSettings, StepSettings
 from faintfield.rig.stages.protocol import Point
@@ -46,11 +47,11 @@ def main() -> None:
 def _costs_ms(folder: Path, plan: FrozenPlan, exposure: Exposure) -> list[float]:
     """Return the time of each frame."""
     costs_ms = []
-    with opened(folder, plan) as session:
+    with open_session(folder, plan) as session:
         for frame in session.frames:
             begun_s = time.perf_counter()
             written = session.write(frame, session.intend(frame), exposure)
-            session.commit(frame, written, {})
+            session.commit(frame, written, FrameRecord(frame.stop.target, frame.exposure_s))
             costs_ms.append(1e3 * (time.perf_counter() - begun_s))
     return costs_ms
 

@@ -19,7 +19,7 @@ from PIL import Image
 
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, shrunk, write_png
-from tests.end_to_end.browser import Tab, browsing
+from tests.end_to_end.browser import Tab, open_browser
 
 _PICTURES = Path(__file__).parent / "pictures"
 _WHITE_E = 1.5
@@ -51,8 +51,8 @@ def draw_noise_page(demo: Path) -> None:
 
 
 def draw_pages(demo: Path) -> None:
-    """Take pictures of the pages of a reconstruction, a stage and a capture as a browser shows them."""
-    with TemporaryDirectory() as scratch, browsing(Path(scratch) / "browser") as tab:
+    """Take the pages of a reconstruction and of a stage as a browser shows them, and the one of a capture."""
+    with TemporaryDirectory() as scratch, open_browser(Path(scratch) / "browser") as tab:
         tab.call("Emulation.setScrollbarsHidden", hidden=True)
         for name, page, height_px in _PAGES:
             _resize(tab, height_px)

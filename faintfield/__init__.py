@@ -28,7 +28,7 @@ _MODULES = {
     "RigError": "rig.errors",
     "RigSettings": "rig.settings",
     "StageSettings": "rig.stages.settings",
-    "Step": "rig.plan",
+    "CaptureStep": "rig.plan",
     "Target": "calib.geometry",
     "back_projection": "recon.solver.starts",
     "calibrate_geometry": "calib.geometry",
@@ -85,7 +85,7 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.rig.errors import RigError as RigError
     from faintfield.rig.plan import CapturePlan as CapturePlan
     from faintfield.rig.plan import Grid as Grid
-    from faintfield.rig.plan import Step as Step
+    from faintfield.rig.plan import CaptureStep as CaptureStep
     from faintfield.rig.session.access import taken_frames as taken_frames
     from faintfield.rig.settings import RigSettings as RigSettings
     from faintfield.rig.stages.protocol import MotionLimits as MotionLimits

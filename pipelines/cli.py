@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import msgspec
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from faintfield.pipelines.console import framed_console, say
+from faintfield.pipelines.console import framed_console, inform
 from faintfield.pipelines.errors import NAMED_FAILURES, WrongUsage
 from faintfield.pipelines.log_file import logged
 from faintfield.pipelines.registry import register_commands
@@ -80,13 +80,13 @@ def run(arguments: Sequence[str]) -> int:
     except CycloptsError:
         return WRONG_USAGE
     except WrongUsage as failure:
-        say(f"faintfield: wrong usage: {failure}")
+        inform(f"faintfield: wrong usage: {failure}")
         return WRONG_USAGE
     except NAMED_FAILURES as failure:
-        say(f"faintfield: {type(failure).__name__}: {failure}")
+        inform(f"faintfield: {type(failure).__name__}: {failure}")
         return FAILED
     except KeyboardInterrupt:
-        say("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, no file is half-written")
+        inform("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, no file is half-written")
         return FAILED
     return DONE
 

@@ -21,7 +21,7 @@ logger = logging.getLogger("faintfield")
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
 
-def say(text: str) -> None:
+def inform(text: str) -> None:
     """Print one line of human words, and record it where a log is kept."""
     console.print(text, markup=False)
     logger.info(text)

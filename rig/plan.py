@@ -1,4 +1,4 @@
-"""What will be captured: every position and every frame, laid down before anything moves and never computed again."""
+"""Plan a capture: all positions and frames, computed once, before anything moves."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -14,23 +14,23 @@ from faintfield.rig.stages.workspace import StageWorkspace
 type Order = Literal["serpentine", "raster"]
 type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"]
 
-# Two status reports at five a second, and half a wait for the first.
+# Time in s to verify that the stage has arrived: two status reports at five per second, and half a wait for the first.
 _ARRIVAL_S = 0.3
 
 
 class Grid(Struct, frozen=True, forbid_unknown_fields=True):
-    """The nodes: columns along the stage's first axis, rows along its second.
+    """Grid of camera positions (nodes): columns along the first axis of the stage, rows along the second.
 
     Parameters
     ----------
     rows, columns : int
-        How many.
+        Number of rows and of columns.
     pitch_mm : float
-        Distance of neighbours, both ways.
+        Distance of neighbouring nodes along both axes.
     origin_mm : Point
-        Where node (0, 0) is, in the stage's machine coordinates.
+        Position of node (0, 0) in the machine coordinates of the stage.
     order : str
-        `serpentine` goes back and forth, `raster` begins every row at column 0.
+        `serpentine` reverses every second row, `raster` begins every row at column 0.
     """
 
     rows: int
@@ -47,7 +47,7 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
             )
 
     def position(self, row: int, column: int) -> Point:
-        """Return where a node is."""
+        """Return the position of a node."""
         x_mm, y_mm = self.origin_mm
         return Point(x_mm + column * self.pitch_mm, y_mm + row * self.pitch_mm)
 
@@ -67,23 +67,23 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Stop(Struct, frozen=True, forbid_unknown_fields=True):
-    """A node and where it is."""
+    """A node and its position."""
 
     node: tuple[int, int]
     target: Point
 
 
-class Step(Struct, frozen=True, forbid_unknown_fields=True):
-    """One step of the experiment: the same exposures at every stop, or at the centre alone.
+class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
+    """One step of the experiment: the same exposures at every node, or at the centre node only.
 
     Parameters
     ----------
     kind : str
-        What the frames are for.
+        Purpose of the frames.
     exposure_s : tuple of float
-        Exposure times, one after the other at each stop.
+        Exposure times in s, in order, at each stop.
     frames_per_node : int
-        Frames of each exposure time.
+        Number of frames of each exposure time at a stop.
     at : str
         `grid` or `centre`.
     """
@@ -99,55 +99,55 @@ class Step(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole capture, frozen.
+    """A whole capture; it does not change once it is made.
 
     Parameters
     ----------
     stops : tuple of Stop
         The nodes in the order in which every step visits them.
     centre : Stop
-        Where steps `at = "centre"` stand.
-    steps : tuple of Step
-        The steps in order.
+        The centre node, where steps with `at = "centre"` are taken.
+    steps : tuple of CaptureStep
+        Steps in order.
     approach_mm : float
-        How far past a position an axis goes before it arrives from below.
+        Distance below a position from which an axis approaches it, always in the same direction.
     frame_bytes : int
-        Size of one frame on disk.
+        Size of a frame on disk.
     settle_s : float
         Rest at each stop before the first exposure.
     readout_s : float
-        Time of a frame besides its exposure.
+        Duration of a frame besides its exposure.
     """
 
     stops: tuple[Stop, ...]
     centre: Stop
-    steps: tuple[Step, ...]
+    steps: tuple[CaptureStep, ...]
     approach_mm: float
     frame_bytes: int
     settle_s: float = 0.0
     readout_s: float = 0.0
 
     @classmethod
-    def of(cls, grid: Grid, steps: Sequence[Step], **rest: float) -> "CapturePlan":
-        """Return the plan of `steps` over `grid`; `rest` are the remaining parameters."""
+    def of(cls, grid: Grid, steps: Sequence[CaptureStep], **rest: float) -> "CapturePlan":
+        """Return the plan of `steps` over `grid`; `rest` holds the remaining parameters by name."""
         return msgspec.convert(
             {"stops": grid.stops(), "centre": grid.centre(), "steps": tuple(steps), **rest}, cls, from_attributes=True
         )
 
-    def stops_of(self, step: Step) -> tuple[Stop, ...]:
-        """Return where `step` stops, in order."""
+    def stops_of(self, step: CaptureStep) -> tuple[Stop, ...]:
+        """Return the stops of `step` in order."""
         return self.stops if step.at == "grid" else (self.centre,)
 
-    def frames(self) -> int:
-        """Return how many frames will be taken."""
+    def frame_count(self) -> int:
+        """Return the number of frames."""
         return sum(len(self.stops_of(s)) * len(s.exposure_s) * s.frames_per_node for s in self.steps)
 
     def disk_bytes(self) -> int:
-        """Return how much room the frames need."""
-        return self.frames() * self.frame_bytes
+        """Return the size of all frames on disk."""
+        return self.frame_count() * self.frame_bytes
 
     def path(self, start: Point | None = None) -> tuple[Point, ...]:
-        """Return every point that the stage goes through, turning points included, from `start` if it is known."""
+        """Return all points of the stage's path in order, turning points included, from `start` if it is known."""
         targets = [stop.target for step in self.steps for stop in self.stops_of(step)]
         points = [targets.pop(0) if start is None else start] if targets else []
         for target in targets:
@@ -156,17 +156,17 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(points)
 
     def check(self, workspace: StageWorkspace, start: Point | None = None) -> None:
-        """Refuse the plan if any of its positions, or the way between two, is not allowed.
+        """Check that the stage may go to all positions, and along the path between them.
 
         Raises
         ------
         OutsideTravel, KeepOutCrossed
-            Before anything moves.
+            The path leaves the travel of the stage, or meets a keep-out box.
         """
         workspace.check_path(self.path(start))
 
     def duration_s(self, motion: MotionLimits, feed_mm_per_s: float, start: Point | None = None) -> float:
-        """Return how long the capture will take, by the controller's own rates and accelerations, prompts aside."""
+        """Return the duration of the capture without prompts, from the controller's rates and accelerations."""
         stops = sum(len(self.stops_of(step)) for step in self.steps)
         exposing_s = sum(
             len(self.stops_of(s)) * s.frames_per_node * (sum(s.exposure_s) + len(s.exposure_s) * self.readout_s)

@@ -1,4 +1,4 @@
-"""rig.toml: everything that a capture has to know about the rig, checked as it is read."""
+"""Define the content of rig.toml, which describes the rig of a capture."""
 
 import math
 
@@ -6,25 +6,25 @@ from msgspec import Struct
 
 from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
-from faintfield.rig.plan import Grid, Step, StepKind
+from faintfield.rig.plan import CaptureStep, Grid, StepKind
 from faintfield.rig.stages.settings import StageSettings
 
 
 class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[settle]` table: how long the rig rests at a node before the first exposure there.
+    """The `[settle]` table: the rest at a node before the first exposure there.
 
     Parameters
     ----------
     measure : bool
-        Find it once per session, from short frames after a long move.
+        Measure the rest once per session, from short frames after a move.
     exposure_s : float
-        Of these short frames.
+        Exposure time of the short frames.
     limit_px : float
-        Which shift of the picture does no harm.
+        Largest shift of the picture that does no harm.
     longest_s : float
-        How long to look; a rig that still swings then is reported.
+        Duration of the measurement; there is a warning if the rig still swings at its end.
     wait_s : float
-        The rest that is planned with, and taken when nothing is measured.
+        Rest for which the plan allows, and which is used if it is not measured.
     """
 
     measure: bool = True
@@ -39,24 +39,24 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[checks]` table: from where on a frame gives a warning.
+    """The `[checks]` table: limits beyond which a frame gives a warning.
 
     Parameters
     ----------
     saturation_dn : float, optional
-        Value of a saturated pixel; without it, the largest that the file's type holds.
+        Value of a saturated pixel; by default the largest value of the file's data type.
     saturated_share : float
         Largest share of saturated pixels in a lit frame.
     least_contrast_dn : float
-        Smallest difference of the bright and the dark parts of a charuco or bright frame.
+        Smallest difference between the bright and the dark parts of a charuco or bright frame.
     least_flat_dn : float
         Smallest median of a flat frame.
     sharpness_share : float
-        Smallest sharpness of a lit frame, as a share of the median of its step.
+        Smallest sharpness of a charuco or bright frame, as a share of the median of its step.
     board_corners : int
-        Fewest board corners that make a charuco frame useful.
+        Smallest number of board corners that makes a charuco frame useful.
     leak_dn : float
-        Largest difference of brightness between two parts of a frame that should be dark.
+        Largest difference between the means of two parts of a dark frame or a noise reference.
     """
 
     saturation_dn: float | None = None
@@ -74,16 +74,16 @@ class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DriftSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """The `[drift]` table: homing again, to find lost steps that no report shows.
+    """The `[drift]` table: checks for lost steps, which the controller does not notice, by homing again.
 
     Parameters
     ----------
     check : bool
-        Whether to.
+        Check for drift after every step over the grid.
     limit_mm : float
-        How much drift to look for.
+        Smallest drift that counts.
     every_nodes : int
-        How often, besides at the end of every step over the grid; 0: only then.
+        Check after this many nodes as well; 0 means not.
     """
 
     check: bool = True
@@ -101,12 +101,12 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
     exposure_s : float or list of float
         One exposure time, or several.
     frames_per_node : int
-        Frames of each exposure time.
+        Number of frames of each exposure time at a node.
     at : str, optional
-        `grid` or `centre`; without it, `centre` for dark and flat, `grid` for the rest.
+        `grid` or `centre`; by default `centre` for dark and flat, `grid` for the other kinds.
     photons_per_s : float, optional
-        Of a flat step, where the light has been measured: photons per pixel and second, mean over the detector. From it
-        follows the quantum efficiency.
+        Measured light of a flat step in photons per pixel and second, mean over the detector; it gives the quantum
+        efficiency.
     """
 
     kind: StepKind
@@ -120,15 +120,15 @@ class StepSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"step.at = {self.at!r}; give 'grid' or 'centre'")
         if self.photons_per_s is not None and not (self.kind == "flat" and 0.0 < self.photons_per_s < math.inf):
             raise ValueError(
-                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; it is positive, and for flats only"
+                f"step.photons_per_s = {self.photons_per_s} in a {self.kind} step; give a positive number, in flats"
             )
         self.step()
 
-    def step(self) -> Step:
-        """Return the step of a plan."""
+    def step(self) -> CaptureStep:
+        """Return the step of the plan."""
         exposures = self.exposure_s if isinstance(self.exposure_s, tuple) else (self.exposure_s,)
         centred = self.at == "centre" or (self.at is None and self.kind in ("dark", "flat"))
-        return Step(self.kind, exposures, self.frames_per_node, "centre" if centred else "grid")
+        return CaptureStep(self.kind, exposures, self.frames_per_node, "centre" if centred else "grid")
 
 
 class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -137,7 +137,7 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     depth_mm : tuple of float
-        How far from the camera the objects stand: where `faintfield run` reconstructs planes.
+        Distances of the objects from the camera, at which `faintfield run` reconstructs planes.
     """
 
     depth_mm: tuple[float, ...] = ()
@@ -148,7 +148,7 @@ class SceneSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole rig.toml."""
+    """Content of a rig.toml."""
 
     stage: StageSettings
     camera: CameraSettings
@@ -168,9 +168,9 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def mosaic(self) -> Mosaic | None:
-        """The colour filters of a camera whose files do not say."""
+        """Colour filters of the camera if its files do not state them."""
         return None if isinstance(self.camera, GPhoto2Settings) else self.camera.mosaic
 
-    def steps(self) -> tuple[Step, ...]:
+    def steps(self) -> tuple[CaptureStep, ...]:
         """Return the steps of the plan."""
         return tuple(step.step() for step in self.step)

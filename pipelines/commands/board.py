@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from faintfield.calib.board import Board, black_rectangles_mm
 from faintfield.pipelines.arguments import Count, Positive
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.sets.board_set import BoardEntry
@@ -73,7 +73,7 @@ def board(
         except ValueError as failure:
             raise WrongUsage(f"{failure}") from failure
     write_whole(out, _document([_page(each, width_mm, height_mm) for each in made], (width_mm, height_mm)))
-    say(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
+    inform(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
     entries = [{name: getattr(each, name) for name in BoardEntry.__struct_fields__} for each in made]
     return {"out": str(out), "paper": paper, "board": entries}
 

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from numpy.typing import NDArray
 
 from faintfield.pipelines.arguments import Fraction, NotNegative, Positive, Seed
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import building_folder, write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
@@ -90,7 +90,7 @@ def darken(
         write_json(folder / "provenance.json", record | {"scale_e": scale, "photons_on_object": photons})
     figures = brightness(load_set(out))
     known = {"quantum_efficiency": quantum_efficiency, "read_noise_e": read_noise_e}
-    say(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
+    inform(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")
     return {
         "out": str(out),
         "views": len(loaded.image_paths),

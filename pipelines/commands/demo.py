@@ -9,7 +9,7 @@ from faintfield.pipelines.commands.capture import capture
 from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
 from faintfield.pipelines.commands.run import run_steps, session_steps
 from faintfield.pipelines.commands.simulate import NOISE_FREE
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
@@ -49,11 +49,13 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     settings = demo_rig(DemoSize.quick() if quick else DemoSize.full(), snr, seed)
     write_toml(out / "rig.toml", settings)
     session = out / "session"
-    say("capturing: boards, a toy truck at 500 mm and a toy airplane at 700 mm, almost dark, then dark and flat frames")
+    inform(
+        "capturing: boards, a toy truck at 500 mm and a toy airplane at 700 mm, almost dark, then dark and flat frames"
+    )
     capture(out / "rig.toml", session, yes=True)
     depths = list(settings.scene.depth_mm)
     run_steps(session, session_steps(session, Request(depths, _METHODS)))
-    say("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
+    inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
     reconstruct_set(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
     alone = Request(depths, [DEFAULT_METHOD])

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from faintfield.pipelines.arguments import Count, Positive, Seed, SizePx
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.simulate import NOISE_FREE, simulate
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.provenance import provenance
@@ -69,7 +69,7 @@ def figures(
     options = {"only": wanted, "snr": snr, "seed": seed, "seeds": seeds, "size_px": list(size_px)}
     check_free(out, replace_if=PAGE_FILE)
     if {2, 3} & set(wanted):
-        say("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm")
+        inform("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm")
         simulate(out / _SCENE, snr=snr, seed=seed, size_px=size_px, overwrite=True)
     makers: dict[int, Callable[[], dict[str, Any]]] = {
         2: lambda: _figure2(out),
@@ -83,7 +83,7 @@ def figures(
         made[f"figure{number}"] = makers[number]()
         record = provenance("figures", options, {}) | {"wall_time_s": time.monotonic() - started}
         write_json(out / f"figure{number}_provenance.json", record)
-        say(f"figure {number}: {time.monotonic() - started:.1f} s")
+        inform(f"figure {number}: {time.monotonic() - started:.1f} s")
     return {"out": str(out), "report": str(_write_page(out)), "figures": made}
 
 

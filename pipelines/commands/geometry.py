@@ -9,7 +9,7 @@ from faintfield.calib.errors import TooFewViews
 from faintfield.calib.geometry import BoardObservation, GeometrySettings, RigGeometry, Target, calibrate_geometry
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.pipelines.arguments import LensName, Positive
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import WrongSize
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import geometry_content, write_geometry
@@ -118,27 +118,29 @@ def _say_what_was_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) ->
     empty = [view.node for view, seen in per_view if not any(len(board.corners) for board in seen)]
     if empty:
         names = ", ".join(str(list(node)) for node in empty[:_NODES_OF_ONE_LINE])
-        say(f"no board was found in {len(empty)} of {len(per_view)} views (nodes {names}{' …' if empty[8:] else ''})")
+        inform(
+            f"no board was found in {len(empty)} of {len(per_view)} views (nodes {names}{' …' if empty[8:] else ''})"
+        )
     legacy = sorted({board.board for _, seen in per_view for board in seen if board.legacy})
     if legacy:
-        say(f"printed in OpenCV's older layout, which begins with a white square: {', '.join(legacy)}")
+        inform(f"printed in OpenCV's older layout, which begins with a white square: {', '.join(legacy)}")
 
 
 def _say_result(board_set: BoardSet, measured: RigGeometry, stage: StageReport, content: dict[str, Any]) -> None:
     """Say in a few lines how good the geometry is."""
     known = ", ".join(f"{sigma:.3f} px at {depth} mm" for depth, sigma in content["transfer_sigma_px"].items())
-    say(f"{len(measured.nodes)} nodes, {measured.corners} corners, residual {measured.rms_inlier_px:.3f} px")
-    say(f"transfer between views known to {known}")
+    inform(f"{len(measured.nodes)} nodes, {measured.corners} corners, residual {measured.rms_inlier_px:.3f} px")
+    inform(f"transfer between views known to {known}")
     missing = {view.node for view in board_set.views} - set(measured.nodes)
     if missing:
-        say(f"without a pose, since no board ties them to the rest: nodes {sorted(missing)}; take them again")
+        inform(f"without a pose, since no board ties them to the rest: nodes {sorted(missing)}; take them again")
     if stage.node_residual_rms_mm.value is not None:
-        say(f"nodes lie {stage.node_residual_rms_mm.value:.3f} mm rms off the regular grid that fits best")
+        inform(f"nodes lie {stage.node_residual_rms_mm.value:.3f} mm rms off the regular grid that fits best")
     for doubt in (*measured.doubts, *stage.doubts):
-        say(doubt)
+        inform(doubt)
     repeatability = measured.repeatability
     if repeatability is not None and repeatability.sd_mm > _MOST_REPEATABILITY_MM:
-        say(
+        inform(
             f"the stage comes back to a node within {1e3 * repeatability.sd_mm:.0f} ± {1e3 * repeatability.se_mm:.0f} "
             f"µm only (limit {1e3 * _MOST_REPEATABILITY_MM:.0f} µm); the uncertainties above include it. "
             "Show several boards at once in one sweep, or let the stage settle longer"

@@ -9,7 +9,7 @@ import msgspec
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import NoiseCalibration, calibrate
 from faintfield.pipelines.calibration.noise_frames import Plane, read_series
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole
 from faintfield.pipelines.formats.provenance import provenance
@@ -102,19 +102,19 @@ def _black_level_doubts(plane: Plane, calibration: NoiseCalibration) -> list[str
 
 def _tell(out: Path, result: dict[str, Any]) -> None:
     """Say the main numbers and every doubt."""
-    say(f"{STANDARD}; likelihood: {result['likelihood']}")
+    inform(f"{STANDARD}; likelihood: {result['likelihood']}")
     said: dict[str, str] = {}
     for name, label, unit in _SHOWN:
         estimate = result[name]
         if estimate["value"] is None:
             reason = estimate["why"]
-            say(f"  {label}: not identifiable: {'as for ' + said[reason] if reason in said else reason}")
+            inform(f"  {label}: not identifiable: {'as for ' + said[reason] if reason in said else reason}")
             said.setdefault(reason, label.partition(",")[0])
         else:
             low, high = estimate["ci95"]
-            say(f"  {label}: {estimate['value']:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
+            inform(f"  {label}: {estimate['value']:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
     counts = {kind: len(result[f"{kind}_pixels"]) for kind in ("hot", "noisy", "dead")}
-    say("  pixels: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
+    inform("  pixels: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
     for warning in result["warnings"]:
-        say(f"  warning: {warning}")
-    say(f"{out / NOISE_FILE}")
+        inform(f"  warning: {warning}")
+    inform(f"{out / NOISE_FILE}")

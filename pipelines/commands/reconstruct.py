@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import alone_in, remove, remove_leftovers, require_room, write_json
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, read_plane_poses, tilted_grid
@@ -302,7 +302,7 @@ def _reconstructed(loaded: LoadedSet, out: Path, request: Request, crew: Crew) -
     _say_what_oscillates(sweep.records)
     _say_what_is_not_reached(sweep.records)
     _say_what_is_black(sweep.records)
-    say(f"{len(depths) + len(request.tilted)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
+    inform(f"{len(depths) + len(request.tilted)} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return {
         "out": str(out),
         "report": str(report),
@@ -377,7 +377,7 @@ def _say_what_oscillates(records: list[dict[str, Any]]) -> None:
     certificates = [certificate for certificate in certificates if "oscillates" in certificate]
     swings = [certificate["relative_change"] for certificate in certificates if certificate["oscillates"]]
     if swings:
-        say(
+        inform(
             f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
             f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
             "--penalty-weight calms it, and leaves more noise."
@@ -389,7 +389,7 @@ def _say_what_is_not_reached(records: list[dict[str, Any]]) -> None:
     certificates = [record["certificate"] for record in records if record["method"] in ("pmlem", *TOGETHER)]
     missed = [certificate["value"] for certificate in certificates if not certificate["reached"]]
     if missed:
-        say(
+        inform(
             f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
             f"{max(missed):.1%} from the optimum instead of {certificates[0]['tolerance']:.0%}; allow more --passes"
         )
@@ -399,7 +399,7 @@ def _say_what_is_black(records: list[dict[str, Any]]) -> None:
     """Tell of planes without light, which are right only if there is none."""
     black = [record for record in records if record["mean_e"] <= _BLACK_E]
     if black:
-        say(
+        inform(
             f"{len(black)} of {len(records)} planes are black ({black[0]['method']}, {black[0]['depth_mm']:g} mm for "
             "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
             "with dark frames of the same exposure"

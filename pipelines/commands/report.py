@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.pages.report import write_report
 
 
@@ -20,5 +20,5 @@ def report(directory: Path, /) -> dict[str, Any]:
         Folder with reconstruction.json, or whose folders have one: what `reconstruct` wrote, or a session.
     """
     path = write_report(directory)
-    say(f"{path}")
+    inform(f"{path}")
     return {"report": str(path)}

@@ -15,7 +15,7 @@ from faintfield.pipelines.commands.reconstruct import (
     options_of,
     reconstruct_set,
 )
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from faintfield.pipelines.formats.hashes import Hashes
 from faintfield.pipelines.formats.provenance import first_difference, provenance
@@ -182,16 +182,16 @@ def run_steps(session: Path, steps: Sequence[Step]) -> dict[str, Any]:
     for step in steps:
         if missing := [name for name in step.needs if name in failed]:
             failed[step.name] = failed[missing[0]]
-            say(f"{step.name}: left as it is, for it needs {missing[0]}")
+            inform(f"{step.name}: left as it is, for it needs {missing[0]}")
             continue
         try:
             why = _out_of_date(session, step, hashes)
-            say(f"{step.name}: {why or 'up to date'}")
+            inform(f"{step.name}: {why or 'up to date'}")
             if why is not None:
                 step.make()
         except NAMED_FAILURES as failure:
             failed[step.name] = failure
-            say(f"{step.name}: failed: {failure}")
+            inform(f"{step.name}: failed: {failure}")
         else:
             done.append({"step": step.name, "ran": why is not None, "why": why or "up to date"})
     hashes.save()
@@ -219,7 +219,7 @@ def _altered_frames(session: Path, hashes: Hashes) -> list[str]:
         if path.is_file() and hashes.of(str(path.relative_to(session))) != taken.sha256
     ]
     if altered:
-        say(
+        inform(
             f"warning: {altered[0]} and {len(altered) - 1} other frames are not what was captured; results are made "
             f"from them as they are now. Restore them from a copy; `faintfield verify {session}` names the first"
         )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import building_folder, write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_frame, write_plane, write_png
@@ -113,7 +113,7 @@ def simulate(
         _write_noise_free_set(folder / NOISE_FREE, experiment, rendered, scale, mosaic)
         truth = _write_truth(folder, experiment, rendered, scale, snr, poses, mosaic)
         write_json(folder / "provenance.json", provenance("simulate", options, {}))
-    say(
+    inform(
         f"{out}: {rows} x {columns} views, SNR {truth.snr:.3f}; photons per pixel on the object: "
         f"{truth.photons_from_moments:.2f} (moments), {truth.photons_linear:.2f} (the paper's linear formula)"
     )

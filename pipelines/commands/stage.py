@@ -10,7 +10,7 @@ import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
 
-from faintfield.pipelines.console import console, say
+from faintfield.pipelines.console import console, inform
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
@@ -93,9 +93,9 @@ def info(connection: Connection = Connection()) -> Identity:
     """Show firmware, travel and settings of the controller, without moving."""
     with _connected(connection) as stage:
         identity = stage.identify()
-        say(f"{identity.firmware}, travel {stage.travel()}")
+        inform(f"{identity.firmware}, travel {stage.travel()}")
         rates = " and ".join(f"{60.0 * rate:g}" for rate in identity.motion.rate_mm_per_s)
-        say(f"rates {rates} mm/min; a position counts as reached within {max(identity.tolerance_mm):.4f} mm")
+        inform(f"rates {rates} mm/min; a position counts as reached within {max(identity.tolerance_mm):.4f} mm")
         return identity
 
 
@@ -104,7 +104,7 @@ def home(connection: Connection = Connection()) -> Position:
     """Find the homing switches."""
     with _connected(connection) as stage:
         homing = stage.home()
-        say(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
+        inform(f"homed to {homing.position.point} in {homing.duration_s:.1f} s")
         return homing.position
 
 
@@ -132,7 +132,7 @@ def goto(
         if home:
             stage.home()
         position = stage.move_to(x_mm, y_mm)
-        say(f"arrived at {position.point}")
+        inform(f"arrived at {position.point}")
         return position
 
 
@@ -157,7 +157,7 @@ def jog(
     """
     with _connected(connection) as stage:
         position = stage.jog(dx_mm, dy_mm, unlock=unlock)
-        say(f"reported at {position.point}; not homed, so the true position is unknown")
+        inform(f"reported at {position.point}; not homed, so the true position is unknown")
         return position
 
 
@@ -173,7 +173,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     with _connected(connection) as stage:
         checks = []
         for check in conformance(stage):
-            say(f"tried: {check.name}")
+            inform(f"tried: {check.name}")
             checks.append(check)
     console.print(_table(checks))
     failed = [check for check in checks if not check.passed]
@@ -197,7 +197,7 @@ def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0
         Simulated seconds per real second.
     """
     with serving(SIMULATED_FIRMWARE[protocol]) as server:
-        say(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
+        inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
         with suppress(KeyboardInterrupt):
             server.run(speed)
 
@@ -213,7 +213,7 @@ def _connected(connection: Connection) -> Iterator[Gantry]:
     stage.connect()
     try:
         for warning in stage.identify().warnings:
-            say(f"warning: {warning}")
+            inform(f"warning: {warning}")
         yield stage
     finally:
         stage.close()

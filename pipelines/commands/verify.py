@@ -1,15 +1,16 @@
-"""`faintfield verify`: every frame against its hash, the journal against the plan."""
+"""`faintfield verify`: compare every frame of a session with its hash, and the journal with the plan."""
 
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.rig.errors import SessionCorrupt
-from faintfield.rig.session.verify import verify as verdict_of
+from faintfield.rig.session.verify import verify as verify_session
 
-_SHOWN = 10
+# Problems printed one by one; the failure gives their number.
+_MAX_SHOWN = 10
 
 
 def verify(session: Path, /) -> dict[str, Any]:
@@ -20,21 +21,21 @@ def verify(session: Path, /) -> dict[str, Any]:
     session
         Its folder.
     """
-    verdict = verdict_of(session, lambda paths: progress(list(paths), "hashing"))
-    for problem in verdict.problems[:_SHOWN]:
-        say(f"problem: {problem}")
+    verdict = verify_session(session, lambda paths: progress(list(paths), "hashing"))
+    for problem in verdict.problems[:_MAX_SHOWN]:
+        inform(f"problem: {problem}")
     if verdict.problems:
         raise SessionCorrupt(
             f"{session}: {len(verdict.problems)} problems, the first: {verdict.problems[0]}; "
             f"restore files from a copy, or run capture again if the session is not complete"
         )
     state = "complete" if verdict.sealed else f"{len(verdict.missing)} still to be taken"
-    say(f"{session}: {verdict.present} of {verdict.planned} frames present and whole, {state}")
+    inform(f"{session}: {verdict.present} of {verdict.planned} frames present and whole, {state}")
     for count, what in (
         (len(verdict.left_out), "left out by the operator"),
         (verdict.superseded, "taken again; the earlier files are kept"),
         (len(verdict.suspect), "kept although the stage lost its scale after them"),
     ):
         if count:
-            say(f"  {count} {what}")
+            inform(f"  {count} {what}")
     return {"session": str(session), **msgspec.to_builtins(verdict)}

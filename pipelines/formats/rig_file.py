@@ -1,11 +1,12 @@
-"""rig.toml, read and checked; and what the commands on it share."""
+"""Read rig.toml, its template, and the stored settings of the stage beside it."""
 
+from importlib.resources import files
 from pathlib import Path
 
-from faintfield.pipelines.errors import InputError
-from faintfield.pipelines.formats.frames import read_frame
+import msgspec
+
+from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.toml_files import read_toml
-from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.settings import RigSettings
 
 
@@ -15,14 +16,33 @@ def read_rig(path: Path) -> RigSettings:
     Raises
     ------
     MissingFile, BadValue, UnknownKey
-        With the path and the key.
+        The file cannot be used; the message names the file and the key.
     """
     return read_toml(path, RigSettings)
 
 
-def decoded(path: Path) -> Pixels | None:
-    """Return the pixels of a frame's file, None when it cannot be decoded here."""
-    try:
-        return read_frame(path).pixels_dn
-    except InputError:
+def rig_template() -> str:
+    """Return the text of a commented rig.toml, which describes a simulated rig."""
+    return files("faintfield.pipelines.formats").joinpath("rig_template.toml").read_text(encoding="utf-8")
+
+
+def stage_settings_path(rig: Path) -> Path:
+    """Return the path of the stored settings of the stage of a rig.toml."""
+    return rig.with_suffix(".stage.json")
+
+
+def read_stage_settings(rig: Path) -> dict[str, str] | None:
+    """Read the stored settings of the stage of a rig.toml, None if there are none.
+
+    Raises
+    ------
+    BadValue
+        The file is not as `faintfield check --remember` writes it.
+    """
+    path = stage_settings_path(rig)
+    if not path.exists():
         return None
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
+    except (msgspec.DecodeError, UnicodeDecodeError) as failure:
+        raise BadValue(f"{path}: is not what --remember writes ({failure}); run with --remember again") from failure

@@ -1,1 +1,1 @@
-"""What a capture shows while it runs, in the terminal and on a local page."""
+"""Run a guided capture and show it, in the terminal and on a local web page."""

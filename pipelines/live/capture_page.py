@@ -1,12 +1,12 @@
-"""The capture as a local web page: what the terminal shows, and its keys as buttons, dim red on black.
+"""Serve a capture as a local web page: what the terminal shows, with its keys as buttons, dim red on black.
 
-Served to this computer alone, at an address that nobody can guess: its first part is a random token.
+The page is served to this computer only, at an address that cannot be guessed: its path begins with a random token.
 """
 
 import secrets
 import socket
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.resources import files
 from typing import Any
@@ -22,14 +22,16 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import WISHES, Panel, Shown
-from faintfield.pipelines.live.terminal import MEANINGS, levels
-from faintfield.rig.capture.guide import spoken_duration
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.terminal import LABELS, display_levels
+from faintfield.rig.capture.guide import format_duration
 
 _HOST = "127.0.0.1"
+# Width of the frame's picture in pixels.
 _PICTURE_PX = 960
-_BINS = 64
-_LONGEST_PRESS_BYTES = 1000
+_HISTOGRAM_BINS = 64
+# Longer requests are not read: a press is far shorter.
+_MAX_PRESS_BYTES = 1000
 _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
@@ -39,20 +41,22 @@ _HEADERS = {
 }
 
 
-class _Press(msgspec.Struct, forbid_unknown_fields=True):
-    """What the page sends when a button is pressed."""
+class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
+    """Message from the page when a button is pressed."""
 
     word: str
     prompt: int | None = None
 
 
 @contextmanager
-def serving_page(panel: Panel) -> Iterator[str]:
-    """Serve the page of `panel` while the block runs, and yield its address."""
+def serve_page(panel: CapturePanel) -> Iterator[str]:
+    """Serve the page of `panel` while the block runs; yield its address."""
     token = secrets.token_urlsafe(24)
     listener = socket.create_server((_HOST, 0))
-    config = uvicorn.Config(page_of(panel, token), log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
-    server = uvicorn.Server(config)
+    application = _application(panel, token)
+    server = uvicorn.Server(
+        uvicorn.Config(application, log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
+    )
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
     thread.start()
     try:
@@ -63,68 +67,67 @@ def serving_page(panel: Panel) -> Iterator[str]:
         listener.close()
 
 
-def page_of(panel: Panel, token: str) -> Starlette:
-    """Return the page as an application; without the token there is nothing to be found."""
+def _application(panel: CapturePanel, token: str) -> Starlette:
+    """Return the web application; every path of it begins with the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
         return HTMLResponse(html, headers=_HEADERS)
 
     async def state(_: Request) -> Response:
-        return JSONResponse(state_of(panel), headers=_HEADERS)
+        return JSONResponse(_state(panel), headers=_HEADERS)
 
     async def picture(_: Request) -> Response:
         if panel.shown is None:
             return Response(status_code=404, headers=_HEADERS)
-        return Response(picture_of(panel.shown), media_type="image/png", headers=_HEADERS)
+        return Response(_frame_png(panel.shown), media_type="image/png", headers=_HEADERS)
 
     async def press(request: Request) -> Response:
         try:
             body = await request.body()
-            pressed = msgspec.json.decode(body[:_LONGEST_PRESS_BYTES], type=_Press)
+            pressed = msgspec.json.decode(body[:_MAX_PRESS_BYTES], type=_PressRequest)
         except msgspec.DecodeError as failure:
             return JSONResponse({"error": str(failure)}, status_code=400, headers=_HEADERS)
-        if pressed.word not in MEANINGS:
+        if pressed.word not in LABELS:
             return JSONResponse({"error": "no such button"}, status_code=400, headers=_HEADERS)
         panel.press(pressed.word, pressed.prompt)
         return JSONResponse({}, headers=_HEADERS)
 
-    handlers: list[tuple[str, Callable[[Request], Awaitable[Response]], str]] = [
-        ("", index, "GET"),
-        ("state", state, "GET"),
-        ("frame.png", picture, "GET"),
-        ("press", press, "POST"),
-    ]
     return Starlette(
-        routes=[Route(f"/{token}/{path}", handler, methods=[method]) for path, handler, method in handlers],
-        # A page elsewhere whose name is made to point here is turned away
+        routes=[
+            Route(f"/{token}/", index),
+            Route(f"/{token}/state", state),
+            Route(f"/{token}/frame.png", picture),
+            Route(f"/{token}/press", press, methods=["POST"]),
+        ],
+        # Turn away requests by another host name, which a foreign page could make point to this computer
         middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST])],
     )
 
 
-def state_of(panel: Panel) -> dict[str, Any]:
-    """Return all that the page shows, except the picture."""
+def _state(panel: CapturePanel) -> dict[str, Any]:
+    """Return what the page shows, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
-    words = list(WISHES) if asked is None else list(asked.prompt.answers)
+    words = list(REQUESTS) if asked is None else list(asked.prompt.answers)
     return {
         "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
         "status": None if status is None else msgspec.to_builtins(status),
-        "to_go": "" if status is None else spoken_duration(status.to_go_s),
-        "buttons": [{"word": word, "label": MEANINGS[word]} for word in words],
+        "to_go": "" if status is None else format_duration(status.to_go_s),
+        "buttons": [{"word": word, "label": LABELS[word]} for word in words],
         "frame": None if shown is None else _frame_state(shown),
     }
 
 
-def picture_of(shown: Shown) -> bytes:
-    """Return a frame as PNG, in red alone."""
-    grey = levels(shown.pixels, _PICTURE_PX)
+def _frame_png(shown: ShownFrame) -> bytes:
+    """Return a frame as PNG, in red only."""
+    grey = display_levels(shown.pixels, _PICTURE_PX)
     zero = np.zeros_like(grey)
     return encoded(np.dstack([grey, zero, zero]), ".png")
 
 
-def _frame_state(shown: Shown) -> dict[str, Any]:
-    """Return name, figures and histogram of a frame."""
-    counts, edges = np.histogram(shown.pixels, bins=_BINS)
+def _frame_state(shown: ShownFrame) -> dict[str, Any]:
+    """Return name, measured values and histogram of a frame."""
+    counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
     return {
         "name": shown.frame.name,
         "values": dict(shown.values),

@@ -1,7 +1,7 @@
-"""What terminal and page have in common: one prompt, one status, one queue of pressed buttons.
+"""Hold what terminal and page share: one prompt, one status, one queue of pressed buttons.
 
-Whoever presses first answers; both show the same. The capture runs in the main thread and only looks at the queue, so
-a key, a click and Ctrl-C take the same way.
+Both show the same, and the first answer counts, wherever it comes from. The capture runs in the main thread and reads
+the queue, into which keys, clicks and Ctrl-C are put alike.
 """
 
 import itertools
@@ -12,68 +12,68 @@ from typing import NamedTuple, get_args
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Answer, Prompt, Status, Wish
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.session.frames import PlannedFrame
 
-WISHES: tuple[Wish, ...] = get_args(Wish.__value__)
+REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
 
 
-class Pressed(NamedTuple):
-    """A button or key: the word on it, and the number of the prompt that it was meant for, if for one."""
+class ButtonPress(NamedTuple):
+    """A pressed button or key: its word, and the number of the prompt that it answers, if any."""
 
     word: str
     prompt: int | None
 
 
-class Asked(Struct, frozen=True):
-    """A prompt that waits for its answer; `number` tells it from earlier ones."""
+class OpenPrompt(Struct, frozen=True):
+    """A prompt that waits for its answer; `number` distinguishes it from earlier ones."""
 
     number: int
     prompt: Prompt
 
 
-class Shown(Struct, frozen=True):
-    """A frame as it is looked at."""
+class ShownFrame(Struct, frozen=True):
+    """The frame on display, with its measured values by name."""
 
     frame: PlannedFrame
     pixels: Pixels
     values: Mapping[str, float]
 
 
-class Panel:
-    """An `Operator` that others look at and press buttons of.
+class CapturePanel:
+    """The `OperatorInterface` of a capture; views show its state and press its buttons.
 
     Parameters
     ----------
     unattended : bool
-        Prompts answer themselves; wishes are still heard.
+        Give every prompt its unattended answer; requests are still accepted.
 
     Attributes
     ----------
     asked, status, shown
-        What is to be seen now. Each is replaced as a whole, so any thread may look.
+        Prompt, status and frame to show, or None. Each is replaced as a whole, so any thread may read them.
     on_change : list of callable
-        Told in the capture's thread that something is new.
+        Called in the thread of the capture when any of these has changed.
     """
 
     def __init__(self, *, unattended: bool) -> None:
-        self.asked: Asked | None = None
+        self.asked: OpenPrompt | None = None
         self.status: Status | None = None
-        self.shown: Shown | None = None
+        self.shown: ShownFrame | None = None
         self.on_change: list[Callable[[], None]] = []
         self.unattended = unattended
-        self._pressed: SimpleQueue[Pressed] = SimpleQueue()
+        self._pressed: SimpleQueue[ButtonPress] = SimpleQueue()
         self._numbers = itertools.count(1)
 
     def press(self, word: str, prompt: int | None = None) -> None:
         """Press a button, from any thread or a signal handler."""
-        self._pressed.put(Pressed(word, prompt))
+        self._pressed.put(ButtonPress(word, prompt))
 
     def ask(self, prompt: Prompt) -> Answer:
-        """Wait for an answer to `prompt` from wherever it comes."""
+        """Show `prompt` and return the first answer to it."""
         if self.unattended:
             return prompt.unattended
-        self.asked = Asked(next(self._numbers), prompt)
+        self.asked = OpenPrompt(next(self._numbers), prompt)
         self._changed()
         while True:
             pressed = self._pressed.get()
@@ -82,28 +82,28 @@ class Panel:
                 self._changed()
                 return pressed.word
 
-    def wish(self) -> Wish | None:
-        """Return the latest of what was wished for since the last call."""
-        latest: Wish | None = None
+    def take_request(self) -> OperatorRequest | None:
+        """Return the latest request since the last call, None if there is none."""
+        latest: OperatorRequest | None = None
         while True:
             try:
                 pressed = self._pressed.get_nowait()
             except Empty:
                 return latest
-            if pressed.word in WISHES and pressed.prompt is None:
+            if pressed.word in REQUESTS and pressed.prompt is None:
                 latest = pressed.word
 
     def show_status(self, status: Status) -> None:
-        """Show where the capture stands."""
+        """Show the state of the capture."""
         self.status = status
         self._changed()
 
     def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
         """Show the frame just taken."""
-        self.shown = Shown(frame, pixels, values)
+        self.shown = ShownFrame(frame, pixels, values)
         self._changed()
 
     def _changed(self) -> None:
-        """Tell those who look."""
-        for tell in self.on_change:
-            tell()
+        """Inform the views."""
+        for callback in self.on_change:
+            callback()

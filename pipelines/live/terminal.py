@@ -1,4 +1,4 @@
-"""The capture in the terminal: the guide's words, keys, a line of progress, and the last frame as a picture."""
+"""Show a capture in the terminal: prompts, keys, a status line, and the last frame as a picture."""
 
 import os
 import select
@@ -15,13 +15,13 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from faintfield.pipelines.console import console, say
-from faintfield.pipelines.live.panel import Panel, Shown
+from faintfield.pipelines.console import console, inform
+from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.guide import Prompt, Status, spoken_duration
+from faintfield.rig.capture.guide import Prompt, Status, format_duration
 
 KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
-MEANINGS = {
+LABELS = {
     "go": "go on",
     "again": "try again",
     "keep": "keep as it is",
@@ -30,27 +30,28 @@ MEANINGS = {
     "stop": "stop",
     "pause": "pause",
 }
+# Width of the frame's picture in characters.
 _PICTURE_COLUMNS = 48
 _BARS = " ▁▂▃▄▅▆▇█"
 
 
 class TerminalView:
-    """Shows a panel in the terminal; on anything else than a terminal, a line for each step and warning.
+    """Shows a panel in the terminal; without a terminal, prints a line for each step and warning.
 
     Parameters
     ----------
-    panel : Panel
-        What to show.
+    panel : CapturePanel
+        The panel to show.
     """
 
-    def __init__(self, panel: Panel) -> None:
+    def __init__(self, panel: CapturePanel) -> None:
         self._panel = panel
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._said: set[str] = set()
-        self._asked = 0
+        self._printed: set[str] = set()
+        self._prompt_number = 0
 
     @contextmanager
-    def showing(self) -> Iterator[None]:
+    def show(self) -> Iterator[None]:
         """Show the panel while the block runs."""
         self._panel.on_change.append(self._refresh)
         if not console.is_terminal:
@@ -60,66 +61,66 @@ class TerminalView:
             yield
 
     def _refresh(self) -> None:
-        """Show what is new."""
+        """Print new prompts and warnings, and update the picture."""
         status, asked = self._panel.status, self._panel.asked
-        if asked is not None and asked.number != self._asked:
-            self._asked = asked.number
+        if asked is not None and asked.number != self._prompt_number:
+            self._prompt_number = asked.number
             for line in prompt_lines(asked.prompt):
-                say(line)
+                inform(line)
         if status is not None:
             title = [status.title] if self._panel.unattended else []
             for line in (*title, *(f"warning: {it}" for it in status.warnings)):
-                if line not in self._said:
-                    self._said.add(line)
-                    say(line)
+                if line not in self._printed:
+                    self._printed.add(line)
+                    inform(line)
         if console.is_terminal:
             self._live.update(self._picture(), refresh=True)
 
     def _picture(self) -> RenderableType:
-        """Return the part of the screen that changes."""
+        """Return the part of the screen that is redrawn."""
         parts: list[RenderableType] = []
         if self._panel.shown is not None:
             parts += [frame_picture(self._panel.shown.pixels), Text(values_line(self._panel.shown), style="dim")]
         if self._panel.status is not None:
             parts.append(Text(status_line(self._panel.status)))
-        wishes = "  ".join(f"[{KEYS[word]}] {MEANINGS[word]}" for word in ("pause", "retake", "skip", "stop"))
         if self._panel.asked is None:
-            parts.append(Text(wishes, style="dim"))
+            keys = "  ".join(f"[{KEYS[word]}] {LABELS[word]}" for word in ("pause", "retake", "skip", "stop"))
+            parts.append(Text(keys, style="dim"))
         return Group(*parts)
 
 
 def prompt_lines(prompt: Prompt) -> list[str]:
     """Return a prompt as lines of text."""
-    answers = "   ".join(f"[{KEYS[answer]}] {MEANINGS[answer]}" for answer in prompt.answers)
+    answers = "   ".join(f"[{KEYS[answer]}] {LABELS[answer]}" for answer in prompt.answers)
     return [
         "",
         prompt.title,
         *(f"  {line}" for line in prompt.lines),
-        f"  {answers}   (Enter: {MEANINGS[prompt.answers[0]]})",
+        f"  {answers}   (Enter: {LABELS[prompt.answers[0]]})",
     ]
 
 
 def status_line(status: Status) -> str:
-    """Return the status in a line."""
+    """Return a status as one line."""
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
-    return f"{status.done} of {status.total} frames, {spoken_duration(status.to_go_s)} to go;{node}: {status.doing}"
+    return f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
 
 
-def values_line(shown: Shown) -> str:
-    """Return the name of a frame and its histogram, and in a second line what was measured in it."""
+def values_line(shown: ShownFrame) -> str:
+    """Return a line with name and histogram of a frame, and a second one with its measured values."""
     values = "  ".join(f"{name} {value:g}" for name, value in shown.values.items())
     return f"{shown.frame.name}  {histogram_bars(shown.pixels)}\n{values}"
 
 
 def histogram_bars(pixels: Pixels, bins: int = 24) -> str:
-    """Return the histogram from the darkest to the brightest pixel, heights on a logarithmic scale."""
+    """Return a histogram in block characters of logarithmic height, from the darkest to the brightest pixel."""
     counts, _ = np.histogram(pixels, bins=bins)
     heights = np.log1p(counts) / max(float(np.log1p(counts).max()), 1.0)
     return "".join(_BARS[round(height * (len(_BARS) - 1))] for height in heights)
 
 
-def levels(pixels: Pixels, width_px: int) -> Pixels:
-    """Return a frame as 8-bit levels (row, column), reduced to a width, from its 1 % to its 99.8 % quantile."""
+def display_levels(pixels: Pixels, width_px: int) -> Pixels:
+    """Return a frame (row, column) reduced to a width, in 8-bit levels from its 1 % to its 99.8 % quantile."""
     grey = np.asarray(pixels if pixels.ndim == 2 else pixels.mean(axis=2), np.float32)
     scale = min(1.0, width_px / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -128,8 +129,8 @@ def levels(pixels: Pixels, width_px: int) -> Pixels:
 
 
 def frame_picture(pixels: Pixels) -> Text:
-    """Return a frame in half blocks, red on black: what does not spoil eyes that are used to the dark."""
-    picture = levels(pixels, _PICTURE_COLUMNS)
+    """Return a frame in half blocks, red on black, which preserves dark adaptation."""
+    picture = display_levels(pixels, _PICTURE_COLUMNS)
     text = Text()
     for top, bottom in zip(picture[:-1:2], picture[1::2], strict=True):
         for upper, lower in zip(top, bottom, strict=True):
@@ -139,7 +140,7 @@ def frame_picture(pixels: Pixels) -> Text:
 
 
 @contextmanager
-def _keys(panel: Panel) -> Iterator[None]:
+def _keys(panel: CapturePanel) -> Iterator[None]:
     """Let single keys press the panel's buttons while the block runs."""
     if not sys.stdin.isatty():
         yield

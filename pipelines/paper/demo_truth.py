@@ -50,7 +50,7 @@ def write_truth(out: Path, session: Path, snr: float) -> Path:
 def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
     """Return rt_cam_ref (6,) of every node's dark-scene frame, as the simulated world has recorded it."""
     recorded = {
-        frame.stop.node: np.array(taken.detail["camera"][TRUE_POSE])
+        frame.stop.node: np.array(taken.record.camera[TRUE_POSE])
         for frame, taken, _ in taken_frames(session)
         if frame.kind == "dark_scene"
     }

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
 from faintfield.pipelines.reconstruction.depth_map import Compared, compared_depths
 from faintfield.recon.depth.best_focus import LEAST_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
@@ -86,7 +86,7 @@ def best_focus(loaded: LoadedSet, out: Path, range_mm: tuple[float, float] | Non
         round(_refined(loaded, out, compared, place, float(np.median(found.index[place]))), 1) for place in places
     ]
     depths = sorted(set(depths))
-    say(f"planes of best focus between {near_mm:g} and {far_mm:g} mm: {', '.join(f'{d:g}' for d in depths)} mm")
+    inform(f"planes of best focus between {near_mm:g} and {far_mm:g} mm: {', '.join(f'{d:g}' for d in depths)} mm")
     record = {
         "depth_mm": depths,
         "searched_mm": [list(searched) for searched in ranges],

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MemoryShort
 from faintfield.pipelines.formats.large_arrays import available_bytes
 from faintfield.pipelines.formats.plane_poses import Place, depth_of
@@ -100,5 +100,5 @@ def _of_what_is_there(one: Solution, record: dict[str, Any]) -> Solution:
 
 def _without_occlusion(joint: list[Solution], why: str) -> list[Solution]:
     """Return the planes as they are, and say so."""
-    say(f"occlusion is left out: {why}; the planes are those of joint")
+    inform(f"occlusion is left out: {why}; the planes are those of joint")
     return [replace(one, record=one.record | {"occlusion": False, "occlusion_left_out": why}) for one in joint]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, words_of
 from faintfield.pipelines.formats.results.plane_files import PlaneFiles
@@ -197,13 +197,13 @@ class Sweep:
             if record := files.finished():
                 self._finished[files.method, files.place] = record
         if self._finished:
-            say(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
+            inform(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
         tasks = self._tasks()
         self._finish_whole(self._files)
         with closing(crew(self._loaded, out, tasks)) as done:
             for task, words in progress(done, "reconstructing planes", len(tasks)):
                 for line in words:
-                    say(line)
+                    inform(line)
                 self._finish_whole(task.files)
 
     def _tasks(self) -> list[PlaneTask]:

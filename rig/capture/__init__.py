@@ -1,1 +1,1 @@
-"""The capture: the loop over frames, its prompts and checks."""
+"""Run a capture: the loop over frames, prompts, checks of frames and boards, settling and drift."""

@@ -1,4 +1,4 @@
-"""The experiment as a person is led through it: what to do before each step, and what can be answered."""
+"""Guide a person through the experiment: what to do before each step, and which answers there are."""
 
 from collections.abc import Mapping
 from typing import Literal, Protocol
@@ -10,16 +10,16 @@ from faintfield.rig.plan import StepKind
 from faintfield.rig.session.frames import PlannedFrame
 
 type Answer = Literal["go", "again", "keep", "retake", "skip", "stop"]
-type Wish = Literal["pause", "skip", "retake", "stop"]
+type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
 
 _TO_DO: dict[StepKind, tuple[str, ...]] = {
     "charuco": (
-        "Put the boards in place, in view from every node, and let them stand still until this sweep is done.",
+        "Put the boards in place, in view from every node, and do not touch them until this sweep is done.",
         "Turn the lights on.",
     ),
     "bright": (
         "Take the boards away and put the objects in place.",
-        "Turn the lights on. Nothing may be moved from here until the dark-scene set is done.",
+        "Turn the lights on. From here on, move nothing until the dark-scene set is done.",
     ),
     "dark_scene": (
         "Lights out. Cover every lamp, screen and indicator; the objects stay where they are.",
@@ -35,12 +35,12 @@ _TO_DO: dict[StepKind, tuple[str, ...]] = {
 _TO_DO_AGAIN: dict[StepKind, tuple[str, ...]] = {
     "charuco": (
         "Move and turn the boards: nearer or farther, tilted another way, still in view from every node.",
-        "Then let them stand still until this sweep is done.",
+        "Then do not touch them until this sweep is done.",
     ),
     "flat": ("Change the light on the diffuser, so that the frames become clearly brighter or darker.",),
 }
 _CHECK: dict[StepKind, str] = {
-    "charuco": "Check that the corners found are many and that no frame is saturated.",
+    "charuco": "Check that many corners are found and that no frame is saturated.",
     "bright": "Check focus and that no frame is saturated.",
     "dark_scene": "Check that frames look empty: the scene shows only in the reconstruction.",
     "noise_reference": "Check that frames are even: a bright corner is stray light.",
@@ -63,15 +63,15 @@ class Prompt(Struct, frozen=True):
     Parameters
     ----------
     key : str
-        What it is about, for the journal: `home`, `step`, `paused`, `stage`, `camera`, `drift`, `skipped`.
+        Subject of the question, for the journal: `home`, `step`, `paused`, `stage`, `camera`, `drift`, `skipped`.
     title : str
-        A few words.
+        Title in a few words.
     lines : tuple of str
-        What to do, what will happen, how long it takes, what to check.
+        What to do, what will happen, how long it takes, and what to check.
     answers : tuple of str
-        What can be answered; the first is the usual one.
+        Possible answers, the usual one first.
     unattended : str
-        The answer of a capture without a person (`--yes`).
+        Answer of a capture without a person (`--yes`).
     """
 
     key: str
@@ -82,26 +82,26 @@ class Prompt(Struct, frozen=True):
 
 
 class Status(Struct, frozen=True):
-    """Where the capture stands.
+    """State of the capture.
 
     Parameters
     ----------
     doing : str
         What happens now, in a few words.
     step, steps : int
-        The present step, from 1, and how many there are.
+        Number of the present step, from 1, and number of steps.
     title : str
-        Of the present step.
+        Title of the present step.
     done, total : int
-        Frames.
+        Frames taken, and frames of the plan.
     to_go_s : float
-        Time to go, prompts aside.
+        Remaining time in s, without prompts.
     node : (int, int), optional
-        Where the stage is or goes.
+        Row and column of the node where the stage is or goes.
     grid : tuple of tuple of float
-        Per row and column, which share of this step's frames is done; −1 where it has none.
+        Share of this step's frames that is done, per row and column; −1 where the step has none.
     warnings : tuple of str
-        The latest.
+        The latest warnings.
     """
 
     doing: str
@@ -116,19 +116,19 @@ class Status(Struct, frozen=True):
     warnings: tuple[str, ...]
 
 
-class Operator(Protocol):
-    """The person at the rig, by way of a terminal, a page, or answers given in advance."""
+class OperatorInterface(Protocol):
+    """Connects a capture to the person at the rig: by terminal, by page, or by answers given in advance."""
 
     def ask(self, prompt: Prompt) -> Answer:
-        """Wait for an answer."""
+        """Return the answer to a prompt, waiting for it."""
         ...
 
-    def wish(self) -> Wish | None:
-        """Return what was asked for since the last call, without waiting."""
+    def take_request(self) -> OperatorRequest | None:
+        """Return the latest request since the last call, without waiting."""
         ...
 
     def show_status(self, status: Status) -> None:
-        """Show where the capture stands."""
+        """Show the state of the capture."""
         ...
 
     def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
@@ -136,50 +136,37 @@ class Operator(Protocol):
         ...
 
 
-class Unattended:
-    """Nobody: every prompt gets the answer that it has for this case."""
-
-    def ask(self, prompt: Prompt) -> Answer:
-        """Answer at once."""
-        return prompt.unattended
-
-    def wish(self) -> Wish | None:
-        """Wish for nothing."""
-        return None
-
-    def show_status(self, status: Status) -> None:
-        """Show nothing."""
-
-    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
-        """Show nothing."""
-
-
 def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duration_s: float) -> Prompt:
-    """Return the question before a step.
+    """Return the prompt before a step.
 
     Parameters
     ----------
     frame : PlannedFrame
-        Its first frame.
+        First frame of the step.
     step, steps : int
-        Which step of how many, from 1.
+        Number of the step, from 1, and number of steps.
     frames, duration_s : int, float
-        How many frames are to be taken, and how long that takes.
+        Number of frames to be taken, and the time for them in s.
     """
-    title = TITLES[frame.kind] + (f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else "")
     to_do = _TO_DO_AGAIN.get(frame.kind, _TO_DO[frame.kind]) if frame.sweep else _TO_DO[frame.kind]
-    will = f"Then {frames} frames follow, {spoken_duration(duration_s)}. The stage moves by itself: keep clear of it."
+    motion = f"Then {frames} frames follow, {format_duration(duration_s)}. The stage moves by itself: keep clear of it."
     return Prompt(
         key="step",
-        title=f"Step {step} of {steps}: {title}",
-        lines=(*to_do, will, _CHECK[frame.kind]),
+        title=step_title(frame, step, steps),
+        lines=(*to_do, motion, _CHECK[frame.kind]),
         answers=("go", "skip", "stop"),
         unattended="go",
     )
 
 
-def spoken_duration(duration_s: float) -> str:
-    """Return a duration as one says it."""
+def step_title(frame: PlannedFrame, step: int, steps: int) -> str:
+    """Return the title of a step, given any of its frames, its number from 1 and the number of steps."""
+    sweep = f" {frame.sweep + 1}" if frame.kind in ("charuco", "flat") else ""
+    return f"Step {step} of {steps}: {TITLES[frame.kind]}{sweep}"
+
+
+def format_duration(duration_s: float) -> str:
+    """Return a duration rounded to s, min, or h and min, such as `about 2 h 05 min`."""
     if duration_s < 90:
         return f"about {max(1, round(duration_s))} s"
     minutes = round(duration_s / 60)

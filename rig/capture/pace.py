@@ -1,4 +1,4 @@
-"""The time to go, from the controller's own rates and from how long things have really taken."""
+"""Estimate the remaining time of a capture, from the controller's rates and from the times measured so far."""
 
 from statistics import median
 
@@ -8,12 +8,13 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import one_sided, path_duration_s
 from faintfield.rig.stages.protocol import Point
 
-# Guesses until the first stop and the first frame have been timed: two status reports, and writing a file.
+# Time in s of a stop besides motion and rest, and of a frame besides exposure and readout, until one has been measured:
+# two status reports, and writing a file.
 _STOP_S, _FRAME_S = 0.5, 0.2
 
 
 class Pace:
-    """Learns what a stop takes besides its motion, and a frame besides its exposure.
+    """Tracks where the stage is, and learns how long a stop takes besides motion and a frame besides exposure.
 
     Parameters
     ----------
@@ -23,6 +24,13 @@ class Pace:
         The rig's time.
     rest_s, readout_s : float
         The planned rest at each stop, and a frame's time besides its exposure.
+
+    Attributes
+    ----------
+    here : Point or None
+        Position of the stage, None if it is not known.
+    check_s : float
+        Duration of a drift check.
     """
 
     def __init__(self, stage: Gantry, clock: Clock, rest_s: float, readout_s: float) -> None:
@@ -31,47 +39,57 @@ class Pace:
         self._stop_s: list[float] = []
         self._frame_s: dict[bool, list[float]] = {False: [], True: []}
         self._guess_s = (_STOP_S + rest_s, _FRAME_S + readout_s)
+        self._departed_s = 0.0
+        self._start: Point | None = None
+        self._repeated = False
+        self.here: Point | None = None
         self.check_s = 0.0
 
-    def stopped(self, begun_s: float, start: Point | None, target: Point) -> None:
-        """Note that the way from `start` to readiness at `target` ends now."""
-        if start is not None:
-            self._stop_s.append(self._clock.now_s() - begun_s - self.motion_s(start, target))
+    def depart(self) -> None:
+        """Note that the stage leaves its position."""
+        self._departed_s, self._start = self._clock.now_s(), self.here
+        self.here, self._repeated = None, False
 
-    def exposed(self, begun_s: float, exposure_s: float, *, repeated: bool) -> None:
-        """Note that a frame ends now, from its intent to its commit; `repeated` if it is not the first at its stop.
+    def arrive(self, target: Point, *, timed: bool) -> None:
+        """Note that the stage is at rest at `target`; learn from the time it took if `timed`."""
+        if timed and self._start is not None:
+            self._stop_s.append(self._clock.now_s() - self._departed_s - self._motion_s(self._start, target))
+        self.here = target
 
-        The two differ: a controller that was just asked for its position is not asked again at once.
+    def finish_frame(self, begun_s: float, exposure_s: float) -> None:
+        """Note that a frame that was begun at `begun_s` is committed.
+
+        The first frame at a stop is told from the next ones, which are faster: a controller that was just asked for its
+        position is not asked again at once.
         """
-        self._frame_s[repeated].append(self._clock.now_s() - begun_s - exposure_s)
+        self._frame_s[self._repeated].append(self._clock.now_s() - begun_s - exposure_s)
+        self._repeated = True
 
-    def motion_s(self, start: Point, target: Point) -> float:
-        """Return how long the stage itself takes."""
-        path = (start, *one_sided(start, target, self._stage.settings.approach_mm))
-        return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())
-
-    def to_go_s(self, frames: list[PlannedFrame], here: Point | None, checks: int) -> float:
-        """Return how long `frames` will take, prompts aside.
+    def remaining_s(self, frames: list[PlannedFrame], drift_checks: int) -> float:
+        """Return how long `frames` will take, without prompts.
 
         Parameters
         ----------
         frames : list of PlannedFrame
-            What is still to be taken, in order.
-        here : Point, optional
-            Where the stage is.
-        checks : int
-            How many drift checks are still to come.
+            The frames still to be taken, in order.
+        drift_checks : int
+            Number of drift checks still to come.
         """
         stop_s = median(self._stop_s) if self._stop_s else self._guess_s[0]
         first_s = median(self._frame_s[False] or [self._guess_s[1]])
         again_s = median(self._frame_s[True] or [first_s])
-        total_s = checks * self.check_s
-        last_step = None
+        total_s = drift_checks * self.check_s
+        here, last_step = self.here, None
         for frame in frames:
             target = frame.stop.target
             arrives = target != here or frame.step != last_step
             if arrives:
-                total_s += stop_s + (self.motion_s(here, target) if here is not None else 0.0)
+                total_s += stop_s + (self._motion_s(here, target) if here is not None else 0.0)
             total_s += frame.exposure_s + (first_s if arrives else again_s)
             here, last_step = target, frame.step
         return total_s
+
+    def _motion_s(self, start: Point, target: Point) -> float:
+        """Return how long the motion from `start` to `target` takes."""
+        path = (start, *one_sided(start, target, self._stage.settings.approach_mm))
+        return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())

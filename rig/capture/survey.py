@@ -1,4 +1,4 @@
-"""Before anything moves: who is there, what is planned, and whether it can be done."""
+"""Survey the rig before anything moves: identify stage and camera, make the plan, and check that it is possible."""
 
 import math
 
@@ -14,18 +14,18 @@ from faintfield.rig.stages.protocol import Identity
 
 
 class Survey(Struct, frozen=True):
-    """What was found.
+    """Result of `survey`.
 
     Parameters
     ----------
     stage : Identity
-        Who the stage's controller says it is.
+        Identity of the stage, as its controller reports it.
     camera : CameraReport
-        Who the camera says it is.
+        Identity of the camera, as it reports it.
     plan : CapturePlan
-        What will be captured.
+        Plan of the capture.
     duration_s : float
-        How long it will take, prompts aside.
+        Duration of the capture in s, without prompts.
     """
 
     stage: Identity
@@ -35,12 +35,12 @@ class Survey(Struct, frozen=True):
 
 
 def survey(rig: Rig, settings: RigSettings) -> Survey:
-    """Connect to stage and camera, lay down the plan, and let both go again; nothing moves, nothing is exposed.
+    """Connect to stage and camera, make the plan, and disconnect; nothing moves and nothing is exposed.
 
     Raises
     ------
     RigError
-        One of them does not answer, or the plan cannot be carried out.
+        Stage or camera does not answer, or the plan is not possible.
     """
     try:
         rig.stage.connect()
@@ -54,7 +54,7 @@ def survey(rig: Rig, settings: RigSettings) -> Survey:
             settle_s=settings.settle.wait_s,
             readout_s=report.readout_s,
         )
-        refuse_what_cannot_be_done(plan, rig.stage, report)
+        check_plan(plan, rig.stage, report)
         identity = rig.stage.identify()
         duration_s = plan.duration_s(identity.motion, rig.stage.feed_mm_per_s())
         return Survey(identity, report, plan, duration_s)
@@ -63,13 +63,13 @@ def survey(rig: Rig, settings: RigSettings) -> Survey:
         rig.stage.close()
 
 
-def refuse_what_cannot_be_done(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
-    """Raise when a position of the plan is not allowed, or an exposure time not offered.
+def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
+    """Check that the stage allows all positions of a plan and the camera offers all its exposure times.
 
     Raises
     ------
     PlanRefused
-        With the first thing that is wrong.
+        A position is not allowed or an exposure time is not offered; the message names the first.
     """
     plan.check(stage.workspace())
     for exposure_s in sorted({exposure_s for step in plan.steps for exposure_s in step.exposure_s}):
@@ -77,6 +77,6 @@ def refuse_what_cannot_be_done(plan: CapturePlan, stage: Gantry, camera: CameraR
             offered = camera.exposures_s or ()
             nearest = min(offered, key=lambda it: abs(math.log(it / exposure_s)), default=math.nan)
             raise PlanRefused(
-                f"exposure_s = {exposure_s:g} is not offered by the camera; the nearest that is: {nearest:g}; "
+                f"exposure_s = {exposure_s:g} is not offered by the camera, the nearest that is: {nearest:g}; "
                 "correct it in rig.toml"
             )

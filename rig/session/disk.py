@@ -1,4 +1,4 @@
-"""Files of a session: written whole or not at all, never overwritten, never deleted; and the lock on its folder."""
+"""Write the files of a session whole or not at all, never overwrite or delete one, and lock the session's folder."""
 
 import fcntl
 import hashlib
@@ -17,19 +17,20 @@ PART = ".part"
 
 
 def write_new(path: Path, content: bytes | memoryview) -> None:
-    """Write `content` to `path`, which must not exist, such that it survives a power cut.
+    """Write `content` to a new file that survives a power cut.
 
-    The bytes go to `path` with `.part` behind it, are flushed, take their name, and the folder is flushed.
+    The bytes are written to `path` with the suffix `.part` and flushed; then the file is renamed and its folder is
+    flushed.
 
     Raises
     ------
     SessionUnwritable
-        In words; no half of a file is left behind.
+        The file exists or cannot be written; no partial file is left behind.
     """
     part = path.with_name(path.name + PART)
-    with in_words(path):
+    with translate_errors(path):
         if path.exists():
-            raise SessionUnwritable(f"{path}: is there already and is never overwritten; set it aside and go on")
+            raise SessionUnwritable(f"{path}: exists and is never overwritten; set it aside and go on")
         try:
             with part.open("wb") as file:
                 file.write(content)
@@ -43,8 +44,8 @@ def write_new(path: Path, content: bytes | memoryview) -> None:
 
 
 def set_aside(path: Path, folder: Path) -> Path:
-    """Move a file into `folder` under a name that is free, and return it."""
-    with in_words(path):
+    """Move a file into `folder` under an unused name, and return its new path."""
+    with translate_errors(path):
         folder.mkdir(exist_ok=True)
         number = 0
         while (target := folder / f"{path.name}.{number}").exists():
@@ -56,7 +57,7 @@ def set_aside(path: Path, folder: Path) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder's entries, so that a rename survives a power cut."""
+    """Flush the entries of a folder, so that a rename survives a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -70,28 +71,28 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def file_of(exposure: Exposure) -> bytes | memoryview:
-    """Return what is kept: the camera's own bytes, or an array as a TIFF."""
+def encode_exposure(exposure: Exposure) -> bytes | memoryview:
+    """Return the bytes of the file to keep: the camera's own file, or its array as a TIFF."""
     if exposure.content is not None:
         return exposure.content
     assert exposure.pixels is not None
     buffer = BytesIO()
     photometric = "rgb" if exposure.pixels.ndim == 3 else "minisblack"
     tifffile.imwrite(buffer, exposure.pixels, photometric=photometric)
-    return buffer.getbuffer()  # no second copy of what may be a hundred megabytes
+    return buffer.getbuffer()  # not `getvalue`, which copies perhaps a hundred megabytes
 
 
 @contextmanager
-def locked(folder: Path, *, shared: bool = False) -> Iterator[None]:
-    """Have the session to oneself, or share it with others who only look; the lock ends with the process.
+def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
+    """Hold the lock on a session, exclusive or shared with other readers; it ends with the process at the latest.
 
     Raises
     ------
     SessionBusy
-        Another capture has it.
+        Another capture holds the session.
     """
     path = folder / "lock"
-    with in_words(path):
+    with translate_errors(path):
         descriptor = os.open(path, os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT, 0o644)
     try:
         try:
@@ -108,8 +109,8 @@ def locked(folder: Path, *, shared: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def in_words(path: Path) -> Iterator[None]:
-    """Turn what the system says about a file into a named failure."""
+def translate_errors(path: Path) -> Iterator[None]:
+    """Raise `SessionUnwritable` for an error of the operating system."""
     try:
         yield
     except OSError as failure:

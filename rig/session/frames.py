@@ -1,4 +1,4 @@
-"""The frames of a plan, one by one, in the order in which they are taken."""
+"""List the frames of a plan in the order in which they are taken."""
 
 from collections import Counter
 
@@ -13,19 +13,19 @@ class PlannedFrame(Struct, frozen=True):
     Parameters
     ----------
     number : int
-        Its place in the plan.
+        Index in the plan.
     step : int
-        Which of the plan's steps it belongs to.
+        Index of its step in the plan.
     kind : str
-        The kind of that step.
+        Kind of that step.
     sweep : int
-        How many steps of the same kind come before: the sweep of a board, the level of a flat.
+        Number of earlier steps of the same kind: the sweep of a board, the light level of a flat.
     stop : Stop
-        Node and position.
+        Node and position of the stage.
     exposure_s : float
-        Exposure time.
+        Exposure time in s.
     repeat : int
-        Which of the frames of the same exposure at the same stop.
+        Index among the frames of the same exposure time at the same stop.
     """
 
     number: int
@@ -38,7 +38,7 @@ class PlannedFrame(Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """What it is called in messages, and how its file's name begins."""
+        """Name of the frame in messages, and the beginning of its file name."""
         row, column = self.stop.node
         return f"{self.number:05d}_{self.kind}_{self.sweep}_r{row}_c{column}"
 

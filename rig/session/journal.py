@@ -1,7 +1,7 @@
-"""The journal of a session: everything that happened, in the order in which it did, on disk before it counts.
+"""Keep the journal of a session: a database of all that happened during a capture.
 
-SQLite in WAL mode with synchronous=FULL: when a call returns, what it recorded survives a power cut. Rows are only
-ever added. Order is that of their numbers; times are for people, since clocks can be set back.
+The journal is SQLite in WAL mode with synchronous=FULL: once a call returns, what it recorded survives a power cut.
+Rows are only added, and ordered by their numbers; times are for people, since clocks can be set back.
 """
 
 import sqlite3
@@ -9,12 +9,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 import msgspec
 from msgspec import Struct
 
+from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt, SessionUnwritable
+from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.transport import Direction
 
 _SCHEMA = """
@@ -34,27 +36,58 @@ _COMMITTED = """
 SELECT intent.id, intent.frame, "commit".file, "commit".sha256, "commit".bytes, "commit".detail, void.why
 FROM "commit" JOIN intent ON intent.id = "commit".intent LEFT JOIN void ON void.intent = intent.id ORDER BY intent.id
 """
-# Serial traffic waits in memory for the next entry that must be on disk at once, or for this many pieces.
-_TRAFFIC_WAITS = 2000
+# Records of serial traffic held in memory before they are written, as each write costs a flush of the disk; any other
+# entry writes them earlier.
+_MAX_PENDING_TRAFFIC = 2000
 
 
-class Committed(Struct, frozen=True):
+class FrameRecord(Struct, frozen=True):
+    """What the journal says about a frame besides its file.
+
+    Parameters
+    ----------
+    position_mm : Point
+        Position that the stage reported before the exposure.
+    exposure_s : float
+        Exposure time.
+    camera : dict
+        Metadata from the camera.
+    checks : dict of str to float
+        Measured values, see `rig.capture.checks.Findings`.
+    warnings : tuple of str
+        Warnings about the frame.
+    """
+
+    position_mm: Point
+    exposure_s: float
+    camera: Metadata = {}
+    checks: dict[str, float] = {}
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def temperature_c(self) -> float | None:
+        """Temperature of the sensor in °C, None if the camera does not report it."""
+        value = self.camera.get("temperature_c")
+        return value if isinstance(value, int | float) else None
+
+
+class CommittedFrame(Struct, frozen=True):
     """A frame that was taken and is on disk.
 
     Parameters
     ----------
     intent : int
-        Number of the intent, which counts the exposures of the session.
+        Number of the exposure within the session.
     frame : int
-        Its place in the plan.
+        Index of the frame in the plan.
     file : str
-        Name within `frames/`.
+        Name of the file within `frames/`.
     sha256, bytes : str, int
-        Of the file.
-    detail : dict
+        Hash and size of the file.
+    record : FrameRecord
         Position, camera metadata, checks.
     void : str, optional
-        Why the frame does not count any more; its file stays.
+        Why the frame is void; its file stays.
     """
 
     intent: int
@@ -62,29 +95,49 @@ class Committed(Struct, frozen=True):
     file: str
     sha256: str
     bytes: int
-    detail: dict[str, Any]
+    record: FrameRecord
     void: str | None = None
 
 
-class Event(Struct, frozen=True):
-    """Something else that happened: a prompt and its answer, a warning, a failure, a measurement."""
+class JournalEvent(Struct, frozen=True):
+    """Any other entry: a prompt and its answer, a warning, a failure, a measurement."""
 
     id: int
     at: str
     kind: str
     frame: int | None
-    detail: dict[str, Any]
+    detail: dict[str, object]
+
+
+class Begun(Struct, frozen=True):
+    """Detail of the event `begun`: the hash of the plan."""
+
+    plan_sha256: str
+
+
+class Suspect(Struct, frozen=True):
+    """Detail of an event `suspect`: the exposures that relied on a stage that lost its scale."""
+
+    intents: tuple[int, ...]
+
+
+class Sealed(Struct, frozen=True):
+    """Detail of the event `sealed`: the frames that were left out, by their index in the plan."""
+
+    skipped: tuple[int, ...]
 
 
 class Journal:
-    """Open journal; also a `TrafficLog` of the stage.
+    """An open journal, which is also the `TrafficLog` of the stage.
 
     Parameters
     ----------
     path : Path
-        The SQLite file; it is created when `create`.
+        The SQLite file.
+    create : bool
+        Create the file if it is missing.
     read_only : bool
-        Look, and leave no trace: not even a lock, so that a write-protected medium can be read.
+        Open without a lock and without writing, so that a write-protected medium can be read.
     """
 
     def __init__(self, path: Path, *, create: bool = False, read_only: bool = False) -> None:
@@ -92,7 +145,7 @@ class Journal:
         self._traffic: list[tuple[float, str, bytes]] = []
         if not create and not path.is_file():
             raise SessionCorrupt(f"{path}: the journal is missing; restore it, or begin a new session")
-        with self._in_words():
+        with self._translate_errors():
             wal = path.with_name(path.name + "-wal")
             mode = "ro" if wal.exists() else "ro&immutable=1"
             uri = f"{path.absolute().as_uri()}?mode={mode if read_only else 'rwc'}"
@@ -107,7 +160,7 @@ class Journal:
         self.close()
 
     def close(self) -> None:
-        """Write what still waits, and close."""
+        """Write pending traffic, and close."""
         try:
             if self._traffic:
                 with self._transaction():
@@ -116,28 +169,29 @@ class Journal:
             self._db.close()
 
     def record(self, at_s: float, direction: Direction, data: bytes) -> None:
-        """Keep serial traffic; it reaches the disk with the next entry."""
+        """Record serial traffic, which reaches the disk with the next entry."""
         self._traffic.append((at_s, direction, data))
-        if len(self._traffic) >= _TRAFFIC_WAITS:
+        if len(self._traffic) >= _MAX_PENDING_TRAFFIC:
             with self._transaction():
                 pass
 
-    def event(self, kind: str, *, frame: int | None = None, **detail: Any) -> None:
-        """Record that something happened."""
+    def event(self, kind: str, *, frame: int | None = None, **detail: object) -> None:
+        """Record an event."""
         with self._transaction():
             self._db.execute(
-                "INSERT INTO event (at, kind, frame, detail) VALUES (?, ?, ?, ?)", (_now(), kind, frame, _text(detail))
+                "INSERT INTO event (at, kind, frame, detail) VALUES (?, ?, ?, ?)",
+                (_now(), kind, frame, _to_json(detail)),
             )
 
     def intend(self, frame: int) -> int:
-        """Record that `frame` is about to be taken, and return the number of the exposure."""
+        """Record that `frame` will be taken now, and return the number of the exposure."""
         with self._transaction():
             row = self._db.execute("INSERT INTO intent (at, frame) VALUES (?, ?)", (_now(), frame))
         assert row.lastrowid is not None
         return row.lastrowid
 
-    def commit(self, intent: int, file: str, sha256: str, size_bytes: int, detail: dict[str, Any]) -> None:
-        """Record that the frame of `intent` is whole and on disk. Earlier takes of it do not count any more."""
+    def commit(self, intent: int, file: str, sha256: str, size_bytes: int, record: FrameRecord) -> None:
+        """Record that the frame of `intent` is complete on disk; earlier takes of it become void."""
         with self._transaction():
             self._db.execute(
                 'INSERT INTO void (intent, at, why) SELECT "commit".intent, ?, ? FROM "commit" '
@@ -147,48 +201,56 @@ class Journal:
             )
             self._db.execute(
                 'INSERT INTO "commit" (intent, at, file, sha256, bytes, detail) VALUES (?, ?, ?, ?, ?, ?)',
-                (intent, _now(), file, sha256, size_bytes, _text(detail)),
+                (intent, _now(), file, sha256, size_bytes, _to_json(record)),
             )
 
     def void(self, intents: list[int], why: str) -> None:
-        """Record that committed frames do not count any more; they will be taken again."""
+        """Record that committed frames are void, and will be taken again."""
         with self._transaction():
             self._db.executemany(
                 "INSERT OR IGNORE INTO void (intent, at, why) VALUES (?, ?, ?)", [(it, _now(), why) for it in intents]
             )
 
-    def committed(self) -> list[Committed]:
-        """Return every frame that was committed, in the order in which they were intended."""
-        with self._in_words():
+    def committed(self) -> list[CommittedFrame]:
+        """Return all committed frames in the order of their exposures."""
+        with self._translate_errors():
             rows = self._db.execute(_COMMITTED).fetchall()
-            return [Committed(a, b, c, d, e, msgspec.json.decode(detail), void) for a, b, c, d, e, detail, void in rows]
+            return [
+                CommittedFrame(a, b, c, d, e, msgspec.json.decode(record, type=FrameRecord), void)
+                for a, b, c, d, e, record, void in rows
+            ]
 
     def uncommitted(self) -> list[tuple[int, int]]:
-        """Return number and frame of every intent that came to nothing."""
-        with self._in_words():
+        """Return the number and the frame of every exposure that was not committed."""
+        with self._translate_errors():
             query = 'SELECT id, frame FROM intent WHERE id NOT IN (SELECT intent FROM "commit") ORDER BY id'
             return self._db.execute(query).fetchall()
 
-    def events(self, kind: str | None = None) -> list[Event]:
-        """Return what happened, all or of one kind, in order."""
-        with self._in_words():
+    def events(self, kind: str | None = None) -> list[JournalEvent]:
+        """Return the events in order, all or those of one kind."""
+        with self._translate_errors():
             query = "SELECT id, at, kind, frame, detail FROM event WHERE ?1 IS NULL OR kind = ?1 ORDER BY id"
             rows = self._db.execute(query, (kind,)).fetchall()
-            return [Event(a, b, c, d, msgspec.json.decode(detail)) for a, b, c, d, detail in rows]
+            return [JournalEvent(a, b, c, d, msgspec.json.decode(detail)) for a, b, c, d, detail in rows]
+
+    def details[T](self, kind: str, layout: type[T]) -> list[T]:
+        """Return the details of the events of a kind, in order, each as an instance of `layout`."""
+        with self._translate_errors():
+            return [msgspec.convert(event.detail, layout) for event in self.events(kind)]
 
     def traffic(self) -> list[tuple[float, str, bytes]]:
-        """Return the stage's traffic: time, direction, bytes."""
-        with self._in_words():
+        """Return the traffic of the stage as time in s, direction and bytes."""
+        with self._translate_errors():
             return self._db.execute("SELECT at_s, direction, data FROM traffic ORDER BY id").fetchall()
 
     def damage(self) -> str | None:
-        """Return what SQLite finds wrong with its file, None when nothing."""
-        with self._in_words():
+        """Return what SQLite's integrity check finds, None if nothing."""
+        with self._translate_errors():
             found = str(self._db.execute("PRAGMA integrity_check").fetchone()[0])
             return None if found == "ok" else " ".join(found.split())
 
     def _prepare(self) -> None:
-        """Choose durability over speed, and make the tables."""
+        """Prefer durability to speed, and create the tables."""
         self._db.execute("PRAGMA journal_mode = WAL")
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute("PRAGMA foreign_keys = ON")
@@ -196,8 +258,8 @@ class Journal:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Make what the block records durable, all of it or nothing, with the traffic that waits."""
-        with self._in_words():
+        """Run the block as one transaction, which also writes the pending traffic."""
+        with self._translate_errors():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -210,8 +272,8 @@ class Journal:
         self._traffic.clear()
 
     @contextmanager
-    def _in_words(self) -> Iterator[None]:
-        """Turn what SQLite says into a named failure."""
+    def _translate_errors(self) -> Iterator[None]:
+        """Raise `SessionUnwritable` or `SessionCorrupt` for an error of SQLite."""
         try:
             yield
         except (sqlite3.OperationalError, OSError) as failure:
@@ -223,10 +285,10 @@ class Journal:
 
 
 def _now() -> str:
-    """Return the time as people write it, in UTC."""
+    """Return the time in UTC as ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _text(detail: dict[str, Any]) -> str:
-    """Return a detail as JSON."""
+def _to_json(detail: object) -> str:
+    """Return a detail as JSON text."""
     return msgspec.json.encode(detail).decode()

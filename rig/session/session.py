@@ -1,34 +1,33 @@
-"""A session: begun once from a plan, resumed as often as need be, sealed when every frame is there."""
+"""The session that a capture writes: which frames are taken, which are missing, and how a frame is recorded."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.plan import CapturePlan
-from faintfield.rig.session.disk import file_of, sha256, write_new
+from faintfield.rig.session.disk import encode_exposure, sha256, write_new
 from faintfield.rig.session.frames import PlannedFrame, planned_frames
-from faintfield.rig.session.journal import Committed, Journal
+from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
 
 
 class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
-    """The content of plan.json: what is captured, and the rig that it was planned for.
+    """Content of plan.json: the plan of a capture and the rig that it was made for.
 
     Parameters
     ----------
     plan : CapturePlan
-        Every position and frame.
+        All positions and frames.
     rig : RigSettings
-        The configuration as it was at the start.
+        Configuration of the rig when the session was begun.
     format : int
-        Version of this layout.
+        Version of the file format.
     """
 
     plan: CapturePlan
@@ -36,8 +35,8 @@ class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
     format: int = 1
 
 
-class Written(Struct, frozen=True):
-    """A file that is whole and on disk, and not committed yet."""
+class WrittenFile(Struct, frozen=True):
+    """A frame's file that is complete on disk but not yet committed."""
 
     intent: int
     path: Path
@@ -46,16 +45,16 @@ class Written(Struct, frozen=True):
 
 
 class Session:
-    """An open session that no other capture has; made by `rig.session.access.opened`.
+    """A session open for writing, as `rig.session.resume.open_session` yields it.
 
     Parameters
     ----------
     folder : Path
-        Where it is.
+        Folder of the session.
     frozen : FrozenPlan
-        What plan.json says.
+        Content of plan.json.
     journal : Journal
-        What happened so far.
+        Open journal of the session.
 
     Attributes
     ----------
@@ -73,15 +72,15 @@ class Session:
 
     @property
     def plan(self) -> CapturePlan:
-        """The plan."""
+        """Plan of the capture."""
         return self.frozen.plan
 
-    def valid(self) -> Mapping[int, Committed]:
-        """Return the frames that count, by their place in the plan."""
+    def valid(self) -> Mapping[int, CommittedFrame]:
+        """Return the valid frames by their index in the plan."""
         return self._valid
 
     def missing(self) -> list[PlannedFrame]:
-        """Return the frames still to be taken, in order; skipped ones come back when the session is run again."""
+        """Return the frames still to be taken, in order, without those skipped since the session was opened."""
         return [it for it in self.frames if it.number not in self._valid and it.number not in self._skipped]
 
     def skipped(self) -> list[PlannedFrame]:
@@ -89,50 +88,50 @@ class Session:
         return [self.frames[number] for number in sorted(self._skipped)]
 
     def skip(self, frame: PlannedFrame) -> None:
-        """Leave a frame out for now."""
+        """Leave a frame out until it is asked for again."""
         self.journal.event("skipped", frame=frame.number)
         self._skipped.add(frame.number)
 
     def unskip(self) -> None:
-        """Ask for the skipped frames again."""
+        """Count the skipped frames as missing again."""
         self._skipped.clear()
 
     def intend(self, frame: PlannedFrame) -> int:
-        """Record that `frame` is about to be taken, and return the number of the exposure."""
+        """Record that `frame` will be taken now, and return the number of the exposure."""
         return self.journal.intend(frame.number)
 
-    def write(self, frame: PlannedFrame, intent: int, exposure: Exposure) -> Written:
-        """Write the file of an exposure under a name that no other exposure has."""
-        content = file_of(exposure)
+    def write(self, frame: PlannedFrame, intent: int, exposure: Exposure) -> WrittenFile:
+        """Write the file of an exposure under a name that contains its number, and is therefore unique."""
+        content = encode_exposure(exposure)
         path = self.folder / FRAMES / f"{frame.name}_x{intent}{exposure.suffix}"
-        # Of the bytes in memory, while they are written: what a disk gets wrong from here on, `verify` finds.
+        # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk.
         with ThreadPoolExecutor(1) as hashing:
             digest = hashing.submit(hashlib.sha256, content)
             write_new(path, content)
-        return Written(intent, path, digest.result().hexdigest(), len(content))
+        return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
 
-    def commit(self, frame: PlannedFrame, written: Written, detail: dict[str, Any]) -> Committed:
-        """Record that a frame is there for good; an earlier take of it does not count any more."""
-        self.journal.commit(written.intent, written.path.name, written.sha256, written.bytes, detail)
-        done = Committed(written.intent, frame.number, written.path.name, written.sha256, written.bytes, detail)
+    def commit(self, frame: PlannedFrame, written: WrittenFile, record: FrameRecord) -> CommittedFrame:
+        """Record that a frame is taken; earlier takes of it become void."""
+        self.journal.commit(written.intent, written.path.name, written.sha256, written.bytes, record)
+        done = CommittedFrame(written.intent, frame.number, written.path.name, written.sha256, written.bytes, record)
         self._valid[frame.number] = done
         return done
 
-    def void(self, frames: Iterable[Committed], why: str) -> None:
-        """Let frames not count any more: their files stay, and they are missing again."""
+    def void(self, frames: Iterable[CommittedFrame], why: str) -> None:
+        """Declare frames void: their files stay, and the frames are missing again."""
         voided = [it for it in frames if self._valid.get(it.frame) == it]
         self.journal.void([it.intent for it in voided], why)
         for it in voided:
             del self._valid[it.frame]
 
-    def path_of(self, committed: Committed) -> Path:
-        """Return where a frame's file is."""
+    def path_of(self, committed: CommittedFrame) -> Path:
+        """Return the path of a frame's file."""
         return self.folder / FRAMES / committed.file
 
     def seal(self) -> None:
-        """Close the journal and write SHA256SUMS over plan, journal and frames: the session is complete.
+        """Close the journal and write SHA256SUMS over plan, journal and frames, which completes the session.
 
-        Skipped frames are left out for good, and the journal says so.
+        Skipped frames are left out for good, as the journal records.
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
         self.journal.close()

@@ -1,4 +1,4 @@
-"""Every file against its hash, the journal against the plan: what a session is worth, without changing a byte."""
+"""Verify a session: compare every file with its hash, and the journal with the plan. Nothing is changed."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
@@ -8,29 +8,29 @@ from msgspec import Struct
 
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.access import read_plan
-from faintfield.rig.session.disk import locked, sha256
+from faintfield.rig.session.disk import lock_session, sha256
 from faintfield.rig.session.frames import PlannedFrame, planned_frames
-from faintfield.rig.session.journal import Committed, Journal
+from faintfield.rig.session.journal import Begun, CommittedFrame, Journal, Sealed, Suspect
 from faintfield.rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed
 
 
 class Verdict(Struct, frozen=True):
-    """What `verify` found.
+    """Result of `verify`.
 
     Parameters
     ----------
     problems : tuple of str
-        Everything that is wrong, one line each; empty when all is well.
+        All problems, one line each; empty if there is none.
     planned, present : int
-        Frames of the plan, and those of them that are there and whole.
+        Number of frames in the plan, and of those whose file is present and unchanged.
     missing : tuple of str
-        Names of the frames that are still to be taken, unless they were left out on purpose.
+        Names of the frames still to be taken, without those left out on purpose.
     left_out : tuple of str
         Names of the frames that the operator left out.
     superseded : int
-        Files of frames that were taken again.
+        Number of files replaced by a later take of the same frame.
     suspect : tuple of str
-        Names of frames that were kept although a check of the stage failed after them.
+        Names of frames that were kept although the next check of the stage failed.
     sealed : bool
         Whether the session is complete.
     """
@@ -46,40 +46,40 @@ class Verdict(Struct, frozen=True):
 
 
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
-    """Return what is wrong with the session in `folder`.
+    """Verify the session in `folder`.
 
     Parameters
     ----------
     folder : Path
-        The session.
+        Folder of the session.
     progress : callable
-        Draws a bar over the files that are read.
+        Wraps the iteration over the files that are read, to draw a progress bar.
 
     Raises
     ------
     SessionBusy
         A capture is under way.
     SessionCorrupt
-        Plan or journal cannot be read at all.
+        Plan or journal cannot be read.
     """
     if not (folder / PLAN).is_file():
         raise SessionCorrupt(f"{folder / PLAN}: is missing; name the folder of a session, or restore the file")
     if not (folder / "lock").exists():
         return _verify(folder, progress)
-    with locked(folder, shared=True):
+    with lock_session(folder, shared=True):
         return _verify(folder, progress)
 
 
 def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) -> Verdict:
-    """Compare everything with everything."""
+    """Verify a session whose lock is held, or that has none."""
     frozen = read_plan(folder)
     frames = planned_frames(frozen.plan)
     with Journal(folder / JOURNAL, read_only=True) as journal:
         damage = journal.damage()
         committed = journal.committed()
-        begun = [event.detail.get("plan_sha256") for event in journal.events("begun")]
-        sealed = [event.detail.get("skipped", []) for event in journal.events("sealed")]
-        suspects = {intent for event in journal.events("suspect") for intent in event.detail["intents"]}
+        begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
+        sealed = [event.skipped for event in journal.details("sealed", Sealed)]
+        suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
     digests = {path.name: sha256(path) for path in progress(sorted((folder / FRAMES).glob("*")))}
     problems = [] if damage is None else [f"{JOURNAL}: {damage}"]
     if begun != [hashlib.sha256((folder / PLAN).read_bytes()).hexdigest()]:
@@ -105,8 +105,10 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     )
 
 
-def _compare(frames: tuple[PlannedFrame, ...], committed: list[Committed], digests: dict[str, str]) -> Iterator[str]:
-    """Yield what is wrong between plan, journal and files."""
+def _compare(
+    frames: tuple[PlannedFrame, ...], committed: list[CommittedFrame], digests: dict[str, str]
+) -> Iterator[str]:
+    """Yield the disagreements between plan, journal and files."""
     taken: dict[int, str] = {}
     for it in committed:
         if not 0 <= it.frame < len(frames) or not it.file.startswith(frames[it.frame].name):
@@ -123,7 +125,7 @@ def _compare(frames: tuple[PlannedFrame, ...], committed: list[Committed], diges
 
 
 def _compare_sums(folder: Path, digests: dict[str, str]) -> Iterator[str]:
-    """Yield what is wrong between SHA256SUMS and the files."""
+    """Yield the disagreements between SHA256SUMS and the files."""
     lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
     stated = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
     actual = {f"{FRAMES}/{name}": digest for name, digest in digests.items()}

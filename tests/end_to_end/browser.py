@@ -1,4 +1,4 @@
-"""A real Chromium, driven by its own protocol over a pipe."""
+"""Control a real Chromium by its DevTools protocol over a pipe."""
 
 import json
 import os
@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-# The protocol is spoken over descriptors 3 and 4; by way of 103 and 104, in case that these are what it is given.
+# Chromium expects the pipes at descriptors 3 and 4; the detour by 103 and 104 helps if they are 3 or 4 already.
 _LAUNCH = (
     "import os, sys; os.dup2(int(sys.argv[1]), 103); os.dup2(int(sys.argv[2]), 104); os.dup2(103, 3); "
     "os.dup2(104, 4); os.execv(sys.argv[3], sys.argv[3:])"
 )
-_LONGEST_WAIT_MS = 30_000
+_MAX_WAIT_MS = 30_000
 
 
 class Tab:
@@ -42,7 +42,7 @@ class Tab:
         self.call("Page.navigate", url=url)
 
     def reload(self) -> None:
-        """Load the page again and wait for it: what is asked of a page that is about to go is never answered."""
+        """Load the page again and wait for it: a call to the old page would never be answered."""
         self.call("Page.reload")
         while self._next().get("method") != "Page.loadEventFired":
             pass
@@ -62,7 +62,7 @@ class Tab:
                 const look = () => {{
                     let holds = false;
                     try {{ holds = Boolean({condition}); }} catch {{}}
-                    if (holds || Date.now() - begun > {_LONGEST_WAIT_MS}) resolve(holds);
+                    if (holds || Date.now() - begun > {_MAX_WAIT_MS}) resolve(holds);
                     else setTimeout(look, 20);
                 }};
                 look();
@@ -71,7 +71,7 @@ class Tab:
         assert done, f"did not come true: {condition}; the page says: {self.text()}"
 
     def text(self) -> str:
-        """Return what is to be read on the page."""
+        """Return the visible text of the page."""
         return str(self.evaluate("document.body.innerText"))
 
     def click(self, word: str) -> None:
@@ -94,23 +94,23 @@ class Tab:
                 return dict(answer["result"])
 
     def _next(self) -> dict[str, Any]:
-        """Return the next message, noting it if it is a complaint."""
+        """Return the next message, and keep it if it reports an error."""
         while b"\0" not in self._buffer:
             data = os.read(self._receive, 1 << 16)
             assert data, "the browser has ended"
             self._buffer += data
         message, _, self._buffer = self._buffer.partition(b"\0")
-        said = json.loads(message)
-        if said.get("method") == "Runtime.exceptionThrown" or (
-            said.get("method") == "Log.entryAdded" and said["params"]["entry"]["level"] == "error"
+        event = json.loads(message)
+        if event.get("method") == "Runtime.exceptionThrown" or (
+            event.get("method") == "Log.entryAdded" and event["params"]["entry"]["level"] == "error"
         ):
-            self.complaints.append(json.dumps(said["params"]))
-        return dict(said)
+            self.complaints.append(json.dumps(event["params"]))
+        return dict(event)
 
 
 @contextmanager
-def browsing(folder: Path) -> Iterator[Tab]:
-    """Run a headless browser whose files are in `folder`."""
+def open_browser(folder: Path) -> Iterator[Tab]:
+    """Run a headless browser that keeps its files in `folder`; yield its tab."""
     assert CHROMIUM is not None
     to_browser, send = os.pipe()
     receive, from_browser = os.pipe()

@@ -9,10 +9,10 @@ from unittest import mock
 import pytest
 
 from faintfield.pipelines import cli
-from faintfield.pipelines.commands.check import time_in_words
 from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.pipelines.live.preflight import duration_words
 from faintfield.rig.session.access import taken_frames
-from faintfield.rig.session.disk import locked
+from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.settings import StageSettings
@@ -111,9 +111,9 @@ def test_check_moves_nothing_and_says_what_matters(shell: Shell) -> None:
 
 def test_a_simulated_stage_has_a_clock_of_its_own() -> None:
     real, simulated = StageSettings("grbl", port="/dev/ttyUSB0"), StageSettings("simulated")
-    assert time_in_words(600.0, real) == "about 10 min without prompts"
+    assert duration_words(600.0, real) == "about 10 min without prompts"
     words = "about 10 min without prompts by the simulated stage's clock, far less by yours"
-    assert time_in_words(600.0, simulated) == time_in_words(600.0, StageSettings("grbl", "simulated:grbl")) == words
+    assert duration_words(600.0, simulated) == duration_words(600.0, StageSettings("grbl", "simulated:grbl")) == words
 
 
 def test_the_template_shows_as_many_board_poses_as_the_geometry_asks_for(shell: Shell) -> None:
@@ -255,7 +255,7 @@ def test_a_session_stays_with_its_rig_and_with_one_capture(shell: Shell) -> None
     with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
     assert "Interrupted" in shell.words
-    with locked(shell.session):
+    with lock_session(shell.session):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
         assert "SessionBusy" in shell.words
         assert shell.run("verify", shell.session) == 1

@@ -14,18 +14,18 @@ import cv2
 import numpy as np
 import pytest
 
-from faintfield.pipelines.live.capture_page import serving_page
-from faintfield.pipelines.live.panel import Panel
+from faintfield.pipelines.live.capture_page import serve_page
+from faintfield.pipelines.live.panel import CapturePanel
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, RigError
-from faintfield.rig.session.access import opened
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from tests.end_to_end.browser import CHROMIUM, Tab, browsing
+from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 from tests.faults.capturing import FRAMES, SMALL_RIG
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
@@ -36,13 +36,13 @@ class Running:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.panel = Panel(unattended=False)
+        self.panel = CapturePanel(unattended=False)
         self.failure: RigError | None = None
         self._stack = ExitStack()
         self._thread = threading.Thread(target=self._capture)
 
     def __enter__(self) -> "Running":
-        self.address = self._stack.enter_context(serving_page(self.panel))
+        self.address = self._stack.enter_context(serve_page(self.panel))
         self._thread.start()
         return self
 
@@ -60,7 +60,7 @@ class Running:
     def _capture(self) -> None:
         plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
         try:
-            with opened(self.folder, plan) as session, TerminalView(self.panel).showing():
+            with open_session(self.folder, plan) as session, TerminalView(self.panel).show():
                 Capture(session, open_rig(SMALL_RIG, session.journal), self.panel, lambda path: None).run()
         except RigError as failure:
             self.failure = failure
@@ -74,7 +74,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with browsing(tmp_path_factory.mktemp("browser")) as tab:
+    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
         yield tab
 
 
@@ -126,7 +126,7 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
 
 
 @needs_browser
-def test_it_is_dark(running: Running, browser: Tab) -> None:
+def test_the_page_is_dark_red(running: Running, browser: Tab) -> None:
     browser.call("Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False)
     browser.open(running.address)
     browser.click("go")
@@ -161,7 +161,7 @@ def test_nothing_is_found_without_the_token(running: Running) -> None:
         assert status_of(root + place, b"{}") in (404, 405)
 
 
-def test_a_name_that_was_made_to_point_here_is_turned_away(running: Running) -> None:
+def test_another_host_name_is_refused(running: Running) -> None:
     parts = urllib.parse.urlsplit(running.address)
     connection = http.client.HTTPConnection(parts.netloc)
     connection.request("GET", parts.path + "state", headers={"Host": "evil.example"})
@@ -177,5 +177,5 @@ def test_nonsense_presses_no_button(running: Running, body: bytes) -> None:
 
 
 def test_one_page_has_another_token_than_the_next() -> None:
-    with serving_page(Panel(unattended=True)) as one, serving_page(Panel(unattended=True)) as other:
+    with serve_page(CapturePanel(unattended=True)) as one, serve_page(CapturePanel(unattended=True)) as other:
         assert urllib.parse.urlsplit(one).path != urllib.parse.urlsplit(other).path

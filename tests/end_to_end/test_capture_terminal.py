@@ -12,7 +12,7 @@ import pytest
 from faintfield.pipelines import cli
 from faintfield.rig.session.verify import verify
 
-_LONGEST_WAIT_S = 60.0
+_MAX_WAIT_S = 60.0
 
 
 class Terminal:
@@ -27,7 +27,7 @@ class Terminal:
         self._read = 0
 
     def wait_for(self, words: str) -> None:
-        """Wait until these words are to be seen, after those waited for before."""
+        """Wait until these words appear after those waited for before."""
         while words not in self.seen[self._read :]:
             assert self._more(), f"{words!r} did not come; seen: {self.seen[-2000:]}"
         self._read = self.seen.index(words, self._read) + len(words)
@@ -41,11 +41,11 @@ class Terminal:
         while self._more():
             pass
         os.close(self._near)
-        return self._process.wait(_LONGEST_WAIT_S)
+        return self._process.wait(_MAX_WAIT_S)
 
     def _more(self) -> bool:
-        """Read what has come; False when nothing will any more."""
-        ready, _, _ = select.select([self._near], [], [], _LONGEST_WAIT_S)
+        """Read new output; return False at its end."""
+        ready, _, _ = select.select([self._near], [], [], _MAX_WAIT_S)
         try:
             data = os.read(self._near, 1 << 16) if ready else b""
         except OSError:  # the other end is closed

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
-from tests.end_to_end.browser import CHROMIUM, Tab, browsing
+from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
@@ -35,7 +35,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with browsing(tmp_path_factory.mktemp("browser")) as tab:
+    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
         yield tab
 
 

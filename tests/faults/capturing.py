@@ -1,4 +1,4 @@
-"""Small captures in processes of their own, to be killed in the middle."""
+"""Run small captures in processes of their own, which can be killed."""
 
 import multiprocessing
 import os
@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
+from faintfield.rig.boards import Board
+from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.guide import Unattended
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.plan import Grid
 from faintfield.rig.session import disk, session
-from faintfield.rig.session.access import opened
+from faintfield.rig.session.frames import PlannedFrame
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
@@ -35,8 +38,9 @@ SMALL_RIG = RigSettings(
     drift=DriftSettings(check=False),
 )
 FRAMES = 2 * 3 + 2 * 3 + 4
+BOARD = Board("large", 9, 6, 40.0, 30.0)
 
-# Every point of a frame's way to the disk at which the power may fail, with the function that is entered or left there
+# The steps by which a frame reaches the disk, each with the function before or after which the power may fail
 STEPS: Mapping[str, tuple[Any, str]] = {
     "intent": (Journal, "intend"),
     "exposure": (SimulatedLab, "expose"),
@@ -49,22 +53,38 @@ STEPS: Mapping[str, tuple[Any, str]] = {
 }
 
 
+class Unattended:
+    """Stands in for a person: gives every prompt its unattended answer, and shows nothing."""
+
+    def ask(self, prompt: Prompt) -> Answer:
+        return prompt.unattended
+
+    def take_request(self) -> OperatorRequest | None:
+        return None
+
+    def show_status(self, status: Status) -> None:
+        pass
+
+    def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
+        pass
+
+
 def capture_small(folder: Path, settings: RigSettings = SMALL_RIG) -> None:
-    """Begin or resume a session without a person, and finish it."""
+    """Begin or resume a session without a person, and complete it."""
     frozen = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
-    with opened(folder, frozen) as open_session:
-        Capture(open_session, open_rig(settings, open_session.journal), Unattended(), lambda path: None).run()
+    with open_session(folder, frozen) as begun:
+        Capture(begun, open_rig(settings, begun.journal), Unattended(), lambda path: None).run()
 
 
 def capture_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:
-    """Capture, and be killed before or after a step, the `countdown`-th time that it is taken while frames are."""
+    """Capture, and be killed before or after a step, the `countdown`-th time it is reached since the first intent."""
     owner, name = STEPS[step]
-    with dying(owner, name, after=after, countdown=countdown):
+    with kill_at(owner, name, after=after, countdown=countdown):
         capture_small(folder)
 
 
 @contextmanager
-def dying(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[None]:
+def kill_at(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[None]:
     """Kill this process when `owner.name` is called for the `countdown`-th time since the first intent."""
     original: Callable[..., Any] = getattr(owner, name)
     intend = Journal.intend
@@ -96,7 +116,7 @@ def dying(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[Non
 
 
 def in_process(target: Callable[..., None], *arguments: Any, **named: Any) -> ForkServerProcess:
-    """Start a process that runs `target`; its imports are there already."""
+    """Start a process that runs `target`; the imports are preloaded."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([__name__])
     process = context.Process(target=_quietly, args=(target, arguments, named), daemon=True)
@@ -105,6 +125,6 @@ def in_process(target: Callable[..., None], *arguments: Any, **named: Any) -> Fo
 
 
 def _quietly(target: Callable[..., None], arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
-    """Run `target` such that a kill is the only way to an unusual end."""
+    """Run `target` without reports of failed threads."""
     threading.excepthook = lambda _: None
     target(*arguments, **named)

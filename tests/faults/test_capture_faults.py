@@ -1,4 +1,4 @@
-"""Cable out, camera gone, disk full, folder made read-only: a named failure or a recovery; the session stays whole."""
+"""A lost cable or camera, a full disk, a read-only folder: a named failure or a recovery; the session stays whole."""
 
 import ctypes
 import resource
@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
-from faintfield.rig.capture.guide import Answer, Operator, Prompt, Unattended
+from faintfield.rig.capture.guide import Answer, OperatorInterface, Prompt
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
-from faintfield.rig.session.access import opened, read_plan, taken_frames
-from faintfield.rig.session.disk import file_of
+from faintfield.rig.session.access import read_plan, taken_frames
+from faintfield.rig.session.disk import encode_exposure
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, is_sealed
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, RigSettings
@@ -26,17 +27,17 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
+from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, in_process
 from tests.faults.stage_faults import Fault, faults_of
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
-# Half a step of 1/80 mm and the rounding of reports
+# Tolerance: half a step of 1/80 mm, and the rounding of reports
 ON_TARGET_UM = 12
 
 
 class TruthfulCamera:
-    """A camera whose frames hold the stage's true position in micrometres, and that fails to order."""
+    """A camera whose frames hold the true position of the stage in µm, and which fails on demand."""
 
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
@@ -74,12 +75,12 @@ class Lab:
     def run(
         self,
         prepare: Callable[[Bench, TruthfulCamera], None] = lambda bench, camera: None,
-        operator: Operator | None = None,
+        operator: OperatorInterface | None = None,
     ) -> RigError | None:
         """Capture; return how it failed, None when it did not."""
         frozen = read_plan(self.folder) if (self.folder / "plan.json").exists() else self.plan()
         try:
-            with opened(self.folder, frozen) as session:
+            with open_session(self.folder, frozen) as session:
                 bench = Bench(CONTROLLERS[self.protocol])
                 camera = TruthfulCamera(bench)
                 rig = Rig(bench.stage(traffic=session.journal), camera, bench.clock, lambda kind, sweep: None)
@@ -94,7 +95,7 @@ class Lab:
         rig = Rig(bench.stage(), TruthfulCamera(bench), bench.clock, lambda kind, sweep: None)
         return FrozenPlan(survey(rig, self.settings).plan, self.settings)
 
-    def assert_every_frame_from_its_place(self) -> None:
+    def assert_true_positions(self) -> None:
         """Assert that the session is whole and that every frame was taken where the plan says."""
         verdict = verify(self.folder)
         assert verdict.problems == ()
@@ -120,10 +121,10 @@ def test_stage_faults_in_mid_capture(tmp_path: Path, protocol: str, fault: Fault
         assert "; " in str(failure)
         assert not is_sealed(lab.folder)
         assert lab.run() is None
-    lab.assert_every_frame_from_its_place()
+    lab.assert_true_positions()
 
 
-def slipping(bench: Bench, camera: TruthfulCamera) -> None:
+def make_slip(bench: Bench, camera: TruthfulCamera) -> None:
     """Let an axis lose steps in the second step of the plan."""
 
     def slip() -> None:
@@ -134,12 +135,12 @@ def slipping(bench: Bench, camera: TruthfulCamera) -> None:
 
 def test_lost_steps_are_found_and_their_frames_taken_again(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
-    assert lab.run(slipping) is None
-    lab.assert_every_frame_from_its_place()
+    assert lab.run(make_slip) is None
+    lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         suspects = journal.events("suspect")
         assert len(suspects) == 1
-        assert "lost its scale" in suspects[0].detail["message"]
+        assert "lost its scale" in str(suspects[0].detail["message"])
         # Everything since the last good check, which was at the end of the first step
         assert [it.frame for it in journal.committed() if it.void is not None] == list(range(6, 12))
     assert verify(lab.folder).superseded == 6
@@ -158,7 +159,7 @@ def test_a_stage_that_loses_steps_again_and_again_is_given_up(tmp_path: Path) ->
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("suspect")) == 3
     assert lab.run() is None
-    # What was in doubt when it was given up stays marked, and is there
+    # The frames in doubt when the capture was given up are present and stay marked
     assert verify(lab.folder).problems == ()
 
 
@@ -171,7 +172,7 @@ class Keeping(Unattended):
 
 def test_frames_kept_in_spite_of_lost_steps_stay_marked(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", "grbl", msgspec.structs.replace(SMALL_RIG, drift=DriftSettings()))
-    assert lab.run(slipping, Keeping()) is None
+    assert lab.run(make_slip, Keeping()) is None
     verdict = verify(lab.folder)
     assert verdict.problems == ()
     assert verdict.suspect == tuple(committed.file for _, committed, _ in taken_frames(lab.folder)[6:12])
@@ -190,7 +191,7 @@ def test_a_camera_that_fails(tmp_path: Path, failures: int) -> None:
     else:
         assert isinstance(failure, CameraError)
         assert lab.run() is None
-    lab.assert_every_frame_from_its_place()
+    lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("camera_failed")) == failures
         assert len(journal.uncommitted()) == failures
@@ -237,7 +238,7 @@ def capture_read_only(folder: Path, place: str) -> None:
     from faintfield.rig.devices import open_rig
 
     plan = FrozenPlan(survey(open_rig(SMALL_RIG), SMALL_RIG).plan, SMALL_RIG)
-    with opened(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
+    with open_session(folder, plan) as session, pytest.raises(SessionUnwritable, match=r"make the folder writable"):
         Capture(session, open_rig(SMALL_RIG, session.journal), Interfering(), lambda path: None).run()
 
 
@@ -253,4 +254,4 @@ def test_a_folder_made_read_only(tmp_path: Path) -> None:
 
 
 def test_frames_are_kept_as_the_camera_made_them() -> None:
-    assert file_of(Exposure(".nef", content=b"raw")) == b"raw"
+    assert encode_exposure(Exposure(".nef", content=b"raw")) == b"raw"

@@ -1,4 +1,4 @@
-"""kill −9 at every step of a frame and at random instants: nothing lost, nothing twice, one frame at most again."""
+"""Kill captures at every step of a frame and at random instants: nothing is lost, at most one frame is taken again."""
 
 import signal
 from pathlib import Path
@@ -10,12 +10,12 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, STEPS, capture_and_die, capture_small, in_process
 
-# A process that captures the small session alone is done long before this.
-_LIFE_S = 60.0
+# A process that captures the small session ends long before this.
+_MAX_LIFE_S = 60.0
 
 
 def assert_whole(folder: Path, kills: int) -> None:
-    """Assert that the frame set equals the plan, and that each kill cost one exposure at most."""
+    """Assert that the frames are those of the plan, and that each kill cost at most one exposure."""
     verdict = verify(folder)
     assert verdict.problems == ()
     assert verdict.sealed
@@ -31,10 +31,10 @@ def assert_whole(folder: Path, kills: int) -> None:
         assert len(list((folder / "frames").iterdir())) == FRAMES
 
 
-def live_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> None:
+def capture_until_killed(folder: Path, step: str, *, after: bool, countdown: int) -> None:
     """Let a process capture until it is killed at a step."""
     process = in_process(capture_and_die, folder, step, after=after, countdown=countdown)
-    process.join(_LIFE_S)
+    process.join(_MAX_LIFE_S)
     assert process.exitcode == -signal.SIGKILL
 
 
@@ -42,22 +42,22 @@ def live_and_die(folder: Path, step: str, *, after: bool, countdown: int) -> Non
 @pytest.mark.parametrize("step", STEPS)
 def test_killed_at_a_step(tmp_path: Path, step: str, after: bool) -> None:
     folder = tmp_path / "session"
-    # Some steps are taken twice for each frame: with these numbers both of them are hit
+    # Some steps occur twice for each frame: these numbers hit both
     for kills, countdown in enumerate((1, 2), start=1):
-        live_and_die(folder, step, after=after, countdown=countdown)
+        capture_until_killed(folder, step, after=after, countdown=countdown)
         with Journal(folder / "journal.sqlite") as journal:
             assert len(journal.uncommitted()) <= kills
     capture_small(folder)
     assert_whole(folder, kills=2)
 
 
-def kill_at_random(folder: Path, kills: int, generator: np.random.Generator, longest_s: float) -> int:
+def kill_at_random(folder: Path, kills: int, generator: np.random.Generator, max_life_s: float) -> int:
     """Kill captures of one session at random instants until it is complete; return how many kills that took."""
     for kill in range(kills):
         if (folder / "SHA256SUMS").exists():
             return kill
         process = in_process(capture_small, folder)
-        process.join(generator.uniform(0.0, longest_s))
+        process.join(generator.uniform(0.0, max_life_s))
         if process.exitcode is not None:
             assert process.exitcode == 0
             return kill
@@ -78,13 +78,13 @@ def test_killed_at_a_hundred_random_instants(tmp_path: Path) -> None:
 
 
 def _random_kills(tmp_path: Path, kills: int, seed: int) -> int:
-    """Kill so many processes, over as many sessions as that takes, and check each; return the number of kills."""
+    """Kill this number of processes, over as many sessions as needed, and check each; return the number of kills."""
     generator = np.random.default_rng(seed)
     done = session = 0
     while done < kills:
         folder = tmp_path / f"session{session}"
         session += 1
-        here = kill_at_random(folder, min(kills - done, 8), generator, longest_s=0.5)
+        here = kill_at_random(folder, min(kills - done, 8), generator, max_life_s=0.5)
         done += here
         if not (folder / "SHA256SUMS").exists():
             capture_small(folder)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.grid import centre_node
-from faintfield.rig.plan import CapturePlan, Grid, Step
+from faintfield.rig.plan import CapturePlan, CaptureStep, Grid
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
@@ -18,15 +18,15 @@ from faintfield.rig.stages.workspace import StageWorkspace
 
 GRID = Grid(7, 7, 50.0, Point(10.0, 10.0))
 STEPS = (
-    Step("charuco", (0.1,)),
-    Step("dark_scene", (0.1,)),
-    Step("dark", (0.1, 0.2), frames_per_node=20, at="centre"),
+    CaptureStep("charuco", (0.1,)),
+    CaptureStep("dark_scene", (0.1,)),
+    CaptureStep("dark", (0.1, 0.2), frames_per_node=20, at="centre"),
 )
 TRAVEL = Box((0.0, 400.0), (0.0, 400.0))
 MOTION = MotionLimits((100.0, 100.0), (500.0, 500.0))
 
 
-def plan_of(grid: Grid = GRID, steps: tuple[Step, ...] = STEPS) -> CapturePlan:
+def plan_of(grid: Grid = GRID, steps: tuple[CaptureStep, ...] = STEPS) -> CapturePlan:
     return CapturePlan.of(grid, steps, approach_mm=2.0, frame_bytes=24_000_000, settle_s=0.5, readout_s=0.4)
 
 
@@ -48,10 +48,10 @@ def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
     assert Grid(2, 4, 50.0, Point(0.0, 0.0)).centre().node == (1, 2) == centre_node(2, 4)
 
 
-def test_frames_and_room() -> None:
+def test_frames_and_disk_space() -> None:
     plan = plan_of()
-    assert plan.frames() == 49 + 49 + 40
-    assert plan.disk_bytes() == plan.frames() * 24_000_000
+    assert plan.frame_count() == 49 + 49 + 40
+    assert plan.disk_bytes() == plan.frame_count() * 24_000_000
 
 
 def test_the_path_reaches_every_stop_from_below() -> None:
@@ -83,7 +83,7 @@ def test_the_predicted_time_is_the_time_it_takes(
     stage = bench.stage()
     stage.connect()
     start = stage.home().position.point
-    plan = plan_of(Grid(7, 7, 50.0, Point(origin, origin)), (Step("dark_scene", (0.1,)),))
+    plan = plan_of(Grid(7, 7, 50.0, Point(origin, origin)), (CaptureStep("dark_scene", (0.1,)),))
     plan.check(stage.workspace(), start)
     predicted_s = plan.duration_s(stage.identify().motion, stage.feed_mm_per_s(), start)
     started_s = bench.clock.now_s()
@@ -105,7 +105,7 @@ def test_wrong_values() -> None:
     with pytest.raises(ValueError, match="at least one row"):
         Grid(0, 7, 50.0, Point(0.0, 0.0))
     with pytest.raises(ValueError, match="exposure times above 0"):
-        Step("dark", ())
+        CaptureStep("dark", ())
     with pytest.raises(msgspec.ValidationError, match="unknown field"):
         msgspec.json.decode(b'{"rows":1,"columns":1,"pitch_mm":1,"origin_mm":[0,0],"pich":2}', type=Grid)
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import building_folder, sha256, write_json
 from faintfield.pipelines.formats.provenance import provenance
@@ -57,7 +57,7 @@ def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, Any]:
         inputs = {frame.file: sha256(source) for frame, source in zip(read.frames, sources, strict=True)}
         inputs |= {descriptor.name: sha256(descriptor)}
         write_json(folder / "provenance.json", provenance("import emva1288", {}, inputs))
-    say(f"{out / FILE_NAME}: {len(frames)} frames of EMVA 1288 release {read.release or 'unstated'} data")
+    inform(f"{out / FILE_NAME}: {len(frames)} frames of EMVA 1288 release {read.release or 'unstated'} data")
     return {"out": str(out), "frames": len(frames), "release": read.release, "saturation_dn": saturation_dn}
 
 

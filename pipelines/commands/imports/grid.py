@@ -7,7 +7,7 @@ from typing import Any
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positive
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, read_picture, write_imported_set
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
@@ -100,7 +100,7 @@ def import_grid(
         options=options,
         overwrite=overwrite,
     )
-    say(f"{out}: {rows} x {columns} views of {width} x {height} px")
+    inform(f"{out}: {rows} x {columns} views of {width} x {height} px")
     return {"out": str(out), "rows": rows, "columns": columns, "size_px": lens.size_px}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.console import progress, say
+from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.files import building_folder, sha256, write_json
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
@@ -68,7 +68,7 @@ def write_imported_set(
     _check_lenses([image.lens for image in images], images[0].path, first)
     exposure_s = exposure_s or first.exposure_s
     if exposure_s is None:
-        say("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
+        inform("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
         exposure_s = 1.0
     noise = msgspec.structs.replace(
         noise,

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
 from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, Noise
@@ -60,7 +60,7 @@ def import_posed(
         models=models,
         overwrite=overwrite,
     )
-    say(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
+    inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
     return {"out": str(out), "views": len(images), "reference": images[index].path.name}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
@@ -99,7 +99,9 @@ def _assume_no_dark_current(path: Path, fitted: dict[str, Any], values: dict[str
     """Take a dark current that the frames could not tell for none, as the calibration's own noise model does."""
     if values["dark_current_e_per_s"] is None:
         why = fitted["dark_current_e_per_s"].get("why", "no reason stated")
-        say(f"{path}: dark_current_e_per_s is not known ({why}); 0 is taken, which is right for short exposures only")
+        inform(
+            f"{path}: dark_current_e_per_s is not known ({why}); 0 is taken, which is right for short exposures only"
+        )
         values["dark_current_e_per_s"] = 0.0
 
 

@@ -82,7 +82,7 @@ def _of_session(folder: Path) -> NoiseSet:
             file=str(path.relative_to(folder)),
             kind=planned.kind,
             exposure_s=planned.exposure_s,
-            temperature_c=taken.detail.get("camera", {}).get("temperature_c"),
+            temperature_c=taken.record.temperature_c,
             level=planned.sweep if planned.kind == "flat" else 0,
             photons=None if (photons_per_s := light[planned.step]) is None else photons_per_s * planned.exposure_s,
         )

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
-from faintfield.pipelines.console import say
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, LoadedSet, View, load_set
@@ -105,7 +105,7 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
             f"reference; take it by a {kind} step of the rig.toml"
         )
     if lacking := len({frame.stop.node for frame in planned}) - len(whole):
-        say(f"{folder}: {lacking} nodes are left out, which miss {_CALLED[kind]} frames; capture again to take them")
+        inform(f"{folder}: {lacking} nodes are left out, which miss {_CALLED[kind]} frames; capture again to take them")
     return sum(at_centre), whole
 
 

@@ -1,4 +1,4 @@
-"""The capture loop: the order of a frame, the operator's wishes, settling, pace."""
+"""The capture loop: the order of a frame, requests of the operator, settling, pace."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -9,42 +9,40 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.checks import check_frame
-from faintfield.rig.capture.guide import TITLES, Answer, Prompt, Status, Wish, spoken_duration, step_prompt
+from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.capture.settling import Settling
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
 from faintfield.rig.plan import Grid
-from faintfield.rig.session.access import opened, taken_frames
-from faintfield.rig.session.frames import PlannedFrame, planned_frames
+from faintfield.rig.session.access import taken_frames
+from faintfield.rig.session.frames import PlannedFrame
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from faintfield.rig.settings import CheckSettings, RigSettings, SettleSettings, StepSettings
-from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.settings import RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.simulation.scene import render
 from faintfield.rig.stages.protocol import Point
-from tests.faults.capturing import FRAMES, SMALL_RIG
+from tests.faults.capturing import BOARD, FRAMES, SMALL_RIG
 
 
 class Person:
-    """An operator with a plan of their own.
+    """An operator with prepared answers and requests.
 
-    `answers` are given by prompt key, one after the other; `wishes` by the number of frames that were shown before.
+    `answers` holds a list for each prompt key; `requests` is keyed by the number of frames shown before.
     """
 
     def __init__(
-        self, answers: Mapping[str, Sequence[Answer]] | None = None, wishes: Mapping[int, Wish] | None = None
+        self,
+        answers: Mapping[str, Sequence[Answer]] | None = None,
+        requests: Mapping[int, OperatorRequest] | None = None,
     ) -> None:
         self.answers = {key: list(values) for key, values in (answers or {}).items()}
-        self.wishes = dict(wishes or {})
+        self.requests = dict(requests or {})
         self.prompts: list[Prompt] = []
         self.statuses: list[Status] = []
         self.seen: list[PlannedFrame] = []
@@ -57,8 +55,8 @@ class Person:
         assert answer in prompt.answers
         return answer
 
-    def wish(self) -> Wish | None:
-        return self.wishes.pop(len(self.seen), None)
+    def take_request(self) -> OperatorRequest | None:
+        return self.requests.pop(len(self.seen), None)
 
     def show_status(self, status: Status) -> None:
         self.statuses.append(status)
@@ -69,10 +67,10 @@ class Person:
 
 
 def run(folder: Path, person: Person, settings: RigSettings = SMALL_RIG) -> RigError | None:
-    """Capture; return why it ended early, if it did."""
+    """Capture; return the failure, None without one."""
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     try:
-        with opened(folder, plan) as session:
+        with open_session(folder, plan) as session:
             Capture(session, open_rig(settings, session.journal), person, lambda path: None).run()
     except RigError as failure:
         return failure
@@ -108,15 +106,15 @@ def test_every_frame_has_its_record(tmp_path: Path) -> None:
     assert run(tmp_path / "session", Person()) is None
     for frame, committed, path in taken_frames(tmp_path / "session"):
         assert path.is_file()
-        assert committed.detail["position_mm"] == pytest.approx(list(frame.stop.target), abs=0.02)
-        assert committed.detail["exposure_s"] == frame.exposure_s
-        assert committed.detail["camera"]["camera"] == "simulated camera"
-        assert "median_dn" in committed.detail["checks"]
+        assert committed.record.position_mm == pytest.approx(list(frame.stop.target), abs=0.02)
+        assert committed.record.exposure_s == frame.exposure_s
+        assert committed.record.camera["camera"] == "simulated camera"
+        assert "median_dn" in committed.record.checks
 
 
-@pytest.mark.parametrize(("wish", "answer"), [("stop", None), ("pause", "stop")])
-def test_stop_and_go_on(tmp_path: Path, wish: Wish, answer: Answer | None) -> None:
-    person = Person({"paused": [answer]} if answer else {}, {4: wish})
+@pytest.mark.parametrize(("wanted", "answer"), [("stop", None), ("pause", "stop")])
+def test_stop_and_go_on(tmp_path: Path, wanted: OperatorRequest, answer: Answer | None) -> None:
+    person = Person({"paused": [answer]} if answer else {}, {4: wanted})
     failure = run(tmp_path / "session", person)
     assert isinstance(failure, CaptureStopped)
     assert str(failure) == f"stopped with 4 of {FRAMES} frames taken; run the same command to go on"
@@ -186,7 +184,6 @@ def test_what_cannot_be_done_is_refused_before_anything_moves() -> None:
         open_rig(real_stage)
 
 
-BOARD = BoardSettings("large", 9, 6, 40.0, 30.0)
 SWINGING = msgspec.structs.replace(
     SMALL_RIG,
     camera=SimulatedSettings(size_px=(160, 120)),
@@ -197,7 +194,7 @@ SWINGING = msgspec.structs.replace(
 )
 
 
-def test_every_frame_is_rested_for_the_first_ones_too(tmp_path: Path) -> None:
+def test_the_stage_rests_before_every_frame(tmp_path: Path) -> None:
     rested_s: list[float] = []
     expose = SimulatedLab.expose
 
@@ -218,54 +215,16 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     assert isinstance(run(folder, Person({}, {2: "stop"}), SWINGING), CaptureStopped)
     assert run(folder, Person(), SWINGING) is None
     with Journal(folder / "journal.sqlite", read_only=True) as journal:
-        found = journal.events("settling")
+        found = journal.details("settling", Settling)
     assert len(found) == 1
-    detail = found[0].detail
-    assert detail["settled"] is True
-    # The swing of 1.5 mm along both axes, seen at 540 mm, falls by e every 0.25 s; frames are 0.1 s apart, and the
-    # controller's reports take 0.2 s to 0.4 s of it
+    assert found[0].settled
+    # The swing of 1.5 mm along both axes, seen at 540 mm, decays by e every 0.25 s; frames are 0.1 s apart, and the
+    # controller's reports take the first 0.2 s to 0.4 s
     shift_px = 2**0.5 * 1.5 * 200 / 540
     rest_s = 0.25 * np.log(shift_px / SWINGING.settle.limit_px)
-    assert rest_s - 0.4 <= detail["wait_s"] <= rest_s - 0.2 + 0.2
-    shifts = [shift for _, shift in detail["curve"]]
+    assert rest_s - 0.4 <= found[0].wait_s <= rest_s - 0.2 + 0.2
+    shifts = [shift for _, shift in found[0].curve]
     assert shifts[0] > 5 * max(shifts[-10:])
-
-
-def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: float) -> Callable[[float], Pixels]:
-    """Return a camera that sees the paper's scene shifted by a function of time."""
-    planes, optics = paper_experiment(96, 72).grey().planes, paper_experiment(96, 72).optics
-    generator = np.random.default_rng(5)
-
-    def expose(exposure_s: float) -> Pixels:
-        shift_mm = shift_px(clock.now_s()) * 600.0 / optics.fx_px
-        seen = next(render(planes, optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
-        clock.sleep_s(exposure_s + 0.05)
-        return np.asarray(generator.poisson(100.0 + light * seen), np.uint16)
-
-    return expose
-
-
-@pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
-def test_settling_is_found_where_it_is(rest_s: float) -> None:
-    clock = SimulatedClock()
-    expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
-    found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05))
-    assert found.settled
-    assert rest_s <= found.wait_s <= rest_s + 0.2
-    shifts = dict(found.curve)
-    assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
-
-
-@pytest.mark.parametrize(
-    ("shift_px", "light"),
-    [(lambda now_s: 0.5 * np.sin(9.0 * now_s), 2e4), (lambda now_s: 0.0, 0.0)],
-    ids=["never at rest", "dark"],
-)
-def test_no_rest_is_not_taken_for_rest(shift_px: Callable[[float], float], light: float) -> None:
-    clock = SimulatedClock()
-    found = measure_settling(shifting(shift_px, clock, light), clock, SettleSettings(exposure_s=0.05))
-    assert not found.settled
-    assert found.wait_s == 3.0
 
 
 @pytest.mark.parametrize("rows", [2, 7])
@@ -277,7 +236,7 @@ def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> 
     )
     plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
     person, told = Person(), list[tuple[float, float]]()
-    with opened(tmp_path / "session", plan) as session:
+    with open_session(tmp_path / "session", plan) as session:
         rig = open_rig(settings, session.journal)
         person.on_status = lambda status: told.append((rig.clock.now_s(), status.to_go_s))
         Capture(session, rig, person, lambda path: None).run()
@@ -287,73 +246,3 @@ def test_the_time_to_go_is_right_after_five_nodes(tmp_path: Path, rows: int) -> 
         assert to_go_s == pytest.approx(end_s - now_s, rel=0.1, abs=2.0)
     now_s, to_go_s = told[11]
     assert to_go_s == pytest.approx(end_s - now_s, rel=0.1)
-
-
-def test_the_guide_has_words_for_every_kind() -> None:
-    for kind in TITLES:
-        settings = msgspec.structs.replace(SMALL_RIG, step=(StepSettings(kind, 0.1),), board=(BOARD,))
-        frame = planned_frames(survey(open_rig(settings), settings).plan)[0]
-        prompt = step_prompt(frame, 1, 1, 10, 100.0)
-        assert TITLES[kind] in prompt.title
-        assert len(prompt.lines) >= 3
-        assert all(line.endswith(".") for line in prompt.lines)
-        assert any("10 frames follow, about 2 min" in line for line in prompt.lines)
-
-
-@pytest.mark.parametrize(
-    ("duration_s", "words"),
-    [
-        (0.2, "about 1 s"),
-        (59.6, "about 60 s"),
-        (100, "about 2 min"),
-        (3600, "about 60 min"),
-        (7500, "about 2 h 05 min"),
-    ],
-)
-def test_durations_as_one_says_them(duration_s: float, words: str) -> None:
-    assert spoken_duration(duration_s) == words
-
-
-def scene(kind: str, **changes: float) -> Pixels:
-    """Return a good frame of a kind."""
-    generator = np.random.default_rng(3)
-    noise = generator.normal(100.0, 3.0, (120, 160))
-    if kind == "charuco":
-        picture = np.kron(BOARD.in_opencv().generateImage((160, 106)), np.ones((3, 3)))
-        noise = 100.0 + 20.0 * np.pad(picture, 20, constant_values=255)
-    elif kind in ("bright", "flat"):
-        noise += 2000.0 + (1500.0 * (np.indices(noise.shape).sum(axis=0) % 24 < 12) if kind == "bright" else 0.0)
-    return noise.astype(np.uint16)
-
-
-@pytest.mark.parametrize("kind", TITLES)
-def test_good_frames_give_no_warning(kind: str) -> None:
-    findings = check_frame(scene(kind), kind, CheckSettings(), (BOARD,), [0.1])  # type: ignore[arg-type]
-    assert findings.warnings == ()
-    if kind == "charuco":
-        assert findings.values["board_corners"] == 8 * 5
-
-
-@pytest.mark.parametrize(
-    ("kind", "spoil", "word"),
-    [
-        ("bright", lambda frame: np.where(frame > 3000, 65535, frame), "saturated"),
-        ("bright", lambda frame: frame // 100, "contrast"),
-        ("flat", lambda frame: frame // 10, "median"),
-        ("dark", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[1] > 140), "stray light"),
-        ("noise_reference", lambda frame: frame + np.uint16(30) * (np.indices(frame.shape)[0] < 20), "stray light"),
-    ],
-)
-def test_bad_frames_give_a_warning(kind: str, spoil: Callable[[Pixels], Pixels], word: str) -> None:
-    frame = np.asarray(spoil(scene(kind)), np.uint16)
-    findings = check_frame(frame, kind, CheckSettings(), (BOARD,), [])  # type: ignore[arg-type]
-    assert any(word in warning and "; " in warning for warning in findings.warnings)
-
-
-def test_a_blurred_frame_is_noticed_beside_sharp_ones() -> None:
-    sharp = scene("bright")
-    blurred = sum(np.roll(sharp.astype(float), shift, axis=1) for shift in range(8)) / 8
-    usual = [check_frame(sharp, "bright", CheckSettings()).values["sharpness"]] * 5
-    assert check_frame(sharp, "bright", CheckSettings(), (), usual).warnings == ()
-    findings = check_frame(np.asarray(blurred, np.uint16), "bright", CheckSettings(), (), usual)
-    assert any("sharpness" in warning for warning in findings.warnings)

@@ -1,4 +1,4 @@
-"""The session on disk: nothing goes unnoticed, nothing is overwritten, nothing is deleted."""
+"""The session on disk: all changes are noticed, nothing is overwritten or deleted."""
 
 import os
 import shutil
@@ -17,10 +17,11 @@ from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import PlanRefused, SessionBusy, SessionCorrupt, SessionUnwritable
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session import journal as journal_module
-from faintfield.rig.session.access import opened, read_plan, refuse_other_rig
+from faintfield.rig.session.access import read_plan
 from faintfield.rig.session.disk import set_aside, write_new
 from faintfield.rig.session.frames import planned_frames
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
@@ -36,13 +37,13 @@ def complete(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def session(complete: Path, tmp_path: Path) -> Path:
-    """Return a complete session of one's own."""
+    """Return a copy of a complete session."""
     return Path(shutil.copytree(complete, tmp_path / "session"))
 
 
 @pytest.fixture
 def unsealed(session: Path) -> Path:
-    """Return a session whose last step, the sealing, is missing."""
+    """Return a complete session that is not sealed."""
     (session / "SHA256SUMS").unlink()
     return session
 
@@ -115,7 +116,7 @@ def test_frames_that_changed_places_are_found(unsealed: Path) -> None:
 
 
 @pytest.mark.parametrize("sealed", [True, False])
-def test_an_edited_plan_is_found_and_not_gone_on_with(session: Path, sealed: bool) -> None:
+def test_an_edited_plan_is_found_and_not_resumed(session: Path, sealed: bool) -> None:
     if not sealed:
         (session / "SHA256SUMS").unlink()
     plan = session / "plan.json"
@@ -135,7 +136,7 @@ def test_verify_reads_a_write_protected_session(session: Path) -> None:
 
 
 def verify_without_rights(folder: Path) -> None:
-    """Verify as somebody who is bound by permissions."""
+    """Verify without the privileges that override permissions."""
     from tests.faults.test_capture_faults import drop_rights
 
     drop_rights()
@@ -143,7 +144,7 @@ def verify_without_rights(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["plan.json", "journal.sqlite"])
-def test_what_holds_a_session_together_is_not_invented_anew(unsealed: Path, name: str) -> None:
+def test_a_lost_plan_or_journal_is_not_replaced(unsealed: Path, name: str) -> None:
     (unsealed / name).unlink()
     with pytest.raises(SessionCorrupt):
         verify(unsealed)
@@ -153,7 +154,7 @@ def test_what_holds_a_session_together_is_not_invented_anew(unsealed: Path, name
 
 
 def test_a_second_capture_is_refused(unsealed: Path) -> None:
-    with opened(unsealed, None):
+    with open_session(unsealed, None):
         for _ in range(2):
             process = in_process(refused, unsealed)
             process.join(60.0)
@@ -165,7 +166,7 @@ def test_a_second_capture_is_refused(unsealed: Path) -> None:
 
 def refused(folder: Path) -> None:
     """Fail unless the session is refused."""
-    with pytest.raises(SessionBusy, match="a capture is under way"), opened(folder, None):
+    with pytest.raises(SessionBusy, match="a capture is under way"), open_session(folder, None):
         pass
 
 
@@ -173,7 +174,7 @@ def test_a_folder_with_other_things_is_no_place_for_a_session(tmp_path: Path) ->
     (tmp_path / "thesis.tex").write_text("important")
     with pytest.raises(SessionCorrupt, match=r"holds thesis\.tex and no session"):
         capture_small(tmp_path)
-    with pytest.raises(SessionCorrupt, match="holds no session"), opened(tmp_path / "other", None):
+    with pytest.raises(SessionCorrupt, match="holds no session"), open_session(tmp_path / "other", None):
         pass
 
 
@@ -189,9 +190,9 @@ def test_orphans_are_set_aside_and_nothing_is_deleted(unsealed: Path) -> None:
         (frames / name).write_bytes(b"orphan")
     (unsealed / "set_aside").mkdir()
     (unsealed / "set_aside" / "stranger.tiff.0").write_bytes(b"older orphan")
-    with opened(unsealed, None) as open_session:
-        assert open_session.missing() == []
-        assert {event.detail["file"] for event in open_session.journal.events("set_aside")} == {
+    with open_session(unsealed, None) as resumed:
+        assert resumed.missing() == []
+        assert {event.detail["file"] for event in resumed.journal.events("set_aside")} == {
             "stranger.tiff", "00001_bright_0_r0_c1_x99.tiff.part",
         }  # fmt: skip
     kept = {path.name: path.read_bytes() for path in (unsealed / "set_aside").iterdir()}
@@ -206,8 +207,8 @@ def test_damaged_and_lost_frames_are_taken_again(unsealed: Path) -> None:
     damaged, lost = frame_files(unsealed)[2], frame_files(unsealed)[5]
     damaged.write_bytes(b"damaged")
     lost.unlink()
-    with opened(unsealed, None) as open_session:
-        assert [frame.number for frame in open_session.missing()] == [2, 5]
+    with open_session(unsealed, None) as resumed:
+        assert [frame.number for frame in resumed.missing()] == [2, 5]
     capture_small(unsealed)
     verdict = verify(unsealed)
     assert verdict.problems == ()
@@ -227,7 +228,7 @@ def test_a_frame_is_never_overwritten(tmp_path: Path) -> None:
 def test_only_the_port_may_change(session: Path) -> None:
     frozen = read_plan(session)
     replace = msgspec.structs.replace
-    refuse_other_rig(frozen, replace(SMALL_RIG, stage=replace(SMALL_RIG.stage, port="simulated:grbl", baud=9600)))
+    check_same_rig(frozen, replace(SMALL_RIG, stage=replace(SMALL_RIG.stage, port="simulated:grbl", baud=9600)))
     for other in (
         replace(SMALL_RIG, stage=replace(SMALL_RIG.stage, approach_mm=1.0)),
         replace(SMALL_RIG, grid=replace(SMALL_RIG.grid, pitch_mm=49.0)),
@@ -235,7 +236,7 @@ def test_only_the_port_may_change(session: Path) -> None:
         replace(SMALL_RIG, camera=replace(SMALL_RIG.camera, seed=2)),
     ):
         with pytest.raises(PlanRefused, match=r"is not what the session was begun with; restore it"):
-            refuse_other_rig(frozen, other)
+            check_same_rig(frozen, other)
 
 
 def test_order_does_not_depend_on_the_clock(tmp_path: Path) -> None:

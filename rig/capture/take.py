@@ -1,0 +1,176 @@
+"""Take one frame: move, rest, verify the position, expose, write, check and commit."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import msgspec
+
+from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.checks import LIT_KINDS, Findings, check_frame
+from faintfield.rig.capture.dialogue import Dialogue
+from faintfield.rig.capture.drift_checks import DriftChecks
+from faintfield.rig.capture.pace import Pace
+from faintfield.rig.capture.settling import Settling, measure_settling
+from faintfield.rig.capture.sweeps import board_warnings
+from faintfield.rig.devices import Rig
+from faintfield.rig.errors import CameraError
+from faintfield.rig.session.frames import PlannedFrame
+from faintfield.rig.session.journal import FrameRecord
+from faintfield.rig.session.session import Session
+
+type Decode = Callable[[Path], Pixels | None]
+
+# Exposures that are not kept are numbered from here, beyond the number of any frame.
+_FIRST_UNKEPT_NUMBER = 10**9
+
+
+class FrameTaker:
+    """Takes the frames of a session one by one.
+
+    Parameters
+    ----------
+    session : Session
+        Open session, where the frames are stored.
+    rig : Rig
+        Stage, camera and clock; connected and homed before `take`.
+    dialogue : Dialogue
+        Informs the operator.
+    drift : DriftChecks
+        Counts the nodes and frames that the next drift check covers.
+    pace : Pace
+        Knows the position of the stage, and learns how long a frame takes.
+    decode : callable
+        Reads the pixels of a frame's file; returns None if it cannot.
+
+    Attributes
+    ----------
+    last : PlannedFrame or None
+        The frame taken last.
+    """
+
+    def __init__(
+        self, session: Session, rig: Rig, dialogue: Dialogue, drift: DriftChecks, pace: Pace, decode: Decode
+    ) -> None:
+        self._session = session
+        self._settings = session.frozen.rig
+        self._rig = rig
+        self._dialogue = dialogue
+        self._drift = drift
+        self._pace = pace
+        self._decode = decode
+        self._settle_s: float | None = None
+        self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
+        self.last: PlannedFrame | None = None
+
+    def take(self, frame: PlannedFrame) -> None:
+        """Move to the node of a frame and take it.
+
+        Raises
+        ------
+        StageError, NotHomed
+            The stage failed, or is not where it was sent.
+        CameraError
+            The camera failed.
+        SessionUnwritable
+            The frame could not be written.
+        """
+        self._dialogue.show_status(frame, "moving")
+        self._go_to(frame)
+        self._dialogue.show_status(frame, "exposing")
+        self._expose(frame)
+
+    def _go_to(self, frame: PlannedFrame) -> None:
+        """Move the stage to the node of a frame, and wait until it is at rest."""
+        target = frame.stop.target
+        if self._pace.here == target:
+            return
+        self._pace.depart()
+        self._rig.stage.move_to(*target)
+        self._drift.count_node()
+        measures = self._settle_s is None and frame.kind in LIT_KINDS
+        if measures:
+            self._settle_s = self._find_settling(frame)
+        # Rest after a measurement, too: its result may be the planned rest, or known from before an interruption
+        self._rig.clock.sleep_s(self._session.plan.settle_s if self._settle_s is None else self._settle_s)
+        self._pace.arrive(target, timed=not measures)
+
+    def _expose(self, frame: PlannedFrame) -> None:
+        """Take a frame at the present node; the order of the steps is what makes a kill at any moment harmless."""
+        rig, session = self._rig, self._session
+        begun_s = rig.clock.now_s()
+        intent = session.intend(frame)
+        position = rig.stage.verify_at(*frame.stop.target)
+        exposure = rig.camera.expose(frame.exposure_s, intent)
+        rig.stage.verify_at(*frame.stop.target)
+        written = session.write(frame, intent, exposure)
+        pixels = exposure.pixels if exposure.pixels is not None else self._decode(written.path)
+        found = self._check(frame, pixels)
+        record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), found.values, found.warnings)
+        self._drift.add(session.commit(frame, written, record))
+        self.last = frame
+        if found.warnings:
+            self._dialogue.warnings = tuple(f"{frame.name}: {warning}" for warning in found.warnings)
+        if frame.kind == "charuco":
+            self._check_boards(frame)
+        self._pace.finish_frame(begun_s, frame.exposure_s)
+        if pixels is not None:
+            self._dialogue.operator.show_frame(frame, pixels, found.values)
+
+    def _check(self, frame: PlannedFrame, pixels: Pixels | None) -> Findings:
+        """Return the measured values and the warnings of a frame."""
+        if pixels is None:
+            return Findings(
+                {}, ("the file cannot be decoded here, so nothing was checked; look at it with the camera's program",)
+            )
+        earlier_sharpness = [
+            it.record.checks["sharpness"]
+            for it in self._session.valid().values()
+            if self._session.frames[it.frame].step == frame.step and "sharpness" in it.record.checks
+        ]
+        return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
+
+    def _check_boards(self, frame: PlannedFrame) -> None:
+        """Warn if a sweep, or all of them, show too little of the boards."""
+        corners = {
+            number: int(taken.record.checks["board_corners"])
+            for number, taken in self._session.valid().items()
+            if "board_corners" in taken.record.checks
+        }
+        for warning in board_warnings(frame, self._session.frames, corners, self._settings.checks.board_corners):
+            self._dialogue.warn(warning)
+
+    def _find_settling(self, frame: PlannedFrame) -> float:
+        """Return the rest in s after a move: measured earlier in this session, measured now, or planned."""
+        settings = self._settings.settle
+        measured = self._session.journal.details("settling", Settling)
+        if measured:
+            return measured[-1].wait_s
+        if not settings.measure:
+            return self._session.plan.settle_s
+        self._dialogue.show_status(frame, "measuring how long the rig swings")
+        found = measure_settling(self._take_unkept, self._rig.clock, settings)
+        self._session.journal.event("settling", frame=frame.number, **msgspec.to_builtins(found))
+        if not found.settled:
+            self._dialogue.warn(
+                f"the rig was not seen at rest within {settings.longest_s:g} s, which is the rest from now on; "
+                "light the scene, stiffen the rig or lower its acceleration, or set settle.measure = false"
+            )
+        return found.wait_s
+
+    def _take_unkept(self, exposure_s: float) -> Pixels:
+        """Return a frame that is not kept."""
+        exposure = self._rig.camera.expose(exposure_s, next(self._unkept_numbers))
+        if exposure.content is None:
+            assert exposure.pixels is not None
+            return exposure.pixels
+        with TemporaryDirectory(prefix="faintfield-") as folder:
+            path = Path(folder) / f"frame{exposure.suffix}"
+            path.write_bytes(exposure.content)
+            pixels = self._decode(path)
+        if pixels is None:
+            raise CameraError(
+                "frames cannot be decoded here, so settling cannot be measured; set settle.measure = false"
+            )
+        return pixels

@@ -1,0 +1,50 @@
+"""The measurement of settling, on a scene that is shifted by a known function of time."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.settling import measure_settling
+from faintfield.rig.settings import SettleSettings
+from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.scene import render
+
+
+def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: float) -> Callable[[float], Pixels]:
+    """Return a camera that sees the paper's scene shifted by a function of time."""
+    planes, optics = paper_experiment(96, 72).grey().planes, paper_experiment(96, 72).optics
+    generator = np.random.default_rng(5)
+
+    def expose(exposure_s: float) -> Pixels:
+        shift_mm = shift_px(clock.now_s()) * 600.0 / optics.fx_px
+        seen = next(render(planes, optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
+        clock.sleep_s(exposure_s + 0.05)
+        return np.asarray(generator.poisson(100.0 + light * seen), np.uint16)
+
+    return expose
+
+
+@pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
+def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
+    clock = SimulatedClock()
+    expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
+    found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05))
+    assert found.settled
+    assert rest_s <= found.wait_s <= rest_s + 0.2
+    shifts = dict(found.curve)
+    assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
+
+
+@pytest.mark.parametrize(
+    ("shift_px", "light"),
+    [(lambda now_s: 0.5 * np.sin(9.0 * now_s), 2e4), (lambda now_s: 0.0, 0.0)],
+    ids=["never at rest", "dark"],
+)
+def test_no_rest_is_not_taken_for_rest(shift_px: Callable[[float], float], light: float) -> None:
+    clock = SimulatedClock()
+    found = measure_settling(shifting(shift_px, clock, light), clock, SettleSettings(exposure_s=0.05))
+    assert not found.settled
+    assert found.wait_s == 3.0
