@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from faintfield.rig.boards import Board
+from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
@@ -38,7 +38,7 @@ SMALL_RIG = RigSettings(
     drift=DriftSettings(check=False),
 )
 FRAMES = 2 * 3 + 2 * 3 + 4
-BOARD = Board("large", 9, 6, 40.0, 30.0)
+BOARD = BoardSettings("large", 9, 6, 40.0, 30.0)
 
 # The steps by which a frame reaches the disk, each with the function before or after which the power may fail
 STEPS: Mapping[str, tuple[Any, str]] = {

@@ -91,10 +91,10 @@ def test_answers_that_come_late_do_not_put_the_recovery_out_of_step() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
     for _ in range(3):
-        bench.firmware.inform("ok")
-    bench.firmware.inform("Resend: 99")
+        bench.firmware.say("ok")
+    bench.firmware.say("Resend: 99")
     bench.wire.hold_up(0.25)
-    bench.firmware.inform("ok")
+    bench.firmware.say("ok")
     stage.recover()
     stage.home()
     target = Point(100.0, 100.0)
