@@ -32,7 +32,7 @@ class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if not hasattr(cv2.aruco, self.dictionary) or not self.dictionary.startswith("DICT_"):
-            raise ValueError(f"board {self.name}: {self.dictionary!r} is not a dictionary of OpenCV; try DICT_5X5_1000")
+            raise ValueError(f"board {self.name}: {self.dictionary!r} names no dictionary of OpenCV; try DICT_5X5_1000")
         available, markers = len(self._dictionary().bytesList), self.columns * self.rows // 2
         if not 0 <= self.first_marker_id <= available - markers:
             raise ValueError(

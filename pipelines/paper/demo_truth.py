@@ -23,8 +23,8 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.planes import Method
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.simulation.camera import TRUE_POSE
 from faintfield.rig.session.access import read_plan, taken_frames
+from faintfield.rig.simulation.camera import TRUE_POSE
 from faintfield.rig.simulation.experiment import SimulatedExperiment
 from faintfield.rig.simulation.lab import lab_experiment
 
