@@ -16,9 +16,9 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.blocks import EDGE_TOLERANCE
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.placement import EDGE_TOLERANCE
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.rig.simulation.optics import SimulatedOptics
 
 type LinearOperatorCheck = Callable[[PlaneOperator], Image]

@@ -13,10 +13,11 @@ from scipy.stats import norm, poisson
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.one_step_late import (
     Iterate,
-    Step,
+    IterationStep,
     mlem,
     oscillates,
     pmlem_one_step_late,
@@ -24,7 +25,6 @@ from faintfield.recon.solver.one_step_late import (
     updated_samples,
 )
 from faintfield.recon.solver.penalties import total_variation, total_variation_gradient
-from faintfield.recon.solver.starts import back_projection, smooth_start, universal_penalty_weight
 
 SHAPE = (9, 12)
 
@@ -181,7 +181,7 @@ def test_samples_seen_by_too_few_views_keep_their_start() -> None:
     assert (plane[~kept] != start[~kept]).all()
 
 
-def run(penalty_weight: float, epsilon: float) -> list[Step]:
+def run(penalty_weight: float, epsilon: float) -> list[IterationStep]:
     operator = shifted_views(6)
     images = drawn(operator, box(1, 3))
     start = smooth_start(operator, images)
@@ -201,8 +201,8 @@ def test_a_large_weight_is_seen_to_swing_and_a_small_one_to_settle() -> None:
     assert (sensitivity[updated] > 2 * weight).all()
 
 
-def history(changes: Sequence[float], alternation: float) -> list[Step]:
-    return [Step(k + 1, change, alternation) for k, change in enumerate(changes)]
+def history(changes: Sequence[float], alternation: float) -> list[IterationStep]:
+    return [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
 
 
 @pytest.mark.parametrize(
