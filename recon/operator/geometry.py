@@ -22,9 +22,7 @@ def scene_geometry(
     lattice_of_view: NDArray[np.intp] | None,
     dtype: np.dtype[Any],
 ) -> SceneGeometry:
-    """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2), and refuse misfits.
-
-    Its `reach` covers whole rows until the kernels have found it.
+    """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2); `reach` covers whole rows.
 
     Raises
     ------
@@ -43,10 +41,7 @@ def scene_geometry(
     transmission = np.zeros((0, 0, 0, 0), dtype) if transmission is None else np.ascontiguousarray(transmission, dtype)
     _check_pixels(flat, valid, transmission, (planes, views, lattices, *detector))
     lattice_of_view = _checked_lattices(lattice_of_view, views, lattices)
-    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat, transmission)):
-        raise GeometryMismatch(
-            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
-        )
+    _check_finite(plane_from_ray, rays, flat, transmission)
     return SceneGeometry(
         _homographies(plane_from_ray, grids, dtype),
         _layout(grids),
@@ -57,6 +52,14 @@ def scene_geometry(
         transmission.reshape(-1),
         np.broadcast_to(np.array([0, _padded(detector[1])], np.intp), (views, int(detector[0]), 2)).copy(),
     )
+
+
+def _check_finite(*parts: NDArray[Any]) -> None:
+    """Refuse numbers that are not finite."""
+    if not all(np.isfinite(part).all() for part in parts):
+        raise GeometryMismatch(
+            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
+        )
 
 
 def _padded(columns: int) -> int:

@@ -118,18 +118,16 @@ def pmlem(
 
     Parameters
     ----------
-    data_term : DataTerm
-        L.
+    data_term, penalty : DataTerm, Penalty
+        L and φ; total variation by default.
     start : float array (samples)
         Positive.
     penalty_weight : float
         β ≥ 0, in the unit of s.
-    penalty : Penalty, optional
-        Total variation by default.
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional
-        That of a similar problem, which is copied; by default that of one constant plane (row, column).
+        That of a similar problem, not changed; by default that of one constant plane (row, column).
 
     Raises
     ------
@@ -138,15 +136,20 @@ def pmlem(
     NotConverged
         An iterate is not finite.
     """
-    if not penalty_weight >= 0:
-        raise ValueError(f"need penalty_weight >= 0, got {penalty_weight}")
-    if not (start > 0).all():
-        raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
+    _check_arguments(penalty_weight, start)
     penalty = penalty or Penalty()
     if penalty_weight == 0 or penalty.name == "none":
         penalty_weight, penalty = 0.0, Penalty("none")
     dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
     return _Pmlem(data_term, penalty_weight, penalty, tolerance).iterates(start, dual)
+
+
+def _check_arguments(penalty_weight: float, start: Image) -> None:
+    """Refuse a negative weight, and a start that is not positive (ValueError)."""
+    if not penalty_weight >= 0:
+        raise ValueError(f"need penalty_weight >= 0, got {penalty_weight}")
+    if not (start > 0).all():
+        raise ValueError(f"start must be positive everywhere, its smallest value is {start.min()}")
 
 
 class _Pmlem:

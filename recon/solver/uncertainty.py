@@ -40,10 +40,8 @@ def standard_deviation(
     ----------
     plane, metric : float array (row, column)
         f at its optimum, and W > 0 there.
-    weight : float
-        β ≥ 0 of the optimum.
-    penalty : Penalty
-        φ.
+    weight, penalty : float, Penalty
+        β ≥ 0 of the optimum, and φ.
     generator : Generator
         Random generator of the draws.
     """
