@@ -58,5 +58,5 @@ $(VENV)/installed: requirements.lock pyproject.toml
 $(VENV)/compiled: $(VENV)/installed $(wildcard recon/*.py recon/*/*.py)
 	@echo "Compiling the kernels ..."
 	find recon -name '*.nb[ci]' -delete
-	$(BIN)/python -c 'from faintfield.recon.operator import plane; from faintfield.recon.solver import proximal; plane.compile_kernels(); proximal.compile_kernels()'
+	$(BIN)/python -c 'from faintfield.recon import compile_kernels; compile_kernels()'
 	@touch $@

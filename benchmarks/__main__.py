@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.passes import compare_passes, memory, scaling
-from benchmarks.problem import Problem
+from benchmarks.problem import BenchmarkProblem
 from benchmarks.solvers import compare_solvers
 
 _MEANING = {
@@ -51,7 +51,7 @@ _MEANING = {
 
 def measure(size_px: int, solvers_size_px: int, rounds: int) -> dict[str, Any]:
     """Return all figures."""
-    problem = Problem.of_size(size_px)
+    problem = BenchmarkProblem.of_size(size_px)
     return {
         "size_px": size_px,
         "views": len(problem.poses),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 
 _NORM_OF_GRADIENT = 8**0.5
 _STEPS = 4000

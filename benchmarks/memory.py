@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.problem import Problem
+from benchmarks.problem import BenchmarkProblem
 
 _MB = 1e6
 
@@ -20,7 +20,7 @@ def _peak_mb() -> float:
 
 def main() -> None:
     """Print the peak before and after, and what there was in between beside six planes."""
-    problem = Problem.of_size(int(sys.argv[1]))
+    problem = BenchmarkProblem.of_size(int(sys.argv[1]))
     before = _peak_mb()
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
     for _ in range(3):

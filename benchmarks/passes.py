@@ -14,13 +14,13 @@ import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
 
-from benchmarks.problem import Problem
-from faintfield.recon.operator.scene import SceneOperator
+from benchmarks.problem import BenchmarkProblem
+from faintfield.recon.operator.scene_operator import SceneOperator
 
 type Run = Callable[[], object]
 
 
-def compare_passes(problem: Problem, rounds: int) -> dict[str, float]:
+def compare_passes(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
     """Return how many times longer than ours each peer takes, and how many times ours the reading of the data."""
     # All matrices are 3 GB and take two minutes to build; what they cost is proportional to the views, within 5 %
     few = np.arange(0, len(problem.poses), 4)
@@ -46,11 +46,11 @@ def compare_passes(problem: Problem, rounds: int) -> dict[str, float]:
     }
 
 
-def scaling(problem: Problem, rounds: int) -> dict[str, float]:
+def scaling(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
     """Return how much longer a pass takes with more of something, over what proportion would make of it."""
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
     single, few = problem.operator(workers=1), np.arange(0, len(problem.poses), 4)
-    half = Problem.of_size(problem.lens.size_px[0] // 2)
+    half = BenchmarkProblem.of_size(problem.lens.size_px[0] // 2)
     seconds = interleaved(
         {
             "all": lambda: operator.adjoint_of_ratio(plane, problem.images),
@@ -82,13 +82,13 @@ def interleaved(
     return {name: statistics.median(times[1:]) for name, times in seconds.items()}
 
 
-def fused_pass(problem: Problem) -> Run:
+def fused_pass(problem: BenchmarkProblem) -> Run:
     """Return our own pass: gather, ratio and scatter in one sweep."""
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
     return lambda: operator.adjoint_of_ratio(plane, problem.images)
 
 
-def _scene_pass(problem: Problem, depths_mm: tuple[float, ...]) -> Run:
+def _scene_pass(problem: BenchmarkProblem, depths_mm: tuple[float, ...]) -> Run:
     scene = SceneOperator(
         np.stack([problem.homographies(depth) for depth in depths_mm]),
         problem.lens.rays(),
@@ -96,11 +96,11 @@ def _scene_pass(problem: Problem, depths_mm: tuple[float, ...]) -> Run:
         flat=problem.flat,
         valid=problem.images.valid,
     )
-    planes = [np.ones(grid.shape, np.float32) for grid in scene.grids]
-    return lambda: scene.adjoint_of_ratio(planes, problem.images)
+    samples = np.ones(scene.samples_shape, np.float32)
+    return lambda: scene.adjoint_of_ratio(samples, problem.images)
 
 
-def sparse_pass(problem: Problem, views: NDArray[np.intp]) -> Run:
+def sparse_pass(problem: BenchmarkProblem, views: NDArray[np.intp]) -> Run:
     """Return the pass over some views with a scipy CSR matrix of each, response and mask in it, and its transpose."""
     matrices = [_bilinear_matrix(problem, view) for view in views]
     transposes = [matrix.T.tocsr() for matrix in matrices]
@@ -115,7 +115,7 @@ def sparse_pass(problem: Problem, views: NDArray[np.intp]) -> Run:
     return run
 
 
-def warp_pass(problem: Problem) -> Run:
+def warp_pass(problem: BenchmarkProblem) -> Run:
     """Return the pass with OpenCV's warps, whose second is not the adjoint of the first; lens and mask are left out."""
     camera = np.linalg.inv(problem.lens.camera_matrix())
     index_from_pixel = [problem.grid().index_from_plane() @ h @ camera for h in problem.homographies()]
@@ -154,7 +154,7 @@ def _sum(part: NDArray[np.float32]) -> float:
     return float(total)
 
 
-def _ratio(problem: Problem, view: int, seen: NDArray[np.float32]) -> NDArray[np.float32]:
+def _ratio(problem: BenchmarkProblem, view: int, seen: NDArray[np.float32]) -> NDArray[np.float32]:
     images = problem.images
     shifted: NDArray[np.float32] = np.maximum(images.electrons[view] + images.read_variance_e2, np.float32(0))
     seen = seen + images.background_e
@@ -163,7 +163,7 @@ def _ratio(problem: Problem, view: int, seen: NDArray[np.float32]) -> NDArray[np
     return shifted
 
 
-def _bilinear_matrix(problem: Problem, view: int) -> scipy.sparse.csr_array:
+def _bilinear_matrix(problem: BenchmarkProblem, view: int) -> scipy.sparse.csr_array:
     """Return H of one view, built from the rays without the operator."""
     rays = problem.lens.rays().reshape(-1, 2)
     homogeneous = np.column_stack([rays, np.ones(len(rays))])

@@ -12,11 +12,11 @@ import numpy as np
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
 from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
 
 _VIEWS, _SIZE_PX, _SNR, _READ_VARIANCE_E2, _DARK_E = 49, 192, 0.16, 12.0, 0.02

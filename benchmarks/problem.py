@@ -9,14 +9,14 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from
 from faintfield.calib.lens import Lens
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.rig.grid import nominal_poses_rt_cam_ref
 
 DEPTH_MM = 500.0
 
 
 @dataclass(frozen=True)
-class Problem:
+class BenchmarkProblem:
     """Views of a square detector: each pixel has a response, background and noise of its own, and some are bad."""
 
     lens: Lens
@@ -25,7 +25,7 @@ class Problem:
     images: ElementalImages
 
     @classmethod
-    def of_size(cls, size_px: int, views: int = 49) -> "Problem":
+    def of_size(cls, size_px: int, views: int = 49) -> "BenchmarkProblem":
         """Return the problem for a lens of 8 % distortion and poses that are off by 0.2° and 0.3 mm."""
         generator = np.random.default_rng(1)
         poses = nominal_poses_rt_cam_ref(7, 7, 50.0) + generator.normal(size=(49, 6)) * np.repeat([0.0035, 0.3], 3)

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.library_solver import primal_dual
-from benchmarks.problem import Problem
+from benchmarks.problem import BenchmarkProblem
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.one_step_late import pmlem_one_step_late
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
 
 _IN_A_ROW = 10
 _LIMIT_S = 15.0
@@ -58,7 +58,7 @@ def compare_solvers(size_px: int) -> dict[str, float | None]:
 
 def _scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
     """Return dark views (one electron per pixel, read noise 3.5) of rectangles of several levels."""
-    problem, generator = Problem.of_size(size_px), np.random.default_rng(4)
+    problem, generator = BenchmarkProblem.of_size(size_px), np.random.default_rng(4)
     operator, truth = problem.operator(), np.full(problem.grid().shape, 0.3)
     for _ in range(25):
         top, left = generator.integers(0, size_px, 2)

@@ -22,7 +22,7 @@ _MODULES = {
     "MotionLimits": "rig.stages.protocol",
     "OutsideTravel": "rig.errors",
     "PlaneGrid": "recon.operator.grid",
-    "PlaneOperator": "recon.operator.plane",
+    "PlaneOperator": "recon.operator.plane_operator",
     "Point": "rig.stages.protocol",
     "ReconstructionError": "recon.errors",
     "RigError": "rig.errors",
@@ -30,7 +30,7 @@ _MODULES = {
     "StageSettings": "rig.stages.settings",
     "CaptureStep": "rig.plan",
     "Target": "calib.geometry",
-    "back_projection": "recon.solver.starts",
+    "back_projection": "recon.solver.initialization",
     "calibrate_geometry": "calib.geometry",
     "calibrate_noise": "calib.noise:calibrate",
     "channel_layouts": "pipelines.reconstruction.channels",
@@ -45,9 +45,9 @@ _MODULES = {
     "pmlem": "recon.solver.pmlem",
     "read_frame": "pipelines.formats.frames",
     "simulate": "pipelines.commands.simulate",
-    "smooth_start": "recon.solver.starts",
+    "smooth_start": "recon.solver.initialization",
     "taken_frames": "rig.session.access",
-    "universal_penalty_weight": "recon.solver.starts",
+    "universal_penalty_weight": "recon.solver.initialization",
 }
 __all__ = list(_MODULES)
 
@@ -73,12 +73,12 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.errors import ReconstructionError as ReconstructionError
     from faintfield.recon.likelihood.images import ElementalImages as ElementalImages
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
-    from faintfield.recon.operator.plane import PlaneOperator as PlaneOperator
+    from faintfield.recon.operator.plane_operator import PlaneOperator as PlaneOperator
     from faintfield.recon.solver.data_fit import DataFit as DataFit
     from faintfield.recon.solver.pmlem import pmlem as pmlem
-    from faintfield.recon.solver.starts import back_projection as back_projection
-    from faintfield.recon.solver.starts import smooth_start as smooth_start
-    from faintfield.recon.solver.starts import universal_penalty_weight as universal_penalty_weight
+    from faintfield.recon.solver.initialization import back_projection as back_projection
+    from faintfield.recon.solver.initialization import smooth_start as smooth_start
+    from faintfield.recon.solver.initialization import universal_penalty_weight as universal_penalty_weight
     from faintfield.rig.devices import open_rig as open_rig
     from faintfield.rig.devices import open_stage as open_stage
     from faintfield.rig.errors import OutsideTravel as OutsideTravel

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""Logarithm and exponential that vectorise inside compiled loops; in float64 they are the library's own.
+"""Logarithm and exponential that can be vectorised in compiled loops.
 
-The library's functions are called one number at a time, which would cost a pass over the data more than all the rest of
-it. In float32 these stand in, with errors of one or two units in the last place.
+The library's functions take one number at a time, which would more than double the cost of a pass over the data. In
+float32 the functions here replace them, with errors of one or two units in the last place; in float64 they are the
+library's.
 """
 
 import math
@@ -12,18 +13,19 @@ import numpy as np
 from numba import types
 from numba.extending import intrinsic, overload
 
-# Options of everything compiled here: sums may be reordered, but infinities and NaN keep their meaning, for callers
-# test for them.
+# Options of all compiled code: sums may be reordered, but infinities and NaN keep their meaning, because callers test
+# for them.
 _OPTIONS = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}}
 compiled = numba.njit(nogil=True, cache=True, **_OPTIONS)
 
-# For what is small and called per pixel or block: handing over arrays costs more than it does.
+# For small functions called per pixel or block, where passing arrays would cost more than the work.
 inlined = numba.njit(inline="always", **_OPTIONS)
 
 _HALF_ROOT_BITS = np.int32(0x3F3504F3)  # √½ as float32
 _LN2, _LN2_HIGH, _LN2_LOW = np.float32(0.6931472), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _LOG2_E = np.float32(1.442695)
-_LEAST, _MOST = np.float32(-87.0), np.float32(88.0)
+# eˣ is a normal float32 between these.
+_MIN_EXPONENT, _MAX_EXPONENT = np.float32(-87.0), np.float32(88.0)
 
 
 @intrinsic
@@ -39,8 +41,8 @@ def _bits(_context, number):
 
 
 @intrinsic
-def _of_bits(_context, bits):
-    """Return the float32 that an int32's bits are."""
+def _float_from_bits(_context, bits):
+    """Return the float32 with the 32 bits of an int32."""
 
     def build(_, builder, __, arguments):
         from llvmlite import ir
@@ -51,12 +53,12 @@ def _of_bits(_context, bits):
 
 
 def logarithm(x):
-    """Return ln x for positive, normal x; what it returns else is a number without meaning."""
+    """Return ln x for positive, normal x, and a meaningless number for any other."""
     return math.log(x)
 
 
 def exponential(x):
-    """Return eˣ, with x kept within −87 and 88."""
+    """Return eˣ, with x clipped to the range −87 to 88."""
     return math.exp(min(max(x, -87.0), 88.0))
 
 
@@ -75,10 +77,10 @@ def _exponential(x):
 
 
 def _logarithm_single(x):
-    """X = 2ᵉ m with m near one, and ln m = 2 artanh((m − 1)/(m + 1)), six terms of whose series are exact enough."""
+    """Return ln x from x = 2ᵉ m with m near one, and six terms of the series of ln m = 2 artanh((m − 1)/(m + 1))."""
     bits = _bits(x)
     exponent = np.int32(bits - _HALF_ROOT_BITS) >> np.int32(23)
-    mantissa = _of_bits(np.int32(bits - np.int32(exponent << np.int32(23))))
+    mantissa = _float_from_bits(np.int32(bits - np.int32(exponent << np.int32(23))))
     s = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
     t = s * s
     series = np.float32(2 / 9) + t * np.float32(2 / 11)
@@ -88,10 +90,10 @@ def _logarithm_single(x):
 
 
 def _exponential_single(x):
-    """X = n ln 2 + r with |r| ≤ ½ ln 2, and eˣ = 2ⁿ eʳ."""
-    x = min(max(x, _LEAST), _MOST)
+    """Return eˣ = 2ⁿ eʳ, with x = n ln 2 + r and |r| ≤ ½ ln 2."""
+    x = min(max(x, _MIN_EXPONENT), _MAX_EXPONENT)
     n = np.floor(x * _LOG2_E + np.float32(0.5))
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = np.float32(1 / 24) + r * (np.float32(1 / 120) + r * (np.float32(1 / 720) + r * np.float32(1 / 5040)))
     series = np.float32(1) + r * (np.float32(1) + r * (np.float32(1 / 2) + r * (np.float32(1 / 6) + r * series)))
-    return series * _of_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
+    return series * _float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))

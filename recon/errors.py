@@ -1,4 +1,4 @@
-"""The failures of reconstruction, one tree: catch `ReconstructionError` to catch them all.
+"""The failures of reconstruction; catch `ReconstructionError` to catch them all.
 
 ReconstructionError
 ├── GeometryMismatch
@@ -8,16 +8,16 @@ ReconstructionError
 
 
 class ReconstructionError(Exception):
-    """The plane asked for cannot be reconstructed from the views given."""
+    """The requested plane cannot be reconstructed from the given views."""
 
 
 class GeometryMismatch(ReconstructionError):
-    """Poses, lens, images and plane do not fit together (a plane behind the camera, say)."""
+    """Poses, lens, images and plane do not fit together (the plane is behind the camera, for example)."""
 
 
 class NotConverged(ReconstructionError):
-    """An iteration left the numbers it is defined on."""
+    """An iteration left the range in which it is defined."""
 
 
 class NothingInFocus(ReconstructionError):
-    """At no depth do the views agree on anything that stands out of the noise."""
+    """The views agree at no depth on anything that stands out of the noise."""

@@ -1,4 +1,4 @@
-"""How dark, and how right: the paper's SNR formulas and the errors of a reconstruction."""
+"""The paper's SNR formulas, and the errors of a reconstruction."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,9 @@ def snr_from_powers(object_e: NDArray[np.floating], reference_e: NDArray[np.floa
     Parameters
     ----------
     object_e : array
-        The pixels of a dark-scene view that lie in the object region, offset removed.
+        Pixels of a dark view in the object region, offset removed.
     reference_e : array
-        The pixels of the noise-reference image, offset removed.
+        Pixels of the noise-reference image, offset removed.
     """
     noise_power = np.mean(np.square(reference_e, dtype=np.float64))
     return float((np.mean(np.square(object_e, dtype=np.float64)) - noise_power) / noise_power)
@@ -34,14 +34,14 @@ def expected_snr_from_powers(signal_e: NDArray[np.floating], dark_e: float, read
 def signal_scale_for_snr(
     relative_signal: NDArray[np.floating], snr: float, dark_e: float, read_noise_e: float
 ) -> float:
-    """Return the factor that turns a relative signal into electrons of which eq. (4) gives `snr`.
+    """Return the factor from a relative signal to electrons for which eq. (4) gives `snr`.
 
     With μ = a m, `expected_snr_from_powers` is quadratic in a: `a² <m²> + a <m> (1 + 2 d) = SNR (d² + d + σ²)`.
 
     Raises
     ------
     ValueError
-        The signal is nowhere positive, or there is no noise to compare with.
+        The mean signal is not positive, or there is no noise.
     """
     m = np.asarray(relative_signal, np.float64)
     square, linear = np.mean(m**2), np.mean(m) * (1 + 2 * dark_e)
@@ -66,19 +66,19 @@ def noise_variance_e2(
 
 
 def snr_linear(photons: float, *, quantum_efficiency: float, read_noise_e: float) -> float:
-    """Return eq. (7), the paper's linear SNR `η Φ_o t / σ²`, of `photons` = Φ_o t per pixel and exposure."""
+    """Return eq. (7), the paper's linear SNR `η Φ_o t / σ²`, for `photons` = Φ_o t per pixel and exposure."""
     return quantum_efficiency * photons / read_noise_e**2
 
 
 def photons_from_linear_snr(snr: float, *, quantum_efficiency: float, read_noise_e: float) -> float:
-    """Return the photons per pixel that eq. (7) reads from an SNR, the paper's figure (3.84 at SNR 0.16)."""
+    """Return the photons per pixel from an SNR by eq. (7), as in the paper (3.84 at SNR 0.16)."""
     return snr * read_noise_e**2 / quantum_efficiency
 
 
 def photons_from_moments(snr: float, *, quantum_efficiency: float, read_noise_e: float, dark_e: float = 0.0) -> float:
     """Return the photons per pixel of a uniform object for which eq. (4) gives `snr` (1.9 at SNR 0.16).
 
-    Eq. (4) is a ratio of powers while eq. (7) is linear in the signal; this is the one that counts photons.
+    Eq. (4) is a ratio of powers while eq. (7) is linear in the signal; only this function returns the true number.
     """
     return signal_scale_for_snr(np.ones(1), snr, dark_e, read_noise_e) / quantum_efficiency
 
@@ -86,7 +86,7 @@ def photons_from_moments(snr: float, *, quantum_efficiency: float, read_noise_e:
 def mean_square_error(plane: Image, truth: Image, region: NDArray[np.bool_] | None = None) -> float:
     """Return the mean square difference of two planes over a region, both divided by the truth's maximum there.
 
-    The object is so scaled to 0…1; the reconstruction is not fitted to the truth in any way.
+    This scales the object to 0…1; the reconstruction is not fitted to the truth.
     """
     where = np.ones(truth.shape, bool) if region is None else region
     peak = float(np.max(truth[where]))

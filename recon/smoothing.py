@@ -1,17 +1,16 @@
-"""A small blur: scipy.ndimage would do it, at 20 MB of code in the memory of every reconstruction."""
+"""A small blur. scipy.ndimage has one, but would add 20 MB to the memory of every reconstruction."""
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image
 
+def blurred(image: NDArray[np.floating], spacings: Sequence[int]) -> NDArray[np.floating]:
+    """Return an image (row, column) averaged with its neighbours; edges are repeated.
 
-def blurred(image: Image, spacings: Sequence[int]) -> Image:
-    """Return an image (row, column) averaged with its neighbours, its edges repeated.
-
-    For each spacing d in turn, every sample becomes ¼, ½, ¼ of those d before it, itself, and d after it, along rows
-    and columns. That is nearly a Gaussian of variance `Σ d²/2`.
+    For each spacing d in turn, every sample becomes the mean of the samples d before it, itself and d after it, with
+    weights ¼, ½ and ¼, along rows and columns. The result is nearly that of a Gaussian of variance `Σ d²/2`.
     """
     for spacing in spacings:
         for axis in (0, 1):

@@ -1,4 +1,4 @@
-"""Threads that stay between calls: to start one takes as long as a step on a small plane."""
+"""Threads that are kept between calls: starting one takes as long as a step on a small plane."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -11,14 +11,14 @@ def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "recon")
 
 
-# A forked process has the pools, but not their threads
+# A forked process inherits the pools, but not their threads
 register_after_fork(_pool, lambda pools: pools.cache_clear())
 
 
-def at_once[Part, Result](work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
-    """Call `work` on all parts at the same time, on the first in the caller's own thread; return in their order.
+def run_in_threads[Part, Result](work: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Call `work` on all parts in parallel, on the first in the caller's own thread; return the results in order.
 
-    `work` must not come back here: it would wait for threads that wait for it.
+    `work` must not call this function: it would wait for threads that wait for it.
     """
     if len(parts) == 1:
         return [work(parts[0])]
@@ -26,5 +26,5 @@ def at_once[Part, Result](work: Callable[[Part], Result], parts: Sequence[Part])
     try:
         first = work(parts[0])
     finally:
-        wait(others)  # nobody may still be writing when an interrupt is answered
+        wait(others)  # no thread may still be writing when an interrupt is handled
     return [first, *(other.result() for other in others)]

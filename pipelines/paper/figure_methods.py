@@ -9,8 +9,8 @@ import numpy as np
 
 from faintfield.pipelines.reconstruction.planes import Method, Settings, solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.solver.starts import back_projection
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.initialization import back_projection
 
 
 @dataclass(frozen=True)

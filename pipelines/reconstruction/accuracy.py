@@ -15,7 +15,7 @@ from faintfield.pipelines.reconstruction.channels import OperatorFactory, channe
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
 from faintfield.pipelines.reconstruction.planes import Method
 from faintfield.recon.metrics import mean_square_error, peak_snr_db
-from faintfield.recon.solver.starts import back_projection
+from faintfield.recon.solver.initialization import back_projection
 
 METRICS_FILE = "metrics.json"
 

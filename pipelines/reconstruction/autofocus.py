@@ -11,7 +11,7 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_latt
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
 from faintfield.pipelines.reconstruction.depth_map import Compared, compared_depths
-from faintfield.recon.depth.best_focus import LEAST_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.best_focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus
 
 # Depths of a search, and around a plane that it found; searches, each in the range where the one before found anything.
@@ -72,7 +72,7 @@ def best_focus(loaded: LoadedSet, out: Path, range_mm: tuple[float, float] | Non
         compared = _searched(loaded, out, *ranges[-1])
         found = compared.depth_map()
         sure = found.confidence >= SURE
-        if np.count_nonzero(sure) < LEAST_SAMPLES:
+        if np.count_nonzero(sure) < MIN_SAMPLES:
             raise _nothing(ranges[0])
         first, last = np.quantile(found.index[sure], _MOST_OF_THE_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
         if last - first > _WORTH_ANOTHER * _DEPTHS:
@@ -158,6 +158,6 @@ def _refined(loaded: LoadedSet, out: Path, compared: Compared, place: NDArray[np
 def _nothing(range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
         f"between {range_mm[0]:.4g} and {range_mm[1]:.4g} mm there is no depth at which the views agree on at least "
-        f"{LEAST_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep-mm "
+        f"{MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep-mm "
         "FIRST:LAST:COUNT, more light, or --depth-mm"
     )

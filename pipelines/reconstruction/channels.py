@@ -18,8 +18,8 @@ from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, noise_of_
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, binned
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.operator.scene import SceneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")

@@ -20,7 +20,7 @@ from faintfield.pipelines.formats.results.plane_files import vouched_for
 from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
 from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
 from faintfield.pipelines.reconstruction.planes import Method
-from faintfield.recon.depth.agreement import Agreement, DepthMap, agreement, bins_for, depth_map
+from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.best_focus import SURE
 
 LEAST_DEPTHS = 5
@@ -61,7 +61,7 @@ class Compared:
     depths_mm: Sequence[float]
     bins_px: int
 
-    def depth_map(self) -> DepthMap:
+    def depth_map(self) -> DepthEstimate:
         """Return where each sample is sharp."""
         return depth_map(self.planes, np.asarray(self.depths_mm))
 

@@ -14,7 +14,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity, transmission
-from faintfield.recon.solver.problem import PosedScene
+from faintfield.recon.solver.problem import SceneProblem
 
 # What is computed of each pixel of each view for all planes together: what it sees, of ones and of light, and ratios.
 _ARRAYS_OF_IMAGES = 5
@@ -44,7 +44,7 @@ def solve_together(
     """
     _require_memory(images, len(grids) if "occlusion" in methods else 0)
     operator = factory.of_scene(grids)
-    objective = Objective.of(PosedScene(operator, images), settings)
+    objective = Objective.of(SceneProblem(operator, images), settings)
     joint = certified(objective, settings)
     found: dict[Method, list[Solution]] = {"joint": joint}
     if "occlusion" in methods:
@@ -64,7 +64,7 @@ def _require_memory(images: ElementalImages, masks: int) -> None:
 
 def _with_occlusion(
     factory: OperatorFactory,
-    objective: Objective[PosedScene],
+    objective: Objective,
     grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
     settings: Settings,

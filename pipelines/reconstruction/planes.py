@@ -7,14 +7,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
-from faintfield.recon.likelihood.likelihoods import likelihood_of, negative_log_likelihood
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.solver.cross_validation import LEAST_VIEWS, chosen_weight
-from faintfield.recon.solver.one_step_late import Step, oscillates, pmlem_one_step_late, settled, updated_samples
+from faintfield.recon.likelihood.selection import select_likelihood
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_weight
+from faintfield.recon.solver.initialization import (
+    back_projection,
+    smooth_start,
+    universal_penalty_weight,
+    well_seen_samples,
+)
+from faintfield.recon.solver.one_step_late import (
+    IterationStep,
+    oscillates,
+    pmlem_one_step_late,
+    settled,
+    updated_samples,
+)
 from faintfield.recon.solver.penalties import Penalty, PenaltyName, total_variation
-from faintfield.recon.solver.pmlem import Dual, PmlemIterate, pmlem
-from faintfield.recon.solver.problem import PosedPlane, PosedScene
-from faintfield.recon.solver.starts import back_projection, smooth_start, universal_penalty_weight, well_seen_samples
+from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.problem import SceneProblem
+from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import standard_deviation
 
 type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
@@ -94,19 +106,19 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
         plane = back_projection(operator, images)
         return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
     if method == "pmlem":
-        return certified(Objective.of(PosedPlane(operator, images), settings), settings)[0]
+        return certified(Objective.of(SceneProblem(operator, images), settings), settings)[0]
     start = smooth_start(operator, images)
-    images = replace(images, likelihood=likelihood_of(images, settings.likelihood, _level_e(operator, start)))
+    images = replace(images, likelihood=select_likelihood(images, settings.likelihood, _level_e(operator, start)))
     return _one_step_late(operator, images, start, method, settings)
 
 
 @dataclass(frozen=True)
-class Objective[Posed: (PosedPlane, PosedScene)]:
+class Objective:
     """What PMLEM minimises, but for the penalty's weight.
 
     Attributes
     ----------
-    posed : PosedPlane or PosedScene
+    posed : SceneProblem
         The operator, and the images with the likelihood they are judged by.
     penalty : Penalty
         What is held against planes.
@@ -116,17 +128,17 @@ class Objective[Posed: (PosedPlane, PosedScene)]:
         Mean light of what the views see.
     """
 
-    posed: Posed
+    posed: SceneProblem
     penalty: Penalty
     start: Image
     level_e: float
 
     @classmethod
-    def of(cls, posed: Posed, settings: Settings) -> "Objective[Posed]":
+    def of(cls, posed: SceneProblem, settings: Settings) -> "Objective":
         """Choose likelihood and penalty as asked for, by the level of light and noise."""
         start = posed.start()
         level_e = posed.level_e(start)
-        likelihood = likelihood_of(posed.images, settings.likelihood, level_e)
+        likelihood = select_likelihood(posed.images, settings.likelihood, level_e)
         posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
 
         def noise_e() -> float:
@@ -135,7 +147,7 @@ class Objective[Posed: (PosedPlane, PosedScene)]:
         return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
 
 
-def certified(objective: Objective[PosedPlane] | Objective[PosedScene], settings: Settings) -> list[Solution]:
+def certified(objective: Objective, settings: Settings) -> list[Solution]:
     """Run PMLEM to its certificate, and return the planes; the record of each is that of the one iteration."""
     posed, penalty, level_e = objective.posed, objective.penalty, objective.level_e
     choice = _chosen(posed, objective.start, penalty, settings)
@@ -193,24 +205,24 @@ class _Choice:
     weight: float
     how: str
     start: Image
-    dual: Dual
+    dual: DualField
     passes: float = 0.0
     curve: list[dict[str, float]] | None = None
 
 
-def _chosen(posed: PosedPlane | PosedScene, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
+def _chosen(posed: SceneProblem, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
     """Return the penalty weight for PMLEM."""
     if settings.penalty == "none":
         return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
         return _Choice(settings.penalty_weight, "given", start, posed.dual())
     guess = posed.usual_weight(start)
-    if len(posed.views) < LEAST_VIEWS:
+    if len(posed.views) < MIN_VIEWS:
         return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
-    found = chosen_weight(posed, guess, penalty)
-    curve = [{"weight": tried.weight, "held_out": tried.held_out} for tried in found.tried]
-    nearest = np.maximum(found.nearest.plane, 1e-3 * start)
-    return _Choice(found.weight, "predicts held-out views best", nearest, found.nearest.dual, found.passes, curve)
+    found = cross_validated_weight(posed, guess, penalty)
+    curve = [{"weight": tried.weight, "held_out": tried.loss} for tried in found.candidates]
+    nearest = np.maximum(found.solution.plane, 1e-3 * start)
+    return _Choice(found.weight, "predicts held-out views best", nearest, found.solution.dual, found.passes, curve)
 
 
 def _level_e(operator: PlaneOperator, start: Image) -> float:
@@ -224,14 +236,14 @@ def _one_step_late(
     """Run MLEM or one-step-late PMLEM as published."""
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
     weight, chosen = _penalty_weight(operator, images, start, method, settings)
-    steps: list[Step] = []
+    steps: list[IterationStep] = []
     limit = settings.passes or _PASSES[method]
     for iterate in pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon):
         steps.append(iterate.step)
         if len(steps) >= limit or settled(steps, _SETTLED):
             break
     plane = iterate.plane
-    objective = negative_log_likelihood(operator, plane, images) + weight * total_variation(plane, epsilon)
+    objective = operator.negative_log_likelihood(plane, images) + weight * total_variation(plane, epsilon)
     record = _record(plane, weight, chosen, len(steps), epsilon, objective)
     record["likelihood"] = images.likelihood.name
     record["certificate"] = {

@@ -17,11 +17,11 @@ from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.joint import solve_together
 from faintfield.pipelines.reconstruction.planes import TOGETHER, Method, Settings, Solution, solve
-from faintfield.recon.depth.focus import Focus, focus_measure, sharp_depths_mm
+from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 
 
 @dataclass(frozen=True)
@@ -268,7 +268,7 @@ def _where(place: Place) -> dict[str, Any]:
     return {"depth_mm": place}
 
 
-def _sum(of_channels: Sequence[dict[str, float]]) -> Focus:
+def _sum(of_channels: Sequence[dict[str, float]]) -> FocusMeasure:
     """Return what all channels together say of a depth."""
     detail_e2 = sum(focus["detail_e2"] for focus in of_channels)
-    return Focus(detail_e2, float(np.linalg.norm([focus["sigma_e2"] for focus in of_channels])))
+    return FocusMeasure(detail_e2, float(np.linalg.norm([focus["sigma_e2"] for focus in of_channels])))

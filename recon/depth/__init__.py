@@ -1,1 +1,1 @@
-"""How far away things are: how well the views agree, focus, and the planes of best focus."""
+"""Depth of objects: agreement of the views, focus, and planes of best focus."""

@@ -1,54 +1,57 @@
-"""The planes of best focus of a sweep: depths at which much of the picture lies, each as the views like it best."""
+"""The planes of best focus of a sweep: depths at which much of the picture lies, refined by the views' agreement."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.depth.agreement import Agreement, DepthMap
+from faintfield.recon.depth.agreement import Agreement, DepthEstimate
 from faintfield.recon.depth.focus import prominence
 
-# Samples count whose depth is as probable as this.
+# Smallest probability of a sample's depth for the sample to count.
 SURE = 0.9
 
-# Fewer samples than these say nothing: a number, and a part of those that are sure.
-LEAST_SAMPLES = 12
-_LEAST_SHARE, _LEAST_PROMINENCE = 0.02, 0.1
+# Fewest samples of a plane: a number, and a fraction of the sure samples.
+MIN_SAMPLES = 12
+_MIN_SHARE = 0.02
 
-# A plane's samples are those within so many steps of it.
+# Smallest prominence of a peak, relative to the highest peak.
+_MIN_PROMINENCE = 0.1
+
+# Largest distance of a plane's samples from it, in steps of the sweep.
 _REACH = 1.5
 
 
-def places_of_focus(found: DepthMap, planes: int) -> list[NDArray[np.bool_]]:
+def places_of_focus(found: DepthEstimate, planes: int) -> list[NDArray[np.bool_]]:
     """Return the samples (row, column) of each depth at which much of the picture lies, in the order of depths.
 
-    That is each peak of the sure samples' distribution over depth that stands out by a tenth of the highest, with at
-    least one in fifty of these samples. None are found where fewer than `LEAST_SAMPLES` are sure.
+    These are the peaks of the sure samples' distribution over depth that stand out by a tenth of the highest and hold
+    at least one in fifty of these samples. There are none if fewer than `MIN_SAMPLES` samples are sure.
 
     Parameters
     ----------
-    found : DepthMap
-        Of a sweep.
+    found : DepthEstimate
+        Depths from a sweep.
     planes : int
-        How many planes the sweep has.
+        Number of planes of the sweep.
     """
     sure = found.confidence >= SURE
-    if np.count_nonzero(sure) < LEAST_SAMPLES:
+    if np.count_nonzero(sure) < MIN_SAMPLES:
         return []
     counts = np.convolve(np.bincount(np.rint(found.index[sure]).astype(int), minlength=planes), (0.25, 0.5, 0.25))[1:-1]
-    least = max(LEAST_SAMPLES, _LEAST_SHARE * np.count_nonzero(sure))
-    peaks = [peak for peak in range(planes) if prominence(counts, peak) > _LEAST_PROMINENCE * counts.max()]
+    fewest = max(MIN_SAMPLES, _MIN_SHARE * np.count_nonzero(sure))
+    peaks = [peak for peak in range(planes) if prominence(counts, peak) > _MIN_PROMINENCE * counts.max()]
     places = [sure & (np.abs(found.index - peak) <= _REACH) for peak in peaks]
-    return [place for place in places if np.count_nonzero(place) >= least]
+    return [place for place in places if np.count_nonzero(place) >= fewest]
 
 
 def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], place: NDArray[np.bool_]) -> float:
-    """Return the one depth at which the views agree best on all samples of a place, by a parabola between depths.
+    """Return the depth at which the views agree best on all samples of a place, by a parabola between depths.
 
     Parameters
     ----------
     planes : sequence of Agreement
-        What the views say at each depth, on samples one angle apart.
+        Agreement at each depth, on samples of the same angular pitch.
     depths_mm : sequence of float
         The depths, in equal steps of 1/depth.
     place : bool array (row, column)

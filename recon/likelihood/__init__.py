@@ -1,1 +1,1 @@
-"""What a pixel's number says of its light: elemental images, pixel models, likelihoods."""
+"""Elemental images and the statistical models of their pixels."""

@@ -1,4 +1,4 @@
-"""The data of a reconstruction: the elemental images of one scene in electrons, and what is known of their noise."""
+"""The data of a reconstruction: the elemental images of one scene in electrons, and the statistics of their noise."""
 
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
@@ -20,18 +20,18 @@ _MODELS = {
 
 
 @dataclass(frozen=True)
-class Likelihood:
-    """By which model of its statistics a pixel is judged, see `recon.likelihood.pixel_models`.
+class PixelLikelihood:
+    """The statistical model of a pixel, see `recon.likelihood.pixel_models`.
 
     Parameters
     ----------
     name : str
-        "poisson" ignores the read noise, and takes negative numbers for zero.
+        The model; "poisson" ignores the read noise, and takes negative numbers for zero.
     level_e : float
-        Electrons of light at which least squares takes the variance of a pixel of response one; the others ignore it.
+        Light at which least squares takes the variance of a pixel of response one; other models ignore it.
     read_noise_share : float
-        What part of σ² counts as variance where the exact model tells counts apart: a pixel informs of its mean as if
-        its variance were `λ + share · σ²`. Solvers take their metric from it; the likelihood itself does not need it.
+        Fraction of σ² that counts as variance where the exact model tells counts apart: the information of a pixel
+        about its mean is that of a variance `λ + share · σ²`. Solvers use it in their metric; the likelihood does not.
     """
 
     name: LikelihoodName = "shifted-poisson"
@@ -53,22 +53,22 @@ class Likelihood:
 class ElementalImages:
     """All views of one scene, `g` of eq. (1), with the known part of their statistics.
 
-    A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of a colour of a mosaic lie on *lattices* of every
-    second pixel, say; each view then appears once per lattice, and maps are given per lattice. Which view lies on which
-    lattice, and where that looks, the operator knows.
+    A view's pixels are `Poisson(H f + b) + N(0, σ²)`. The images of one colour of a mosaic lie on *lattices* (of every
+    second pixel, for example); each view then appears once per lattice, and maps are given per lattice. The operator
+    knows the lattice of each view and its rays.
 
     Parameters
     ----------
     electrons : float array (view, row, column)
-        Offset removed and divided by the gain; negative values are meant, dark current is not subtracted.
+        Offset removed and divided by the gain; values may be negative, dark current is not subtracted.
     background_e : float or array broadcastable to (lattice, row, column)
         b: expected electrons that are not light of the scene (dark current times exposure).
     read_variance_e2 : float or array broadcastable to (lattice, row, column)
-        σ²: variance that is there without any electron.
+        σ²: variance without any electron.
     valid : bool array (view, row, column), optional
-        False where a pixel carries no number (saturated, say); the operator must have been made with the same.
-    likelihood : Likelihood
-        How the numbers are judged.
+        False where a pixel has no valid number (is saturated, for example); the operator must be made with the same.
+    likelihood : PixelLikelihood
+        The statistical model of the numbers.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class ElementalImages:
     background_e: float | Image = 0.0
     read_variance_e2: float | Image = 0.0
     valid: NDArray[np.bool_] | None = None
-    likelihood: Likelihood = field(default_factory=Likelihood)
+    likelihood: PixelLikelihood = field(default_factory=PixelLikelihood)
 
     def __post_init__(self) -> None:
         if self.electrons.ndim != 3:
@@ -93,10 +93,10 @@ class ElementalImages:
                 raise ValueError(f"view {view} has {np.count_nonzero(~finite)} pixels that are not finite numbers")
 
     def binned(self, bins: int) -> "ElementalImages":
-        """Return the images with `bins` by `bins` pixels added up, as one pixel of a coarser detector would count them.
+        """Return the images with `bins` by `bins` pixels added up, as a detector of larger pixels would count them.
 
-        A sum of Poisson counts is one, and so is a sum of read noises: all that is said of images holds for these. A
-        bin counts where all its pixels are `valid`; pixels that never count are the operator's to leave out.
+        Sums of Poisson counts are Poisson, and sums of normal read noises normal, so the statistics stay the same. A
+        bin counts if all its pixels are `valid`; the operator leaves out pixels that never count.
         """
         if bins == 1:
             return self
@@ -109,13 +109,13 @@ class ElementalImages:
         return replace(self, electrons=electrons, background_e=background_e, read_variance_e2=variance_e2, valid=valid)
 
     def known_variance_e2(self) -> float | Image:
-        """Return b + σ², the variance of a pixel beside that of the light, as far as the likelihood counts it."""
+        """Return b + σ², the variance of a pixel without that of the light, as far as the likelihood counts it."""
         share = self.likelihood.read_noise_share if self.likelihood.knows_read_noise else 0.0
         return self.background_e + share * self.read_variance_e2
 
 
 def binned(maps: NDArray[Any], bins: int) -> NDArray[Any]:
-    """Return the means of bins of maps (…, row, column), without what is left at the far edges."""
+    """Return the means of bins of maps (…, row, column); a remainder at the far edges is dropped."""
     rows, columns = (size // bins for size in maps.shape[-2:])
     whole = maps[..., : rows * bins, : columns * bins]
     return np.asarray(whole.reshape(*maps.shape[:-2], rows, bins, columns, bins).mean(axis=(-3, -1)))

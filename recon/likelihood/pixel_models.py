@@ -1,15 +1,14 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""What a pixel's number says of the light it was expected to see: each model's ratio and negative log-likelihood.
+"""The statistical models of a pixel, compiled: each model's ratio and negative log-likelihood.
 
 For a pixel that reads g where λ = (H f) + b is expected, a model gives the *ratio* r, such that the derivative of its
 negative log-likelihood with respect to (H f) is 1 − r, and that negative log-likelihood itself, up to a constant.
-`Poisson(λ) + N(0, σ²)` is the truth; the models are ways to deal with it:
+`Poisson(λ) + N(0, σ²)` is the truth; the models approximate it:
 
 - shifted Poisson: `y = (g + σ²)₊` is taken for Poisson of mean `m = λ + σ²`. r = y/m, value `m − y + y ln(y/m)`.
   With σ = 0 it is Poisson.
 - Poisson–Gaussian: exact. r = E[N | g, λ]/λ, value −ln p(g | λ).
-- least squares: r = 1 + (g − λ)/v, value `(g − λ)²/(2v)`, with v the variance that the pixel has at a stated level of
-  light.
+- least squares: r = 1 + (g − λ)/v, value `(g − λ)²/(2v)`, with v the variance of the pixel at a given level of light.
 """
 
 import numpy as np
@@ -22,12 +21,17 @@ SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES = 0, 1, 2
 # Rows of the workspace that `form_ratio` needs, each of a block's length.
 WORK_ROWS = 8
 
-# Less read noise than this (0.03 electrons) is as good as none, and would overflow.
-_LEAST_VARIANCE_E2 = 1e-3
-_LEAST_MEAN_E = 1e-30
+# Smallest variance of the read noise (0.03 electrons): less makes no difference, and would overflow.
+_MIN_VARIANCE_E2 = 1e-3
 
-# How many standard deviations (and counts) around its mode the sum over the count goes: what is left out is below 1e-7.
+# Smallest expected count, so that its logarithm is finite.
+_MIN_MEAN_E = 1e-30
+
+# Standard deviations, and counts beyond them, that the sum includes on either side of the mode.
+# What it omits is below 1e-7.
 _SPREADS, _EXTRA = 6.5, 4
+
+# Newton steps to the mode.
 _NEWTON_STEPS = 6
 
 
@@ -44,7 +48,7 @@ def form_ratio(model, expected, observed, background, variance, response, level,
     observed, background, variance : array (pixel,)
         g, b and σ².
     response : array (pixel,)
-        Relative response; a pixel of response zero does not count, its ratio is left without meaning.
+        Relative response; a pixel of response zero does not count, and its ratio is meaningless.
     level : number
         Expected light of a pixel of response one, for the variance of least squares.
     work : array (WORK_ROWS, pixels or more)
@@ -66,7 +70,7 @@ def form_ratio(model, expected, observed, background, variance, response, level,
 
 @compiled
 def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work, with_value):
-    """Do as `form_ratio` does, with pointers to `count` numbers each; the value may be left out where it costs."""
+    """Do what `form_ratio` does, with pointers to `count` numbers each; without the value where that saves time."""
     if model == POISSON_GAUSSIAN:
         return _poisson_gaussian(count, expected, observed, background, variance, response, work)
     if model == LEAST_SQUARES:
@@ -117,7 +121,7 @@ def _least_squares(count, expected, observed, background, variance, response, le
 
 @compiled
 def _poisson_gaussian(count, expected, observed, background, variance, response, work):
-    """Sum over the count N outwards from the likeliest, each term from its neighbour by one multiplication."""
+    """Sum over the count N outwards from its mode; each term follows from its neighbour by one multiplication."""
     number = type(expected[0])
     zero, one, half, limit = number(0), number(1), number(0.5), number(80)
     mode, mean = work, advanced(work, count)
@@ -125,10 +129,10 @@ def _poisson_gaussian(count, expected, observed, background, variance, response,
     term, shrink = advanced(step, count), advanced(step, index(2) * count)
     mass, moment = advanced(shrink, count), advanced(shrink, index(2) * count)
     for k in range(count):
-        mean[k] = max(expected[k] + background[k], number(_LEAST_MEAN_E))
-        sigma2[k] = max(variance[k], number(_LEAST_VARIANCE_E2))
+        mean[k] = max(expected[k] + background[k], number(_MIN_MEAN_E))
+        sigma2[k] = max(variance[k], number(_MIN_VARIANCE_E2))
         shrink[k] = exponential(-one / sigma2[k])
-    widest = _likeliest_counts(count, mode, observed, mean, sigma2, response, step)
+    widest = _modes(count, mode, observed, mean, sigma2, response, step)
     reach = int(_SPREADS * np.sqrt(widest)) + _EXTRA
     for k in range(count):
         mass[k], moment[k], term[k] = one, zero, one
@@ -150,7 +154,7 @@ def _poisson_gaussian(count, expected, observed, background, variance, response,
 
 @compiled
 def _sum_upwards(count, reach, mode, step, shrink, term, mass, moment):
-    """Add the terms of the counts above the mode to `mass`, and times their distance to `moment`."""
+    """Add the terms of the counts above the mode to `mass`, and their products with the distance to `moment`."""
     for away in range(1, reach + 1):
         distance = type(step[0])(away)
         for k in range(count):
@@ -162,7 +166,7 @@ def _sum_upwards(count, reach, mode, step, shrink, term, mass, moment):
 
 @compiled
 def _sum_downwards(count, reach, mode, step, shrink, term, mass, moment):
-    """Likewise for the counts below; a term is zero at a count of −1, and from there on."""
+    """Add the terms of the counts below the mode likewise; terms are zero from a count of −1 on."""
     for away in range(1, reach + 1):
         distance = type(step[0])(away)
         for k in range(count):
@@ -173,11 +177,11 @@ def _sum_downwards(count, reach, mode, step, shrink, term, mass, moment):
 
 
 @compiled
-def _likeliest_counts(count, mode, observed, mean, sigma2, response, target):
+def _modes(count, mode, observed, mean, sigma2, response, target):
     """Set `mode` to the N that maximises λᴺ/N! exp(−(g − N)²/2σ²); return the largest variance of N given g.
 
-    It is the whole part of the root of n + σ² ln n = g + σ² ln λ + ½, and zero where that root is below one. Newton's
-    steps from the left of the root of a concave increasing function stay left of it.
+    The mode is the integer part of the root of n + σ² ln n = g + σ² ln λ + ½, and zero where that root is below one.
+    Newton steps on a concave increasing function stay to the left of its root if they start there.
     """
     number = type(mode[0])
     zero, one = number(0), number(1)
@@ -199,7 +203,7 @@ def _likeliest_counts(count, mode, observed, mean, sigma2, response, target):
 
 @compiled
 def _log_factorial_over_power(n, mean):
-    """Return ln(n!) − n ln λ by Stirling's series, arranged so that large parts cancel before they are added."""
+    """Return ln(n!) − n ln λ by Stirling's series, arranged so that large terms cancel before they are added."""
     number = type(n)
     one = number(1)
     at_least_one = max(n, one)

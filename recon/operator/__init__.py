@@ -1,1 +1,1 @@
-"""H: what each detector pixel of each view sees of a scene, and the exact adjoint."""
+"""The operator H, which maps the planes of a scene to the pixels of each view, and its exact adjoint."""

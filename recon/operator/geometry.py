@@ -1,4 +1,4 @@
-"""The pieces of a scene operator, checked and brought into the form that the kernels read."""
+"""The arguments of a scene operator, checked and converted to the arrays that the kernels read."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.operator.blocks import BLOCK_PX
+from faintfield.recon.operator.block_layout import BLOCK_PX
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.kernels import Geometry
+from faintfield.recon.operator.kernels import SceneGeometry
 
 
-def checked_geometry(
+def scene_geometry(
     plane_from_ray: NDArray[Any],
     rays: NDArray[Any],
     grids: Sequence[PlaneGrid],
@@ -21,10 +21,8 @@ def checked_geometry(
     transmission: NDArray[Any] | None,
     lattice_of_view: NDArray[np.intp] | None,
     dtype: np.dtype[Any],
-) -> Geometry:
-    """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2), refusing what does not fit.
-
-    Its `reach` is all of each row, until the kernels have found it.
+) -> SceneGeometry:
+    """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2); `reach` covers whole rows.
 
     Raises
     ------
@@ -41,44 +39,76 @@ def checked_geometry(
     flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     transmission = np.zeros((0, 0, 0, 0), dtype) if transmission is None else np.ascontiguousarray(transmission, dtype)
-    lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
     _check_pixels(flat, valid, transmission, (planes, views, lattices, *detector))
+    lattice_of_view = _checked_lattices(lattice_of_view, views, lattices)
+    _check_finite(plane_from_ray, rays, flat, transmission)
+    return SceneGeometry(
+        _homographies(plane_from_ray, grids, dtype),
+        _layout(grids),
+        lattice_of_view,
+        (int(detector[0]), int(detector[1]), _padded(detector[1])),
+        _maps(rays, flat, dtype),
+        valid.reshape(-1).view(np.uint8),
+        transmission.reshape(-1),
+        np.broadcast_to(np.array([0, _padded(detector[1])], np.intp), (views, int(detector[0]), 2)).copy(),
+    )
+
+
+def _check_finite(*parts: NDArray[Any]) -> None:
+    """Refuse numbers that are not finite."""
+    if not all(np.isfinite(part).all() for part in parts):
+        raise GeometryMismatch(
+            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
+        )
+
+
+def _padded(columns: int) -> int:
+    """Return the columns of whole blocks."""
+    return -(-columns // BLOCK_PX) * BLOCK_PX
+
+
+def _homographies(plane_from_ray: NDArray[Any], grids: Sequence[PlaneGrid], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the homographies from rays to sample indices (plane × view × 9,)."""
+    homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
+    return np.ascontiguousarray(homographies, dtype).reshape(-1)
+
+
+def _layout(grids: Sequence[PlaneGrid]) -> NDArray[np.intp]:
+    """Return the first sample, rows and columns of each plane (plane, 3)."""
+    starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
+    return np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp)
+
+
+def _maps(rays: NDArray[Any], flat: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return rays and response, padded to whole blocks (3 × lattice × row × padded column,)."""
+    lattices, rows, columns = rays.shape[:3]
+    maps = np.full((3, lattices, rows, _padded(columns)), np.nan, dtype)
+    maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
+    return maps.reshape(-1)
+
+
+def _checked_lattices(lattice_of_view: NDArray[np.intp] | None, views: int, lattices: int) -> NDArray[np.intp]:
+    """Return the lattice of each view (view,), and refuse lattices that do not exist."""
+    lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(
             f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} "
             "lattices, counted from 0"
         )
-    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat, transmission)):
-        raise GeometryMismatch(
-            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
-        )
-    homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
-    starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
-    padded = -(-detector[1] // BLOCK_PX) * BLOCK_PX
-    maps = np.full((3, lattices, detector[0], padded), np.nan, dtype)
-    maps[..., : detector[1]] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, *detector))
-    return Geometry(
-        np.ascontiguousarray(homographies, dtype).reshape(-1),
-        np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp),
-        lattice_of_view,
-        (int(detector[0]), int(detector[1]), padded),
-        maps.reshape(-1),
-        valid.reshape(-1).view(np.uint8),
-        transmission.reshape(-1),
-        np.broadcast_to(np.array([0, padded], np.intp), (views, int(detector[0]), 2)).copy(),
-    )
+    return lattice_of_view
 
 
 def _check_pixels(
     flat: NDArray[Any], valid: NDArray[Any], transmission: NDArray[Any], sizes: tuple[int, int, int, int, int]
 ) -> None:
-    """Refuse what is known of pixels when its shape or sign is wrong."""
+    """Refuse maps of pixels of the wrong shape or sign."""
     planes, views, lattices, *detector = sizes
     if valid.size and valid.shape != (views, *detector):
-        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}; give it that")
+        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}; give it that shape")
     if transmission.size and transmission.shape != (planes, views, *detector):
         raise GeometryMismatch(
-            f"transmission has shape {transmission.shape}, the planes' views {(planes, views, *detector)}; give it that"
+            f"transmission has shape {transmission.shape}, the planes' views {(planes, views, *detector)}; "
+            "give it that shape"
         )
     if flat.shape not in ((1, *detector), (lattices, *detector)):
         raise GeometryMismatch(

@@ -1,4 +1,4 @@
-"""The samples of a plane: where they lie, and how many there are."""
+"""The samples of a plane: their number and positions."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ class PlaneGrid:
     shape : (int, int)
         Rows and columns.
     pitch_mm : float
-        Distance of neighbouring samples.
+        Distance between neighbouring samples.
     origin_mm : (float, float)
         x, y of the first sample's centre.
 
@@ -40,12 +40,12 @@ class PlaneGrid:
 
     @classmethod
     def covering(cls, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, pitch_mm: float) -> "PlaneGrid":
-        """Return the grid whose samples, each a square of `pitch_mm`, tile the rectangle of the given outer edges."""
+        """Return the grid whose samples, squares of `pitch_mm`, tile the rectangle with the given edges."""
         rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
         return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
 
     def binned(self, bins: int) -> "PlaneGrid":
-        """Return the grid whose samples each cover `bins` by `bins` of these, without what is left at the far edges."""
+        """Return the grid whose samples each cover `bins` by `bins` of these, without a remainder at the far edges."""
         first = tuple(origin + self.pitch_mm * (bins - 1) / 2 for origin in self.origin_mm)
         return PlaneGrid((self.shape[0] // bins, self.shape[1] // bins), self.pitch_mm * bins, (first[0], first[1]))
 

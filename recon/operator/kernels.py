@@ -1,12 +1,12 @@
 # mypy: disable-error-code="no-untyped-def"
-# The types of compiled functions are numba's business: each call compiles them for what it is given.
-"""The sweep of the operator, compiled: gather, ratio and scatter of a block of pixels before the next is looked at.
+# Compiled functions have no type hints: numba compiles them for the types of each call.
+"""The sweep of the operator, compiled: gather, ratio and scatter of one block of pixels after the other.
 
-A detector row is worked through in blocks of `recon.operator.blocks.BLOCK_PX` pixels. For each block the plane coordinates of
-its pixels are computed once and used by both directions, so H and Hᵀ share their weights by construction. Nothing of
-the size views × pixels is written except by `FORWARD`.
+A detector row is processed in blocks of `BLOCK_PX` pixels. The plane coordinates of a block's pixels are computed once
+and used in both directions, so H and Hᵀ share their weights by construction. Only `FORWARD` writes anything of the size
+views × pixels.
 
-Rows of the detector are dealt out in tiles, tile `t` to worker `t mod workers`, and each worker adds into an
+Rows of the detector are distributed in tiles, tile `t` to worker `t mod workers`, and each worker adds into an
 accumulator of its own: sums are deterministic for a given number of workers.
 """
 
@@ -17,47 +17,42 @@ from numpy.typing import NDArray
 
 from faintfield.recon.elementary import compiled
 from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
-from faintfield.recon.operator.blocks import (
-    BLOCK_PX,
-    COUNTED,
-    EXPECTED,
-    copy,
-    gather,
-    locate_on_all,
-    row_wanted_soon,
-    scatter,
-    weigh,
-    weights_of,
-)
-from faintfield.recon.pointers import advanced, index, pointer, wanted_soon
+from faintfield.recon.operator.block_layout import BLOCK_PX, COUNTED, EXPECTED, weights_of
+from faintfield.recon.operator.blocks import copy, gather, prefetch_block, scatter, weigh
+from faintfield.recon.operator.placement import locate_on_all
+from faintfield.recon.pointers import advanced, index, pointer, prefetch
 
+# Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
 
 FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH = 0, 1, 2, 3, 4, 5
 
+# The operations that add to the samples.
+SCATTERING = (ADJOINT, RATIO, VALUE_AND_RATIO)
 
-class Geometry(NamedTuple):
-    """Where the detector pixels of every view meet the planes, as the kernels read it.
+
+class SceneGeometry(NamedTuple):
+    """Where the detector pixels of every view see the planes, as the kernels read it.
 
     Attributes
     ----------
     homographies : array (plane × view × 9,)
         From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous.
     layout : int array (plane, 3)
-        Where each plane's samples begin in the samples of all; its rows and columns.
+        Index of each plane's first sample among all samples, its rows and its columns.
     lattice_of_view : int array (view,)
-        Which lattice of detector pixels a view's image has.
+        The lattice of detector pixels of each view.
     detector : (int, int, int)
         Rows and columns of the images, and padded columns of the maps below.
     maps : array (3 × lattice × row × padded column,)
         The ray of each pixel, x and y at unit depth, and its response: the flat field, zero for pixels that do not
-        count in any view. Rows are padded to whole blocks with rays of NaN, which meet nothing.
+        count in any view. Rows are padded to whole blocks with rays of NaN, which see nothing.
     valid : uint8 array (view × row × column,)
         Zero for pixels that do not count in this view; of size zero when all do.
     transmission : array (plane × view × row × column,)
-        How much of a plane's light reaches a pixel; of size zero when all does.
+        Fraction of a plane's light that reaches a pixel; of size zero when all light does.
     reach : int array (view, row, 2)
-        From and up to which padded column a row's pixels meet any plane. Written by `REACH`.
+        First and past-the-last padded column at which a row's pixels see any plane. Written by `REACH`.
     """
 
     homographies: NDArray[Any]
@@ -71,14 +66,14 @@ class Geometry(NamedTuple):
 
 
 class PixelModel(NamedTuple):
-    """What is known of the numbers that pixels read, as the kernels read it.
+    """The statistics of the numbers that pixels read, as the kernels read them.
 
     Attributes
     ----------
     model : int
         One of `recon.likelihood.pixel_models`.
     background, variance : array (lattice × row × column,)
-        Expected electrons that are not light, and variance of the read noise.
+        Expected electrons that are not light of the scene, and variance of the read noise.
     level : float
         Light level at which least squares takes the variance.
     """
@@ -89,26 +84,27 @@ class PixelModel(NamedTuple):
     level: float
 
 
+# One long function: its loops share some twenty pointers and counts, which would have to be passed for every block.
 @compiled
 def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
-    """Go once over a worker's share of the detector pixels of `views`; return their negative log-likelihood.
+    """Process a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
     ----------
     operation : int
         `FORWARD`: seen ← H planes, where not zero. `ADJOINT`: accumulator += Hᵀ images.
-        `RATIO`: accumulator += Hᵀ r, with the ratio r that the model of the pixels makes of images and H planes.
-        `VALUE`: only what is returned, which has no meaning unless the operation is this or the next.
-        `VALUE_AND_RATIO`: both; the logarithms of the value are a tenth of the time.
-        `REACH`: geometry.reach ← where rows meet the planes; it must go over all views, and come first.
-        What an operation does not name, it leaves alone.
+        `RATIO`: accumulator += Hᵀ r, with the ratio r of the pixel model, from images and H planes.
+        `VALUE`: only the returned value, which is meaningful for this operation and the next alone.
+        `VALUE_AND_RATIO`: both; the logarithms of the value take a tenth of the time.
+        `REACH`: geometry.reach ← where rows see the planes; it must process all views, and come first.
+        An operation changes nothing else.
     planes, accumulator : array (sample,)
-        What is read, and what is added to: all planes, one after the other.
+        The samples that are read, and those that are added to: all planes, one after the other.
     seen, images : array (image × row × column,)
-        What is written, and what is read; view v has image `image_of_view[v]`.
+        The images that are written, and those that are read; view v has image `image_of_view[v]`.
     pixels : PixelModel
-        What is known of the pixels' numbers.
-    space : Workspace
+        Statistics of the pixels.
+    space : BlockWorkspace
         The worker's own.
     """
     rows, columns, padded = geometry.detector
@@ -148,12 +144,12 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     count = index(min(BLOCK_PX, columns - first))
                     at = index((view * rows + row) * columns + first)
                     if masked:
-                        wanted_soon(valid_at, at + index(columns))
+                        prefetch(valid_at, at + index(columns))
                         weigh(valid_at, at, index(0), count_of_planes, count, scratch)
                     if occluded:
                         weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
                     pixel = index((image * rows + row) * columns + first)
-                    row_wanted_soon(images_at, pixel + index(columns))
+                    prefetch_block(images_at, pixel + index(columns))
                     if operation == ADJOINT:
                         copy(images_at, pixel, scratch, index(EXPECTED), count)
                     else:

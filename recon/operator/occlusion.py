@@ -1,4 +1,4 @@
-"""What nearer planes hide of farther ones, from the light of the nearer ones."""
+"""How much of a plane's light nearer planes hide, judged by the light of the nearer planes."""
 
 from collections.abc import Sequence
 
@@ -6,30 +6,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.operator.scene import SceneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.smoothing import blurred
 
-# A plane is looked at with a blur of a standard deviation of about two samples: noise is not opaque.
-_LOOK, _SOFTEN = (1, 2, 2), (1,)
+# Spacings of the blurs before the light is judged, of about two samples (noise is not opaque), and after.
+_BLUR_BEFORE, _BLUR_AFTER = (1, 2, 2), (1,)
 
-# Opaque from the upper of these parts of the plane's typical light, transparent below the lower.
+# A plane is transparent below the first of these fractions of its typical light, and opaque above the second.
 _TRANSPARENT, _OPAQUE = 0.15, 0.35
 
 
 def opacity(plane: Image) -> Image:
-    """Return how opaque a plane is, 0 to 1 (row, column), judged by its light: what shines or scatters, hides.
+    """Return the opacity of a plane, 0 to 1 (row, column), judged by its light.
 
-    Typical is the mean of the light weighted by the light itself, so that an empty surround does not count. What is
-    black hides without being seen; it stays transparent. And what is fainter than a seventh of the typical passes for
-    noise, or for the blur of something at another depth.
+    The typical light is the mean of the light weighted by the light itself, so that empty surroundings do not count.
+    Black objects are taken for transparent, although they hide what is behind them. Light fainter than a seventh of the
+    typical light is taken for noise, or for the blur of something at another depth.
     """
-    light = blurred(plane, _LOOK)
+    light = blurred(plane, _BLUR_BEFORE)
     total = float(light.sum(dtype=np.float64))
     if total <= 0:
         return np.zeros_like(plane)
     typical = float(np.square(light, dtype=np.float64).sum()) / total
     share = (light / plane.dtype.type(typical) - _TRANSPARENT) / (_OPAQUE - _TRANSPARENT)
-    return np.asarray(blurred(np.clip(share, 0, 1), _SOFTEN), plane.dtype)
+    return np.asarray(blurred(np.clip(share, 0, 1), _BLUR_AFTER), plane.dtype)
 
 
 def transmission(
@@ -40,11 +40,11 @@ def transmission(
     Parameters
     ----------
     operator : SceneOperator
-        H of all planes with nothing hidden; its response is divided out.
+        H of all planes without occlusion; its response is divided out.
     opacities : sequence of float array (row, column)
         α of each plane.
     depths_mm : sequence of float
-        Of the planes.
+        Depth of each plane.
     """
     response = np.asarray(operator.map_of_views(operator.response(), operator.all_views))
     through = np.ones((len(depths_mm), *operator.images_shape), operator.dtype)
@@ -52,7 +52,8 @@ def transmission(
         farther = [index for index, other in enumerate(depths_mm) if other > depth]
         if not farther:
             continue
-        alone = [one if index == near else np.zeros_like(one) for index, one in enumerate(opacities)]
+        alone = np.zeros(operator.samples_shape, operator.dtype)
+        operator.planes_of(alone)[near][:] = opacities[near]
         seen = operator.forward(alone)
         hidden = np.divide(seen, response, out=np.zeros_like(seen), where=response > 0)
         through[farther] *= np.clip(1 - hidden, 0, 1)

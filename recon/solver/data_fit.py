@@ -1,19 +1,17 @@
-"""What the data say of a plane, as solvers ask it: value, gradient, and about how the value is curved."""
-
-from collections.abc import Sequence
+"""The likelihood of a scene as solvers use it: value, gradient, and a diagonal that bounds its curvature."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.smoothing import blurred
 
-# The metric is at least this part of its median where anything is seen: the rest is led by its neighbours.
-_LEAST_METRIC = 1e-3
+# Smallest value of the metric relative to its median over seen samples; samples below follow their neighbours.
+_MIN_METRIC = 1e-3
 
-# A sample counts as at least this part of the typical light when curvature is asked for.
-_LEAST_LIGHT = 0.01
+# Smallest light relative to the typical light when the curvature is computed.
+_MIN_LIGHT = 0.01
 
 
 class DataFit:
@@ -21,61 +19,86 @@ class DataFit:
 
     Parameters
     ----------
-    operator : PlaneOperator
+    operator : SceneOperator
         H.
     images : ElementalImages
-        g, with the likelihood that it is judged by.
+        g, with their likelihood.
     level_e : float
-        Typical light of the plane, > 0.
+        Typical light of a pixel in electrons, > 0.
     views : sequence of int, optional
         The views that count; all by default.
 
     Attributes
     ----------
-    sensitivity : float array (row, column)
+    sensitivity : float array (samples)
         s = Hᵀ 1.
     may_reach_zero : bool
-        False where nothing but light is expected of some pixel, so that a sample that data speak for cannot be zero.
+        Whether L is finite wherever f ≥ 0. It is not where all electrons of some pixel are light: a sample for which
+        there are data cannot be zero then.
     """
 
     def __init__(
-        self,
-        operator: PlaneOperator,
-        images: ElementalImages,
-        level_e: float,
-        views: Sequence[int] | NDArray[np.intp] | None = None,
+        self, operator: SceneOperator, images: ElementalImages, level_e: float, views: ViewSelection = None
     ) -> None:
-        self._operator, self._images, self._views = operator, images, views
-        self._least_light_e = _LEAST_LIGHT * level_e
+        self._operator, self._images = operator, images
+        self._views = operator.all_views if views is None else np.asarray(views)
+        self._min_light_e = _MIN_LIGHT * level_e
         self.sensitivity = operator.sensitivity(views)
-        self._coverage = operator.coverage(views)
         known_e2 = np.asarray(images.known_variance_e2(), np.float64)
         self.may_reach_zero = bool(known_e2.min() > 0)
-        self._known_e2 = self._averaged(known_e2, level_e)
+        if operator.row_sums_are_response:
+            self._coverage = operator.coverage(views)
+            self._known_e2 = self._averaged(known_e2, level_e)
+        else:
+            self._row_sums = operator.forward(np.ones(operator.samples_shape, operator.dtype), views)
 
-    def value_and_gradient(self, plane: Image) -> tuple[float, Image]:
-        """Return L(f) up to a constant, and ∇L = s − Hᵀ r (row, column), in one pass over the data."""
-        value, ratio = self._operator.value_and_ratio(plane, self._images, self._views)
+    def value_and_gradient(self, samples: Image) -> tuple[float, Image]:
+        """Return L(f) up to a constant, and ∇L = s − Hᵀ r (samples), in one pass over the data."""
+        value, ratio = self._operator.value_and_ratio(samples, self._images, self._views)
         return value, self.sensitivity - ratio
 
-    def metric(self, plane: Image) -> Image:
-        """Return about `Hᵀ[ (H 1)/(H f + b + σ²) ]` > 0 (row, column), without a pass over the data.
+    def metric(self, samples: Image) -> Image:
+        """Return about `Hᵀ[ (H 1)/(H f + b + σ²) ]` > 0 (samples).
 
-        These are the row sums of the Hessian that L has on average, and bound it: `xᵀ(∇²L)x ≤ Σ w x²`, because the
-        weights of H are not negative. The inverse variance is averaged over a sample's neighbours, which is no less
-        than what pixels between them have. Data scatter about their average, so that a solver still has to see to its
-        descent.
+        These are the row sums of the Hessian that L has on average, those between planes included. They bound it:
+        `xᵀ(∇²L)x ≤ Σ w x²`, because the weights of H are not negative. Data scatter around their average, so that a
+        solver must still check that it descends.
+
+        For one plane this takes no pass over the data: the inverse variance is averaged over a sample's neighbours,
+        which is no less than what the pixels between them have. Several planes take two passes.
         """
+        if self._operator.row_sums_are_response:
+            return self._metric_of_plane(samples)
+        metric = self._adjoint_of_precision(self._row_sums, self._variance_e2(samples))
+        return np.asarray(_positive(metric), samples.dtype)
+
+    def metric_of_each(self, samples: Image) -> list[Image]:
+        """Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` > 0 (row, column), the metric of each plane alone."""
+        operator = self._operator
+        if operator.row_sums_are_response:
+            return operator.planes_of(self.metric(samples))
+        variance_e2 = self._variance_e2(samples)
+        metrics = []
+        for index in range(len(operator.grids)):
+            ones = np.zeros(operator.samples_shape, operator.dtype)
+            operator.planes_of(ones)[index].fill(1)
+            metric = self._adjoint_of_precision(operator.forward(ones, self._views), variance_e2)
+            metrics.append(_positive(operator.planes_of(metric)[index]))
+        return metrics
+
+    def _metric_of_plane(self, samples: Image) -> Image:
+        """Return the metric of a single plane from the light of its samples."""
         likelihood = self._images.likelihood
         fixed = likelihood.name == "least-squares"
-        light_e = np.full_like(plane, likelihood.level_e) if fixed else np.maximum(plane, self._least_light_e)
+        light_e = np.full_like(samples, likelihood.level_e) if fixed else np.maximum(samples, self._min_light_e)
         response = np.ones_like(self._coverage)
         np.divide(self._coverage, self.sensitivity, out=response, where=self.sensitivity > 0)
-        metric = self._coverage * blurred(1 / (light_e * response + self._known_e2), (1,))
-        return np.asarray(positive_metric(metric), plane.dtype)
+        (precision,) = self._operator.planes_of(1 / (light_e * response + self._known_e2))
+        metric = self._coverage * blurred(precision, (1,)).reshape(samples.shape)
+        return np.asarray(_positive(metric), samples.dtype)
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:
-        """Return b + σ² as the samples meet it: averaged so that its inverse, with typical light added, is kept."""
+        """Return b + σ² for each sample, averaged such that the inverse of its sum with typical light is kept."""
         if known_e2.ndim == 0:
             return float(known_e2)
         inverse = self._operator.adjoint_of_map(1 / (level_e + known_e2), self._views)
@@ -83,7 +106,22 @@ class DataFit:
         np.divide(inverse, self.sensitivity, out=mean, where=self.sensitivity > 0)
         return np.asarray(np.maximum(1 / mean - level_e, 0))
 
+    def _variance_e2(self, samples: Image) -> Image:
+        """Return the variance that L assumes for each pixel, `H f + b + σ²` (view, row, column)."""
+        likelihood, operator = self._images.likelihood, self._operator
+        if likelihood.name == "least-squares":
+            light_e = likelihood.level_e * operator.map_of_views(operator.response(), self._views)
+        else:
+            light_e = np.maximum(operator.forward(samples, self._views), self._min_light_e)
+        return np.asarray(light_e + operator.map_of_views(self._images.known_variance_e2(), self._views))
 
-def positive_metric(metric: Image) -> Image:
-    """Return a metric that is positive where no view sees anything, too."""
-    return np.maximum(metric, _LEAST_METRIC * np.median(metric[metric > 0]))
+    def _adjoint_of_precision(self, seen: Image, variance_e2: Image) -> Image:
+        """Return `Hᵀ[ seen/variance ]` (samples)."""
+        ratio = np.zeros(self._operator.images_shape, self._operator.dtype)
+        ratio[self._views] = seen / variance_e2
+        return self._operator.adjoint(ratio, self._views)
+
+
+def _positive(metric: Image) -> Image:
+    """Return a metric that is also positive where no view sees anything."""
+    return np.maximum(metric, _MIN_METRIC * np.median(metric[metric > 0]))

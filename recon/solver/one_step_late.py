@@ -1,7 +1,7 @@
 """MLEM and one-step-late PMLEM, the iterations of eq. (2) as published.
 
-They are generators of iterates; when to stop, what to show and what to save is the caller's business. None knows it has
-converged: `settled` and `oscillates` judge what the caller has seen. `recon.solver.pmlem` knows.
+They are generators of iterates; the caller decides when to stop, what to show and what to save. They do not know
+whether they have converged (`recon.solver.pmlem` does): `settled` and `oscillates` judge the steps made so far.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.initialization import well_seen_samples
 from faintfield.recon.solver.penalties import total_variation_gradient
-from faintfield.recon.solver.starts import well_seen_samples
 
 # |P| of eq. (3) is at most 1 + 1 + √2: two differences that cannot exceed their own magnitude, and the sum of two.
-_LARGEST_PENALTY_GRADIENT = 2 + 2**0.5
+_MAX_PENALTY_GRADIENT = 2 + 2**0.5
 
 
 @dataclass(frozen=True)
-class Step:
+class IterationStep:
     """How far one pass over the data moved the plane.
 
     Attributes
@@ -31,7 +31,7 @@ class Step:
     relative_change : float
         ‖f⁽ᵏ⁺¹⁾ − f⁽ᵏ⁾‖ / ‖f⁽ᵏ⁾‖.
     alternation : float
-        Cosine between this step and the one before: −1 when the iteration swings to and fro, 0 at the first pass.
+        Cosine of the angle between this step and the last: −1 when the iteration oscillates, 0 at the first pass.
     """
 
     passes: int
@@ -41,22 +41,22 @@ class Step:
 
 @dataclass(frozen=True)
 class Iterate:
-    """What one pass over the data made.
+    """The plane after one pass over the data.
 
     Attributes
     ----------
     plane : float array (row, column)
         Expected electrons per detector pixel.
-    step : Step
-        How it differs from the iterate before; worth keeping when the plane is not.
+    step : IterationStep
+        How it differs from the last iterate; small enough to be kept for all passes.
     """
 
     plane: Image
-    step: Step
+    step: IterationStep
 
 
 def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
-    """Yield iterates of MLEM, eq. (2) with β = 0: maximum likelihood, which fits the noise when carried far."""
+    """Yield iterates of MLEM, eq. (2) with β = 0: maximum likelihood, which fits the noise after many passes."""
     return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
 
 
@@ -66,12 +66,12 @@ def pmlem_one_step_late(
     """Yield iterates of Green's one-step-late PMLEM with total variation, eqs. (2) and (3) as published.
 
     `f ← f / ( s + β P{f} ) · Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ]`: the shifted Poisson model adds the read noise's
-    variance to data and model, after which the data are nearly Poisson; with σ = 0 it is eq. (2) itself.
+    variance to data and model, which makes the data nearly Poisson; with σ = 0 it is eq. (2) itself.
 
     Parameters
     ----------
     start : float array (row, column)
-        Positive where it shall be able to change.
+        Positive.
     penalty_weight : float
         β ≥ 0, in the unit of s.
     epsilon : float
@@ -87,35 +87,34 @@ def pmlem_one_step_late(
     Notes
     -----
     The denominator is positive for every f only where `s > (2 + √2) β`. Samples seen by fewer views keep their start
-    value, see `updated_samples`; the denominator is not clamped. Iterates need not converge: with a large β they swing
-    without end, which `oscillates` tells.
+    value, see `updated_samples`; the denominator is not clamped. Iterates need not converge: with a large β they
+    oscillate without end, which `oscillates` detects.
     """
     if not (penalty_weight >= 0 and epsilon > 0):
         raise ValueError(f"need penalty_weight >= 0 and epsilon > 0, got {penalty_weight} and {epsilon}")
     if not (start > 0).all():
         raise ValueError(f"start must be positive everywhere, its least value is {start.min()}")
-    sensitivity = operator.sensitivity()
-    updated = updated_samples(sensitivity, penalty_weight)
-    seen = well_seen_samples(sensitivity)
+    _check_weight(operator.sensitivity(), penalty_weight)
+    return _one_step_late(operator, images, start, penalty_weight, epsilon)
+
+
+def _check_weight(sensitivity: Image, penalty_weight: float) -> None:
+    """Refuse a weight that could make most denominators negative (NotConverged)."""
+    updated, seen = updated_samples(sensitivity, penalty_weight), well_seen_samples(sensitivity)
     if np.count_nonzero(updated & seen) < np.count_nonzero(seen) / 2:
-        limit = float(np.median(sensitivity[seen])) / _LARGEST_PENALTY_GRADIENT
+        limit = float(np.median(sensitivity[seen])) / _MAX_PENALTY_GRADIENT
         raise NotConverged(
             f"penalty weight {penalty_weight:.3g} makes most denominators of eq. (2) negative; with these views it "
             f"must stay below {limit:.3g}: give a smaller one"
         )
-    return _one_step_late(operator, images, start, penalty_weight, epsilon, sensitivity, updated)
 
 
 def _one_step_late(
-    operator: PlaneOperator,
-    images: ElementalImages,
-    start: Image,
-    penalty_weight: float,
-    epsilon: float,
-    sensitivity: Image,
-    updated: NDArray[np.bool_],
+    operator: PlaneOperator, images: ElementalImages, start: Image, penalty_weight: float, epsilon: float
 ) -> Iterator[Iterate]:
-    """Iterate eq. (2) for ever."""
+    """Iterate eq. (2) without end."""
+    sensitivity = operator.sensitivity()
+    updated = updated_samples(sensitivity, penalty_weight)
     plane = np.array(start, operator.dtype)
     step = np.zeros_like(plane)
     passes = 0
@@ -137,24 +136,24 @@ def _one_step_late(
         alternation = float(np.vdot(step, last_step)) / norms if norms > 0 else 0.0
         change = float(np.linalg.norm(step) / np.linalg.norm(plane)) if step.any() else 0.0
         plane = next_plane
-        yield Iterate(plane, Step(passes, change, alternation))
+        yield Iterate(plane, IterationStep(passes, change, alternation))
 
 
 def updated_samples(sensitivity: Image, penalty_weight: float) -> NDArray[np.bool_]:
-    """Return which samples one-step-late PMLEM changes: those whose denominator is positive whatever the plane."""
-    return np.asarray(sensitivity > _LARGEST_PENALTY_GRADIENT * penalty_weight)
+    """Return which samples one-step-late PMLEM changes: those whose denominator is positive for every plane."""
+    return np.asarray(sensitivity > _MAX_PENALTY_GRADIENT * penalty_weight)
 
 
-def settled(steps: Sequence[Step], tolerance: float) -> bool:
-    """Return whether the last pass changed the plane by less than `tolerance`, relatively."""
+def settled(steps: Sequence[IterationStep], tolerance: float) -> bool:
+    """Return whether the relative change of the last pass is less than `tolerance`."""
     return bool(steps) and steps[-1].relative_change < tolerance
 
 
-def oscillates(steps: Sequence[Step], tolerance: float, window: int = 10) -> bool:
-    """Return whether the iteration swings to and fro instead of settling.
+def oscillates(steps: Sequence[IterationStep], tolerance: float, window: int = 10) -> bool:
+    """Return whether the iteration oscillates instead of settling.
 
-    True when over the last `window` passes successive steps oppose each other on the whole (mean cosine below −0.5),
-    are larger than `tolerance`, and do not shrink (the window's second half moves at least 0.8 times as far).
+    True when over the last `window` passes successive steps mostly oppose each other (mean cosine below −0.5), are
+    larger than `tolerance`, and do not shrink (the second half of the window moves at least 0.8 times as far).
     """
     if len(steps) < window:
         return False

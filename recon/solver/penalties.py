@@ -1,4 +1,4 @@
-"""What a plane's roughness costs: the penalties of PMLEM, and total variation smoothed as in the paper."""
+"""The penalties on a plane's roughness: those of PMLEM, and total variation smoothed as in the paper."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ type PenaltyName = Literal["tv", "huber-tv", "quadratic", "none"]
 
 @dataclass(frozen=True)
 class Penalty:
-    """Σ φ(t) over the samples of a plane, where t is the length of the difference to the next along rows and columns.
+    """Σ φ(t) over the samples of a plane, where t is the length of the difference to the next samples.
 
     "tv": φ = t, isotropic total variation, not smoothed. "quadratic": φ = t²/2δ. "huber-tv": φ = t²/2δ up to t = δ and
     t − δ/2 beyond. "none": 0.
@@ -21,7 +21,7 @@ class Penalty:
     Parameters
     ----------
     name : str
-        One of these.
+        One of the above.
     smoothing_e : float
         δ in electrons; zero for total variation.
 
@@ -40,12 +40,10 @@ class Penalty:
 
     @classmethod
     def for_noise(cls, name: PenaltyName, noise_e: Callable[[], float]) -> "Penalty":
-        """Return a penalty whose δ suits a back-projection with noise of a standard deviation of `noise_e()`.
+        """Return a penalty whose δ suits a back-projection with noise of standard deviation `noise_e()`.
 
-        Total variation has no δ, and does not ask.
-
-        The quadratic penalty then weighs differences as large as the noise about as total variation does; Huber's is
-        total variation for differences above a tenth of the noise.
+        Total variation has no δ and does not call it. The quadratic penalty weights differences as large as the noise
+        about as much as total variation does; Huber's is total variation for differences above a tenth of the noise.
         """
         share = {"quadratic": 1.0, "huber-tv": 0.1}.get(name, 0.0)
         return cls(name, share * noise_e() if share else 0.0)
@@ -59,7 +57,7 @@ class Penalty:
 def total_variation(plane: Image, epsilon: float) -> float:
     """Return Σ u, the smoothed total variation of a plane (row, column).
 
-    `u[i,j] = sqrt( (f[i+1,j] − f[i,j])² + (f[i,j+1] − f[i,j])² + ε )` with no difference taken across an edge
+    `u[i,j] = sqrt( (f[i+1,j] − f[i,j])² + (f[i,j+1] − f[i,j])² + ε )` without differences across an edge
     (Panin, Zeng and Gullberg 1999, eq. (3) of the paper). `epsilon` has the unit of f squared.
     """
     return float(_gradient_magnitude(*_differences(plane), epsilon).sum(dtype=np.float64))

@@ -1,7 +1,8 @@
-"""The nearest plane of little penalty: `min ½ Σ w (x − v)² + β Σ φ(|∇x|)` over x ≥ 0, by its dual, to a proven gap."""
+"""The proximal operator of the penalty, `min ½ Σ w (x − v)² + β Σ φ(|∇x|)` over x ≥ 0, by its dual, to a proven gap."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -12,28 +13,30 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver import proximal_kernels
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.threads import at_once
+from faintfield.recon.threads import run_in_threads
 
-# Steps that a strip makes before it exchanges its edges with its neighbours, and the least rows of a strip.
-_STEPS_AT_ONCE = 10
-_STRIP_ROWS = 64
+# Steps that a strip makes before it exchanges its edges with its neighbours.
+_STEPS_PER_EXCHANGE = 10
 
-# The gap is measured, and acceleration reconsidered, after so many exchanges.
+# Fewest rows of a strip: each strip also works on that many steps' rows of its neighbours.
+_MIN_STRIP_ROWS = 64
+
+# Exchanges between measurements of the gap.
 _EXCHANGES_PER_CHECK = 2
 
 
 @dataclass(frozen=True)
-class Nearest:
-    """The plane found, and how well.
+class ProxResult:
+    """The solution of a proximal problem.
 
     Attributes
     ----------
-    plane : float array (row, column)
-        At least zero.
+    plane : float array (samples)
+        x, at least zero.
     gap : float
-        By how much its objective exceeds the least there is, at most; in the unit of the objective.
+        Bound on how much its objective exceeds the minimum, in the unit of the objective.
     steps : int
-        Steps on the dual field that were made.
+        Steps made on the dual field.
     """
 
     plane: Image
@@ -43,102 +46,130 @@ class Nearest:
 
 @dataclass
 class DualField:
-    """The penalty's dual field, carried from one problem to the next, which it fits nearly.
+    """p, the dual field of the penalty: a start for the next problem, which is nearly the same.
+
+    Samples are those of one plane (row, column), or those of several planes (sample,), one plane after the other. Each
+    plane is penalised separately.
 
     Attributes
     ----------
-    vectors : float array (2, row, column)
-        p, down and right.
+    vectors : list of float array (2, row, column)
+        p of each plane, down and right.
     workers : int
-        Threads.
+        Number of threads.
     """
 
-    vectors: Image
+    vectors: list[Image]
     workers: int = field(default_factory=lambda: int(numba.config.NUMBA_NUM_THREADS))
 
     @classmethod
-    def zero(cls, shape: tuple[int, int], dtype: np.dtype[np.floating]) -> "DualField":
-        """Return the field of a constant plane."""
-        return cls(np.zeros((2, *shape), dtype))
+    def zero(cls, shapes: Sequence[tuple[int, int]], dtype: np.dtype[np.floating]) -> "DualField":
+        """Return the field of constant planes of the given shapes."""
+        return cls([np.zeros((2, *shape), dtype) for shape in shapes])
 
     def copy(self) -> "DualField":
-        """Return a copy that can be changed without changing this one."""
-        return DualField(self.vectors.copy(), self.workers)
+        """Return a copy that can be changed without changing this field."""
+        return DualField([vectors.copy() for vectors in self.vectors], self.workers)
 
-    def plane(self, centre: Image, reach: Image) -> Image:
-        """Return `v − β/w ∇ᵀp` (row, column), not clipped at zero."""
-        plane = np.empty_like(centre)
-        rows = centre.shape[0]
-        self._each_strip(rows, lambda a, b: proximal_kernels.plane_of_dual(a, b, self.vectors, centre, reach, plane))
+    def primal(self, point: Image, reach: Image) -> Image:
+        """Return `v − β/w ∇ᵀp` (samples), not clipped at zero, for a point v and a reach β/w."""
+        plane = np.empty(point.shape, point.dtype)
+        for vectors, (v, r, x) in zip(self.vectors, self._planes(point, reach, plane), strict=True):
+            _set_primal(vectors, v, r, x, self.workers)
         return plane
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
-        """Return `Σ φ(|∇x|)` of a plane, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x."""
-        shape = (penalty.smoothing_e, penalty.bounded)
-        sums = self._each_strip(
-            plane.shape[0], lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, self.vectors, *shape)
-        )
+        """Return `Σ φ(|∇x|)`, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x."""
+        sums = [
+            _penalty_and_slack(vectors, part, penalty, self.workers)
+            for vectors, (part,) in zip(self.vectors, self._planes(plane), strict=True)
+        ]
         return sum(part[0] for part in sums), sum(part[1] for part in sums)
 
-    def nearest(
-        self, centre: Image, metric: Image, weight: float, penalty: Penalty, enough: Callable[[Image], float], most: int
-    ) -> Nearest:
-        """Solve the problem with this field to start from; leave in it the one that belongs to the solution.
-
-        Accelerated projected gradient (Beck and Teboulle 2009) on the dual, in a diagonal metric, with the acceleration
-        dropped when it leads uphill (O'Donoghue and Candès 2015).
+    def prox(
+        self,
+        point: Image,
+        metric: Image,
+        weight: float,
+        penalty: Penalty,
+        gap_tolerance: Callable[[Image], float],
+        max_steps: int,
+    ) -> ProxResult:
+        """Solve the problem starting from this field, and replace the field by that of the solution.
 
         Parameters
         ----------
-        centre, metric : float array (row, column)
+        point, metric : float array (samples)
             v and w > 0.
         weight : float
             β > 0.
         penalty : Penalty
             φ.
-        enough : callable
-            The gap that will do, given the plane so far.
-        most : int
-            Steps that are made at most, to the next multiple of what is made at once.
+        gap_tolerance : callable
+            Returns the gap to reach, given x so far. Planes share it equally.
+        max_steps : int
+            Limit on the steps for each plane, rounded up to the next check of the gap.
         """
-        reach = centre.dtype.type(weight) / metric
-        steps = step_sizes(reach)
-        ahead, made, momentum = self.vectors.copy(), 0, 1.0
-        spare = np.empty_like(self.vectors), np.empty_like(self.vectors)
-        shape = (penalty.smoothing_e, penalty.bounded)
-        while True:
-            for _ in range(_EXCHANGES_PER_CHECK):
-                momenta, momentum = _momenta(momentum)
-                arrays = (self.vectors, ahead, *spare, centre, reach, steps)
-                uphill = self._steps(arrays, (*shape, momenta))
-                old, (self.vectors, ahead) = (self.vectors, ahead), spare
-                spare = old
-                made += momenta.size
-                if uphill > 0:
-                    ahead[:], momentum = self.vectors, 1.0
-            plane = np.maximum(self.plane(centre, reach), 0)
-            gap = weight * self.penalty_and_slack(plane, penalty)[1]
-            if made >= most or gap <= enough(plane):
-                return Nearest(plane, gap, made)
+        reach = point.dtype.type(weight) / metric
+        several = len(self.vectors) > 1
+        plane = np.maximum(self.primal(point, reach), 0) if several else np.empty(point.shape, point.dtype)
+        gap, steps = 0.0, 0
+        for index, (v, r, x) in enumerate(self._planes(point, reach, plane)):
+            ascent = _DualAscent(self.vectors[index], v, r, penalty, self.workers)
+            while True:
+                ascent.advance()
+                gap_of_plane = weight * ascent.set_solution(x)
+                if ascent.steps >= max_steps or gap_of_plane <= gap_tolerance(plane) / len(self.vectors):
+                    break
+            self.vectors[index] = ascent.vectors
+            gap, steps = gap + gap_of_plane, max(steps, ascent.steps)
+        return ProxResult(plane, gap, steps)
 
-    def _steps(self, arrays: tuple[Image, ...], options: tuple[Any, ...]) -> float:
-        """Make some steps on all strips; return how far they and the acceleration disagree, above 0 for uphill."""
-        sums = self._each_strip(
-            self.vectors.shape[1], lambda a, b: proximal_kernels.step_strip(a, b, *arrays, *options)
-        )
-        return float(sum(sums))
-
-    def _each_strip[Result](self, rows: int, work: Callable[[int, int], Result]) -> list[Result]:
-        """Call a function for the first and last row of every strip, in threads when there are several."""
-        count = max(1, min(self.workers, rows // _STRIP_ROWS))
-        edges = np.linspace(0, rows, count + 1).astype(int).tolist()
-        return at_once(lambda strip: work(*strip), list(pairwise(edges)))
+    def _planes(self, *samples: Image) -> Iterator[list[Image]]:
+        """Yield the part (row, column) of each array for each plane, as views into the arrays."""
+        first = 0
+        for vectors in self.vectors:
+            shape = vectors.shape[1:]
+            stop = first + shape[0] * shape[1]
+            yield [array.reshape(-1)[first:stop].reshape(shape) for array in samples]
+            first = stop
 
 
-def compile_kernels() -> None:
-    """Compile what float32 planes need, unless the cache beside the code has it."""
-    ones = np.ones((2, 2), np.float32)
-    DualField.zero((2, 2), ones.dtype).nearest(ones, ones, 1.0, Penalty(), lambda _: 0.0, 1)
+class _DualAscent:
+    """Accelerated projected gradient on the dual of one plane (Beck and Teboulle 2009), in a diagonal metric.
+
+    The acceleration is dropped when it leads uphill (O'Donoghue and Candès 2015).
+    """
+
+    def __init__(self, vectors: Image, point: Image, reach: Image, penalty: Penalty, workers: int) -> None:
+        self.vectors, self.steps = vectors, 0
+        self._ahead, self._momentum = vectors.copy(), 1.0
+        self._spare = np.empty_like(vectors), np.empty_like(vectors)
+        self._point, self._reach, self._step_sizes = point, reach, step_sizes(reach)
+        self._penalty, self._workers = penalty, workers
+
+    def advance(self) -> None:
+        """Make the steps up to the next check of the gap."""
+        for _ in range(_EXCHANGES_PER_CHECK):
+            momenta, self._momentum = _momenta(self._momentum)
+            arrays = (self.vectors, self._ahead, *self._spare, self._point, self._reach, self._step_sizes)
+            options = (self._penalty.smoothing_e, self._penalty.bounded, momenta)
+            step = partial(_step_strip, (*arrays, *options))
+            uphill = sum(_on_strips(len(self._point), self._workers, step))
+            self._spare, (self.vectors, self._ahead) = (self.vectors, self._ahead), self._spare
+            self.steps += momenta.size
+            if uphill > 0:
+                self._ahead[:], self._momentum = self.vectors, 1.0
+
+    def set_solution(self, plane: Image) -> float:
+        """Write x (row, column) that belongs to the field so far, and return its slack."""
+        _set_primal(self.vectors, self._point, self._reach, plane, self._workers)
+        np.maximum(plane, 0, out=plane)
+        return _penalty_and_slack(self.vectors, plane, self._penalty, self._workers)[1]
+
+
+def _step_strip(arguments: tuple[Any, ...], first: int, stop: int) -> float:
+    return float(proximal_kernels.step_strip(first, stop, *arguments))
 
 
 def step_sizes(reach: Image) -> Image:
@@ -149,10 +180,31 @@ def step_sizes(reach: Image) -> Image:
     return reach.dtype.type(0.125) / largest
 
 
+def _set_primal(vectors: Image, point: Image, reach: Image, plane: Image, workers: int) -> None:
+    """Set a plane (row, column) to `v − β/w ∇ᵀp`."""
+    _on_strips(len(plane), workers, lambda a, b: proximal_kernels.primal_of_dual(a, b, vectors, point, reach, plane))
+
+
+def _penalty_and_slack(vectors: Image, plane: Image, penalty: Penalty, workers: int) -> tuple[float, float]:
+    """Return the penalty and the slack of one plane (row, column)."""
+    shape = (penalty.smoothing_e, penalty.bounded)
+    sums = _on_strips(
+        len(plane), workers, lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, vectors, *shape)
+    )
+    return sum(part[0] for part in sums), sum(part[1] for part in sums)
+
+
+def _on_strips[Result](rows: int, workers: int, work: Callable[[int, int], Result]) -> list[Result]:
+    """Call a function for the first and past-the-last row of every strip, in threads when there are several."""
+    count = max(1, min(workers, rows // _MIN_STRIP_ROWS))
+    edges = np.linspace(0, rows, count + 1).astype(int).tolist()
+    return run_in_threads(lambda strip: work(*strip), list(pairwise(edges)))
+
+
 def _momenta(t: float) -> tuple[NDArray[np.float64], float]:
-    """Return the extrapolations of the next steps, and where their sequence stands after them."""
-    momenta = np.empty(_STEPS_AT_ONCE)
-    for n in range(_STEPS_AT_ONCE):
+    """Return the extrapolations of the next steps, and the state of their sequence after them."""
+    momenta = np.empty(_STEPS_PER_EXCHANGE)
+    for n in range(_STEPS_PER_EXCHANGE):
         t_next = (1 + (1 + 4 * t * t) ** 0.5) / 2
         momenta[n] = (t - 1) / t_next
         t = t_next

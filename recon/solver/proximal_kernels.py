@@ -5,9 +5,9 @@ The penalty of a plane x is `β Σ φ(|∇x|)`, with `(∇x)[i,j] = (x[i+1,j] �
 taken across an edge. Its dual field p has a vector of length at most one for each sample (of any length where φ is
 quadratic everywhere), and determines the plane: `x = ( v − β/w ∇ᵀp )₊`.
 
-A step changes a row of p by means of the rows beside it, so n steps on a strip need n rows more on each side, whose
-values become stale one after the other. Each strip works on a copy: strips need no order among themselves, and the
-result does not depend on how many there are.
+A step changes a row of p using the rows next to it, so n steps on a strip need n more rows on each side, whose values
+become stale one after the other. Each strip works on a copy, so strips can be processed in any order, and the result
+does not depend on their number.
 """
 
 import numpy as np
@@ -17,15 +17,15 @@ from faintfield.recon.elementary import compiled
 
 @compiled
 def _plane_row(row, down, right, centre, reach, values):
-    """Set `values` to a row of `v − β/w ∇ᵀp`; the fields have a row and a column of zeros before their first."""
+    """Set `values` to a row of `v − β/w ∇ᵀp`; the fields begin with a row and a column of zeros."""
     for j in range(centre.shape[1]):
         divergence = down[row + 1, j + 1] - down[row, j + 1] + right[row + 1, j + 1] - right[row + 1, j]
         values[j] = centre[row, j] + reach[row, j] * divergence
 
 
 @compiled
-def _kept_positive(values):
-    """Clip a row at zero, and repeat its last value after it."""
+def _clip_row(values):
+    """Clip a row at zero, and repeat its last value after its end."""
     for j in range(values.size - 1):
         values[j] = max(values[j], values.dtype.type(0))
     values[values.size - 1] = values[values.size - 2]
@@ -33,7 +33,7 @@ def _kept_positive(values):
 
 @compiled
 def _step_row(x, below, step, smoothing, bounded, momentum, fields):
-    """Make one accelerated step on a row of the dual field; return how far it goes against the momentum."""
+    """Make one accelerated step on a row of the dual field; return how far it opposes the momentum."""
     p_down, p_right, q_down, q_right = fields
     number = x.dtype.type
     one, against = number(1), number(0)
@@ -61,55 +61,28 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
 
     Parameters
     ----------
-    dual, ahead : array (2, row, column)
-        The field p and the field extrapolated beyond it, on entry.
-    next_dual, next_ahead : array (2, row, column)
-        Receive them, in the strip's rows.
+    dual, ahead, next_dual, next_ahead : array (2, row, column)
+        The field p and the field extrapolated beyond it; the strip's rows of both after the steps.
     centre, reach, steps : array (row, column)
         v, β/w, and the size of the step at each sample.
-    smoothing : number
-        δ of the penalty, in the unit of the plane.
-    bounded : bool
-        Whether |p| ≤ 1.
+    smoothing, bounded : number, bool
+        δ of the penalty, in the unit of the plane; whether |p| ≤ 1.
     momenta : array (step,)
         Extrapolation of each step.
 
     Returns
     -------
     float
-        How far the last step went against its momentum: positive when it is time to drop that.
+        How far the last step opposed its momentum; when positive, the momentum should be dropped.
     """
-    rows, columns = centre.shape
-    halo = momenta.size
-    top, bottom = max(first - halo, 0), min(stop + halo, rows)
-    height = bottom - top
-    local = np.zeros((4, height + 1, columns + 1), centre.dtype)
-    above = max(top - 1, 0)
-    for part in range(2):
-        local[part, 1:, 1:] = dual[part, top:bottom]
-        local[2 + part, 1:, 1:] = ahead[part, top:bottom]
-    if top > 0:
-        local[2, 0, 1:] = ahead[0, above]
-    here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
-    strip_centre, strip_reach = centre[top:bottom], reach[top:bottom]
-    smoothing = centre.dtype.type(smoothing)
+    top, bottom = max(first - momenta.size, 0), min(stop + momenta.size, centre.shape[0])
+    local = _with_halo(top, bottom, dual, ahead)
     against = 0.0
-    for n in range(momenta.size):
-        momentum = centre.dtype.type(momenta[n])
-        _plane_row(0, local[2], local[3], strip_centre, strip_reach, here)
-        _kept_positive(here)
-        against = 0.0
-        for row in range(height):
-            if row + 1 < height:
-                _plane_row(row + 1, local[2], local[3], strip_centre, strip_reach, below)
-                _kept_positive(below)
-            else:
-                below[:] = here
-            fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])
-            sums = _step_row(here, below, steps[top + row], smoothing, bounded, momentum, fields)
-            if first <= top + row < stop:
-                against += sums
-            here, below = below, here
+    for momentum in momenta:
+        options = (centre.dtype.type(smoothing), bounded, centre.dtype.type(momentum))
+        against = _step_rows(
+            first - top, stop - top, local, centre[top:bottom], reach[top:bottom], steps[top:bottom], options
+        )
     for part in range(2):
         next_dual[part, first:stop] = local[part, 1 + first - top : 1 + stop - top, 1:]
         next_ahead[part, first:stop] = local[2 + part, 1 + first - top : 1 + stop - top, 1:]
@@ -117,7 +90,42 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
 
 
 @compiled
-def plane_of_dual(first, stop, dual, centre, reach, plane):
+def _with_halo(top, bottom, dual, ahead):
+    """Return a copy (4, row, column) of rows of both fields, after the row above and a column of zeros."""
+    local = np.zeros((4, bottom - top + 1, dual.shape[2] + 1), dual.dtype)
+    for part in range(2):
+        local[part, 1:, 1:] = dual[part, top:bottom]
+        local[2 + part, 1:, 1:] = ahead[part, top:bottom]
+    if top > 0:
+        local[2, 0, 1:] = ahead[0, top - 1]
+    return local
+
+
+@compiled
+def _step_rows(first, stop, local, centre, reach, steps, options):
+    """Make one step on all rows of a copy; return how far rows `first` to `stop` oppose the momentum."""
+    height, columns = centre.shape
+    here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
+    smoothing, bounded, momentum = options
+    _plane_row(0, local[2], local[3], centre, reach, here)
+    _clip_row(here)
+    against = 0.0
+    for row in range(height):
+        if row + 1 < height:
+            _plane_row(row + 1, local[2], local[3], centre, reach, below)
+            _clip_row(below)
+        else:
+            below[:] = here
+        fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])
+        sums = _step_row(here, below, steps[row], smoothing, bounded, momentum, fields)
+        if first <= row < stop:
+            against += sums
+        here, below = below, here
+    return against
+
+
+@compiled
+def primal_of_dual(first, stop, dual, centre, reach, plane):
     """Set rows of `plane` to `v − β/w ∇ᵀp`, not clipped at zero."""
     zero = centre.dtype.type(0)
     for row in range(first, stop):

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""How sure a penalised plane is: the spread of the planes that data and penalty allow, sample by sample."""
+"""The standard deviation of each sample of a penalised plane."""
 
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
@@ -12,13 +12,13 @@ from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.penalties import Penalty
 
-# Draws whose spread is taken, and how often the curvature of the penalty is brought up to date with that spread.
+# Number of draws, and of updates of the penalty's curvature from their spread.
 _DRAWS, _ROUNDS = 10, 10
 
-# Conjugate gradients are carried on to this residual, relative to the first.
-_RESIDUAL, _MOST_STEPS = 1e-2, 200
+# Relative residual at which conjugate gradients stop, and the limit on their steps.
+_RESIDUAL, _MAX_STEPS = 1e-2, 200
 
-# The variance of a few draws is averaged over neighbours, by `recon.smoothing.blurred`.
+# Spacings of the blur over neighbours that makes up for the small number of draws.
 _BLUR = (1, 2)
 
 
@@ -27,27 +27,23 @@ def standard_deviation(
 ) -> Image:
     """Return the standard deviation (row, column) of a plane in electrons, by Laplace's method.
 
-    The posterior `exp(−L − β Σ φ(|∇f|))` is replaced by the normal distribution that fits it best near its maximum:
-    its precision is `W + β ∇ᵀ D ∇`, with W the curvature of the data that the solver works in. Total variation has no
-    curvature of its own. By its tangent parabolas (variational Bayes: Babacan, Molina and Katsaggelos 2008)
-    `D = 1/√( |∇f|² + Var ∇f )`, where the variance is that of the very distribution sought; a few rounds settle both.
-    Draws from it are `(W + β ∇ᵀ D ∇)⁻¹ ( √W ξ + ∇ᵀ √(β D) η )` with ξ and η white.
+    The posterior `exp(−L − β Σ φ(|∇f|))` is approximated by a normal distribution of precision `W + β ∇ᵀ D ∇`, with W
+    the solver's curvature of the data. By tangent parabolas of total variation (variational Bayes: Babacan, Molina and
+    Katsaggelos 2008) `D = 1/√( |∇f|² + Var ∇f )`, with the variance of the sought distribution itself; a few rounds
+    determine both. Draws are `(W + β ∇ᵀ D ∇)⁻¹ ( √W ξ + ∇ᵀ √(β D) η )` with ξ and η white.
 
-    The weight that predicts best is not that of the law that planes are drawn from. Total variation scales with f, so
-    that `exp(−β TV)` over n samples integrates to a constant times β⁻ⁿ, and the likeliest β is `n / <TV(f)>`, the mean
-    over the same draws (Pereyra, Bioucas-Dias and Figueiredo 2015). It is found along with the spread, over the samples
-    where there is something to see: the emptiness around says nothing of them. Other penalties keep their weight.
+    With total variation, β is replaced by its most likely value `n / <TV(f)>` over n samples and the same draws
+    (Pereyra, Bioucas-Dias and Figueiredo 2015), because the weight that predicts best is not that of the distribution
+    of planes. Only opaque samples count: empty surroundings say nothing about them.
 
     Parameters
     ----------
     plane, metric : float array (row, column)
         f at its optimum, and W > 0 there.
-    weight : float
-        β ≥ 0 of the optimum.
-    penalty : Penalty
-        φ.
+    weight, penalty : float, Penalty
+        β ≥ 0 of the optimum, and φ.
     generator : Generator
-        Of the draws.
+        Random generator of the draws.
     """
     w = np.asarray(metric, np.float32)
     if weight == 0 or penalty.name == "none":
@@ -57,14 +53,14 @@ def standard_deviation(
     own = _squared_gradient(np.asarray(plane, np.float32))
     spread = np.full_like(w, 2 * np.median(1 / w))
     draws = [np.zeros_like(w) for _ in white]
-    there = opacity(np.asarray(plane, np.float32)) > 0.5
+    opaque = opacity(np.asarray(plane, np.float32)) > 0.5
     with ThreadPoolExecutor(int(numba.config.NUMBA_NUM_THREADS)) as pool:
         for _ in range(1 if penalty.name == "quadratic" else _ROUNDS):
             curvature = np.float32(weight) * _curvature(np.sqrt(own + spread), penalty)
             draws = list(pool.map(_draw, repeat(w), repeat(curvature), white, of_edges, draws))
             spread = blurred(_mean([_squared_gradient(draw) for draw in draws]), _BLUR)
-            if penalty.name == "tv" and there.any():
-                weight = 1 / float(np.sqrt(own + spread)[there].mean(dtype=np.float64))
+            if penalty.name == "tv" and opaque.any():
+                weight = 1 / float(np.sqrt(own + spread)[opaque].mean(dtype=np.float64))
     return np.asarray(np.sqrt(blurred(_mean([np.square(draw) for draw in draws]), _BLUR)), plane.dtype)
 
 
@@ -86,7 +82,7 @@ def _curvature(length: Image, penalty: Penalty) -> Image:
 
 
 def _draw(w: Image, curvature: Image, white: Image, of_edges: Image, start: Image) -> Image:
-    """Return one draw, by conjugate gradients in the scale of the diagonal."""
+    """Return one draw, by conjugate gradients preconditioned with the diagonal."""
     target = np.sqrt(w) * white + _divergence(np.sqrt(curvature) * of_edges)
     diagonal = w + _degree(curvature)
     x, image = start.copy(), np.empty_like(start)
@@ -94,9 +90,9 @@ def _draw(w: Image, curvature: Image, white: Image, of_edges: Image, start: Imag
     residual = target - image
     z = residual / diagonal
     ahead, rho = z.copy(), float(np.vdot(residual, z))
-    least = _RESIDUAL**2 * float(np.vdot(target, target / diagonal))
-    for _ in range(_MOST_STEPS):
-        if rho <= least:
+    tolerance = _RESIDUAL**2 * float(np.vdot(target, target / diagonal))
+    for _ in range(_MAX_STEPS):
+        if rho <= tolerance:
             break
         _precision(w, curvature, ahead, image)
         step = x.dtype.type(rho / float(np.vdot(ahead, image)))
@@ -128,7 +124,7 @@ def _precision(w, curvature, x, out):
 
 
 def _differences(plane: Image) -> Image:
-    """Return ∇x (2, row, column), none across an edge."""
+    """Return ∇x (2, row, column), zero across an edge."""
     both = np.zeros((2, *plane.shape), plane.dtype)
     np.subtract(plane[1:], plane[:-1], out=both[0, :-1])
     np.subtract(plane[:, 1:], plane[:, :-1], out=both[1, :, :-1])

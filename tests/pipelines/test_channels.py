@@ -22,7 +22,7 @@ from faintfield.pipelines.reconstruction.channels import (
 )
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
-from faintfield.recon.solver.starts import back_projection
+from faintfield.recon.solver.initialization import back_projection
 
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]

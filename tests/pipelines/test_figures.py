@@ -18,7 +18,7 @@ from faintfield.pipelines.paper import figure4
 from faintfield.pipelines.paper.figure4 import SNRS, Error, Stage, curves, is_monotone, over_best, staged
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, FigureMethod
 from faintfield.recon.metrics import expected_snr_from_powers
-from faintfield.recon.solver.starts import back_projection
+from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.objects import shaded_ball, star_chart
 
 type Command = Callable[..., CompletedProcess[str]]

@@ -16,7 +16,6 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
-from faintfield.recon.likelihood.likelihoods import negative_log_likelihood
 from faintfield.recon.solver.penalties import total_variation
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -119,7 +118,7 @@ def test_the_objective_is_the_likelihood_with_the_penalty(method: str, results: 
     for plane in _record(results / method)["planes"]:
         pixels = tifffile.imread(results / method / plane["file"])
         operator = factory.at_depth(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
-        likelihood = negative_log_likelihood(operator, pixels, images)
+        likelihood = operator.negative_log_likelihood(pixels, images)
         penalty = plane["penalty_weight"] * total_variation(pixels, plane["epsilon_e2"])
         assert plane["objective"] == pytest.approx(likelihood + penalty, rel=1e-9)
         assert (penalty > 100) == (method == "pmlem-osl")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 
 type LinearOperatorCheck = Callable[[PlaneOperator], Image]
 

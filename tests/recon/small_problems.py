@@ -9,9 +9,9 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import gammaln
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, Likelihood, LikelihoodName
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 
 SHAPE = (9, 12)
 DETECTOR = (11, 14)  # a sample more on each side
@@ -21,12 +21,14 @@ _COUNTS = np.arange(50.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class DenseProblem:
     """Data of one plane, the operator under test, and the same operator as a matrix."""
 
     operator: PlaneOperator
     images: ElementalImages
     matrix: Image
+    homographies: Image
+    rays: Image
 
     def counted(self) -> Any:
         return self.matrix.any(axis=1)
@@ -69,7 +71,7 @@ def problem(
     high: float = 6.0,
     seed: int = 2,
     dtype: type[np.float32] | type[np.float64] = np.float64,
-) -> Problem:
+) -> DenseProblem:
     """A bright box on a dark plane, in views that are displaced by up to half a sample."""
     generator = np.random.default_rng(seed)
     shifts = generator.uniform(-0.5, 0.5, (views, 2))
@@ -83,8 +85,14 @@ def problem(
     truth[2:6, 3:9] = high
     mean = (matrix @ truth.ravel()).reshape(views, *DETECTOR)
     electrons = generator.poisson(mean + background_e) + generator.normal(0, np.sqrt(variance_e2), mean.shape)
-    judged_by = Likelihood(likelihood, level_e=3.0 if likelihood == "least-squares" else 0.0)
-    return Problem(operator, ElementalImages(electrons, background_e, variance_e2, likelihood=judged_by), matrix)
+    judged_by = PixelLikelihood(likelihood, level_e=3.0 if likelihood == "least-squares" else 0.0)
+    return DenseProblem(
+        operator,
+        ElementalImages(electrons, background_e, variance_e2, likelihood=judged_by),
+        matrix,
+        homographies,
+        rays,
+    )
 
 
 def _bilinear(rows: Image, columns: Image) -> Image:
@@ -106,7 +114,7 @@ def difference_matrix() -> Image:
     return matrix.reshape(2 * SAMPLES, SAMPLES)
 
 
-def primal_dual_solution(posed: Problem, weight: float, passes: int) -> Image:
+def primal_dual_solution(posed: DenseProblem, weight: float, passes: int) -> Image:
     """The optimum with total variation, by Condat and Vũ's primal-dual iteration with fixed steps."""
     gradient_of = difference_matrix()
     lightest = float(posed.images.background_e) + float(posed.images.read_variance_e2)
@@ -124,7 +132,7 @@ def primal_dual_solution(posed: Problem, weight: float, passes: int) -> Image:
     return f.reshape(SHAPE)
 
 
-def smooth_solution(posed: Problem, weight: float, phi: Callable[[Image], tuple[Image, Image]]) -> Image:
+def smooth_solution(posed: DenseProblem, weight: float, phi: Callable[[Image], tuple[Image, Image]]) -> Image:
     """The optimum with a penalty Σ φ(|∇f|) that has a derivative, by L-BFGS-B; `phi` gives φ and φ'/t."""
     gradient_of = difference_matrix()
 

@@ -10,7 +10,7 @@ from faintfield.recon.depth.agreement import Agreement, agreement, bins_for, dep
 from faintfield.recon.depth.best_focus import SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 
 type Scene = Callable[[NDArray[np.floating], NDArray[np.floating], float], NDArray[np.floating]]
 

@@ -5,13 +5,13 @@ from scipy.ndimage import map_coordinates
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.solver.cross_validation import chosen_weight
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.cross_validation import cross_validated_weight
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.problem import PosedPlane
-from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.problem import SceneProblem
 
 SIZE = 48
 
@@ -29,8 +29,8 @@ def reconstructed(images: ElementalImages, shifts: Image, pitch: float) -> Image
     samples = int(SIZE / pitch)
     operator = PlaneOperator(homographies, rays, PlaneGrid((samples, samples), pitch, (0.0, 0.0)))
     start = smooth_start(operator, images)
-    weight = chosen_weight(
-        PosedPlane(operator, images), universal_penalty_weight(operator, images, start), Penalty()
+    weight = cross_validated_weight(
+        SceneProblem(operator, images), universal_penalty_weight(operator, images, start), Penalty()
     ).weight
     for iterate in pmlem(DataFit(operator, images, float(start.mean())), start, penalty_weight=weight):
         if iterate.certificate.distance < 0.01 or iterate.passes >= 25:

@@ -9,8 +9,8 @@ from scipy.optimize import brentq
 from scipy.stats import norm, poisson
 
 from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName
-from faintfield.recon.likelihood.likelihoods import likelihood_of, read_noise_share
 from faintfield.recon.likelihood.pixel_models import WORK_ROWS, form_ratio
+from faintfield.recon.likelihood.selection import read_noise_share, select_likelihood
 
 SIGMAS_E = [0.3, 1.0, 2.0, 3.46, 7.0]
 
@@ -30,17 +30,17 @@ def images(variance_e2: object) -> ElementalImages:
     ],
 )
 def test_the_read_noise_chooses(variance_e2: object, name: str) -> None:
-    assert likelihood_of(images(variance_e2), "auto", 1.0).name == name
+    assert select_likelihood(images(variance_e2), "auto", 1.0).name == name
 
 
 def test_least_squares_takes_the_variance_at_the_typical_light() -> None:
-    likelihood = likelihood_of(images(12.0), "least-squares", 3.5)
+    likelihood = select_likelihood(images(12.0), "least-squares", 3.5)
     assert likelihood.level_e == 3.5
     assert replace(images(12.0), likelihood=likelihood).known_variance_e2() == pytest.approx(12.02)
 
 
 def test_poisson_ignores_read_noise() -> None:
-    assert replace(images(12.0), likelihood=likelihood_of(images(12.0), "poisson", 1.0)).known_variance_e2() == 0.02
+    assert replace(images(12.0), likelihood=select_likelihood(images(12.0), "poisson", 1.0)).known_variance_e2() == 0.02
 
 
 def light_at_snr(sigma_e: float) -> float:
@@ -53,7 +53,7 @@ def reported_e(name: LikelihoodName, mean_e: float, sigma_e: float) -> float:
     counts = np.arange(80)
     g = np.linspace(-9 * sigma_e, 40 + 9 * sigma_e, 60001)
     density = poisson.pmf(counts, mean_e) @ norm.pdf(g, counts[:, None], sigma_e)
-    model = likelihood_of(images(sigma_e**2), name, mean_e).model
+    model = select_likelihood(images(sigma_e**2), name, mean_e).model
     variance, zero, work = np.full(g.size, sigma_e**2), np.zeros(g.size), np.empty((WORK_ROWS, g.size))
 
     def score(level_e: float) -> float:
@@ -67,7 +67,7 @@ def reported_e(name: LikelihoodName, mean_e: float, sigma_e: float) -> float:
 @pytest.mark.parametrize("sigma_e", SIGMAS_E)
 def test_light_is_reported_without_bias_at_snr_016(sigma_e: float) -> None:
     mean_e = light_at_snr(sigma_e)
-    name = likelihood_of(images(sigma_e**2), "auto", mean_e).name
+    name = select_likelihood(images(sigma_e**2), "auto", mean_e).name
     assert reported_e(name, mean_e, sigma_e) == pytest.approx(mean_e, rel=0.01)
 
 

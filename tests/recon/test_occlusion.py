@@ -5,7 +5,7 @@ import pytest
 
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity, transmission
-from faintfield.recon.operator.scene import SceneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
 
 
 def test_what_shines_is_opaque_and_faint_ghosts_are_not() -> None:

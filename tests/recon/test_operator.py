@@ -1,7 +1,7 @@
 """H against the contract, against a matrix built another way, against analytic scenes; and what it refuses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -16,87 +16,13 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.blocks import EDGE_TOLERANCE
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.placement import EDGE_TOLERANCE
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.rig.simulation.optics import SimulatedOptics
+from tests.recon.operator_cases import DISTORTIONS, FACING_AT_500_MM, Case, cases, mosaic_rays
 
 type LinearOperatorCheck = Callable[[PlaneOperator], Image]
-
-DISTORTIONS: list[tuple[float, ...]] = [
-    (),
-    (-0.15, 0.04, 1e-3, -5e-4, 0.01),
-    (0.2, -0.1, -1e-3, 2e-3, 0.02, 0.3, -0.05, 0.01),
-]
-MOSAIC_PHASES = [(0, 0), (0, 1), (1, 0), (1, 1)]
-FACING_AT_500_MM = fronto_parallel_rt_ref_plane(500.0)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A camera at several poses before a plane, in terms of the world."""
-
-    rays: NDArray[np.float64]  # (lattice, row, column, 2)
-    rt_cam_ref: NDArray[np.float64]
-    rt_ref_plane: NDArray[np.float64]
-    grid: PlaneGrid
-    flat: NDArray[np.float64]  # (lattice, row, column)
-    valid: NDArray[np.bool_]
-    lattice_of_view: NDArray[np.intp]
-    workers: int
-
-    def operator(self) -> PlaneOperator:
-        return PlaneOperator(
-            plane_from_ray(self.rt_cam_ref, self.rt_ref_plane),
-            self.rays,
-            self.grid,
-            flat=self.flat,
-            valid=self.valid,
-            lattice_of_view=self.lattice_of_view,
-            dtype=np.float64,
-            workers=self.workers,
-        )
-
-
-@st.composite
-def cases(draw: st.DrawFn, most_rows: int = 19, most_columns: int = 71) -> Case:
-    """Odd sizes, near and far planes, turned and displaced cameras that see some of the plane, mosaics, masks."""
-    generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed"))
-    rows, columns = draw(st.tuples(st.integers(2, most_rows), st.integers(2, most_columns)), label="detector")
-    views = draw(st.integers(1, 4), label="views")
-    depth_mm = draw(st.sampled_from([120.0, 500.0, 20_000.0]), label="depth_mm")
-    turn_rad = draw(st.sampled_from([0.0, 0.02, 0.4]), label="turn_rad")
-    tilt_rad = draw(st.sampled_from([0.0, 0.5]), label="tilt_rad")
-    mosaic = draw(st.booleans(), label="mosaic")
-    axis = (
-        2 * (rows // 4),
-        2 * (columns // 4),
-    )  # the pixel, on the mosaic's first phase, that looks at the plane's centre
-    lens = Lens((columns, rows), 90.0, 92.0, axis[1], axis[0], draw(st.sampled_from(DISTORTIONS)))
-    rays = mosaic_rays(lens) if mosaic else lens.rays()[np.newaxis]
-    shape = draw(st.tuples(st.integers(2, 11), st.integers(2, 45)), label="plane")
-    pitch_mm = depth_mm / 90.0 * draw(st.sampled_from([0.6, 1.0, 2.3]), label="scale") * (2 if mosaic else 1)
-    poses = generator.uniform(-1, 1, (views, 6)) * np.repeat([turn_rad, 4 * pitch_mm], 3)
-    flat, masked = draw(st.booleans(), label="flat"), draw(st.booleans(), label="masked")
-    lattice_of_view = generator.integers(0, len(rays), views)
-    valid = generator.random((views, *rays.shape[1:3])) >= (0.1 if masked else 0.0)
-    poses[0], lattice_of_view[0], valid[0] = 0, 0, True  # so that something is seen for certain
-    return Case(
-        rays,
-        poses,
-        np.array([*generator.uniform(-tilt_rad, tilt_rad, 3), 0, 0, depth_mm]),
-        PlaneGrid(shape, pitch_mm, (-pitch_mm * (shape[1] - 1) / 2, -pitch_mm * (shape[0] - 1) / 2)),
-        flat=generator.uniform(0.3, 1.0, rays.shape[:3]) if flat else np.ones(rays.shape[:3]),
-        valid=valid,
-        lattice_of_view=lattice_of_view,
-        workers=draw(st.integers(1, 3), label="workers"),
-    )
-
-
-def mosaic_rays(lens: Lens) -> NDArray[np.float64]:
-    """The rays (lattice, row, column, 2) of the four phases of a mosaic, cut to a common size."""
-    rows, columns = lens.size_px[1] // 2, lens.size_px[0] // 2
-    return np.stack([lens.rays(first, (2, 2))[:rows, :columns] for first in MOSAIC_PHASES])
 
 
 def ray_hits(
@@ -347,67 +273,3 @@ def test_where_nothing_is_expected_and_nothing_known_the_ratio_is_zero() -> None
     operator = looking_at(np.arange(50.0), np.arange(4.0))
     ratio = operator.adjoint_of_ratio(np.zeros((4, 50)), ElementalImages(np.ones((1, 4, 50))))
     np.testing.assert_array_equal(ratio, 0.0)
-
-
-GOOD: dict[str, Any] = {
-    "plane_from_ray": np.stack([np.eye(3)] * 2),
-    "rays": np.zeros((2, 3, 4, 2)),
-    "grid": PlaneGrid((5, 5), 1.0, (-2.0, -2.0)),
-    "lattice_of_view": np.array([0, 1]),
-}
-
-
-@pytest.mark.parametrize(
-    ("bad", "words"),
-    [
-        ({"plane_from_ray": np.eye(3)}, "do not fit"),
-        ({"plane_from_ray": np.zeros((0, 3, 3)), "lattice_of_view": None}, "do not fit"),
-        ({"rays": np.zeros((3, 4))}, "do not fit"),
-        ({"rays": np.zeros((2, 3, 4, 3))}, "do not fit"),
-        ({"flat": np.ones((4, 3))}, "flat"),
-        ({"flat": np.ones((3, 3, 4))}, "flat"),
-        ({"valid": np.zeros((1, 3, 4), bool)}, "valid"),
-        ({"lattice_of_view": np.array([0, 2])}, "lattice_of_view"),
-        ({"lattice_of_view": np.array([0, -1])}, "lattice_of_view"),
-        ({"lattice_of_view": np.array([0, 1, 1])}, "lattice_of_view"),
-        ({"plane_from_ray": np.full((2, 3, 3), np.nan)}, "not a finite number"),
-        ({"rays": np.full((2, 3, 4, 2), np.inf)}, "not a finite number"),
-        ({"flat": np.full((3, 4), np.nan)}, "not a finite number"),
-        ({"grid": PlaneGrid((5, 5), 1.0, (50.0, 0.0))}, "no pixel of any of the 2 views"),
-        ({"valid": np.zeros((2, 3, 4), bool)}, "no pixel of any of the 2 views"),
-    ],
-)
-def test_parts_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> None:
-    assert PlaneOperator(**GOOD).sensitivity().sum() == 24
-    with pytest.raises(GeometryMismatch, match=words):
-        PlaneOperator(**{**GOOD, **bad})
-
-
-@pytest.mark.parametrize("views", [[2], [-1], [0, 0], [0.0], [True, False]])
-def test_views_that_are_not_there_or_twice_are_refused(views: Any) -> None:
-    operator = PlaneOperator(**GOOD)
-    uses: list[Callable[[], Image]] = [
-        lambda: operator.forward(np.ones((5, 5)), views),
-        lambda: operator.adjoint(np.ones((2, 3, 4)), views),
-        lambda: operator.sensitivity(views),
-        lambda: operator.adjoint_of_ratio(np.ones((5, 5)), ElementalImages(np.ones((2, 3, 4))), views),
-    ]
-    for use in uses:
-        with pytest.raises(ValueError, match="views must"):
-            use()
-
-
-def test_planes_images_and_maps_of_another_shape_are_refused() -> None:
-    operator = PlaneOperator(**GOOD)
-    plane, images = np.ones((5, 5)), np.ones((2, 3, 4))
-    uses: list[Callable[[], Image]] = [
-        lambda: operator.forward(images[0]),
-        lambda: operator.adjoint(images[:1]),
-        lambda: operator.adjoint_of_map(plane),
-        lambda: operator.adjoint_of_ratio(images[0], ElementalImages(images)),
-        lambda: operator.adjoint_of_ratio(plane, ElementalImages(images[:1])),
-        lambda: operator.adjoint_of_ratio(plane, ElementalImages(images, background_e=plane)),
-    ]
-    for use in uses:
-        with pytest.raises(GeometryMismatch, match="shape"):
-            use()

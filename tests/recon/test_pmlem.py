@@ -10,14 +10,14 @@ import pytest
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import Image, LikelihoodName
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, norm, pmlem
-from faintfield.recon.solver.starts import smooth_start
 from tests.recon.small_problems import (
     SHAPE,
-    Problem,
+    DenseProblem,
     difference_matrix,
     primal_dual_solution,
     problem,
@@ -28,13 +28,13 @@ LIKELIHOODS: list[LikelihoodName] = ["shifted-poisson", "poisson-gaussian", "lea
 WEIGHT = 1.5
 
 
-def started(posed: Problem) -> tuple[DataFit, Image]:
+def started(posed: DenseProblem) -> tuple[DataFit, Image]:
     start = smooth_start(posed.operator, posed.images)
     return DataFit(posed.operator, posed.images, float(start.mean())), start
 
 
 def solved(
-    posed: Problem, weight: float, penalty: Penalty, *, tolerance: float = 1e-6, most: int = 400
+    posed: DenseProblem, weight: float, penalty: Penalty, *, tolerance: float = 1e-6, most: int = 400
 ) -> PmlemIterate:
     fit, start = started(posed)
     for iterate in pmlem(fit, start, penalty_weight=weight, penalty=penalty, tolerance=tolerance):

@@ -15,10 +15,10 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.blocks import BLOCK_PX
+from faintfield.recon.operator.block_layout import BLOCK_PX
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.operator.scene import SceneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
 
 # Four blocks of pixels and a rest; poses in step with the planes, turned so that they are not, and far aside
 LENS = Lens((4 * BLOCK_PX + 9, 13), 300.0, 300.0, 130.2, 6.1, (-0.08, 0.02))
@@ -62,34 +62,34 @@ def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.G
     alone = singles(options)
     planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
     expected = sum(t * one.forward(plane) for one, plane, t in zip(alone, planes, transmission, strict=True))
-    np.testing.assert_allclose(scene.forward(planes), expected, atol=1e-12)
-    for back, one, t in zip(scene.adjoint(images), alone, transmission, strict=True):
+    np.testing.assert_allclose(scene.forward(scene.samples_of(planes)), expected, atol=1e-12)
+    for back, one, t in zip(scene.planes_of(scene.adjoint(images)), alone, transmission, strict=True):
         np.testing.assert_allclose(back, one.adjoint(t * images), atol=1e-12)
 
 
 def test_a_scene_and_its_adjoint_are_adjoint(generator: np.random.Generator) -> None:
     transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE))
     scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **known(generator), transmission=transmission)
-    planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
-    seen = scene.forward(planes)
-    back = sum(float(np.vdot(plane, other)) for plane, other in zip(planes, scene.adjoint(images), strict=True))
+    samples, images = scene.samples_of(planes_of(generator)), generator.normal(size=IMAGES_SHAPE)
+    seen = scene.forward(samples)
+    back = float(np.vdot(samples, scene.adjoint(images)))
     assert abs(float(np.vdot(seen, images)) - back) <= 1e-12 * np.linalg.norm(seen) * np.linalg.norm(images)
 
 
 def test_the_ratio_of_a_scene_is_formed_with_what_all_planes_give(generator: np.random.Generator) -> None:
     options = known(generator)
     scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options)
-    planes = [generator.uniform(0.5, 2.0, grid.shape) for grid in GRIDS]
+    samples = scene.samples_of([generator.uniform(0.5, 2.0, grid.shape) for grid in GRIDS])
     electrons = generator.normal(1.0, 3.0, IMAGES_SHAPE)
     images = ElementalImages(electrons, 0.25, 2.0, options["valid"])
-    value, ratios = scene.value_and_ratio(planes, images)
-    mean, shifted = scene.forward(planes) + 2.25, np.maximum(electrons + 2.0, 0)
-    for ratio, one in zip(ratios, singles(options), strict=True):
+    value, ratios = scene.value_and_ratio(samples, images)
+    mean, shifted = scene.forward(samples) + 2.25, np.maximum(electrons + 2.0, 0)
+    for ratio, one in zip(scene.planes_of(ratios), singles(options), strict=True):
         np.testing.assert_allclose(ratio, one.adjoint(shifted / mean), atol=1e-12)
-    met = scene.forward([np.ones(grid.shape) for grid in GRIDS]) > 0
+    met = scene.forward(np.ones(scene.samples_shape)) > 0
     terms = mean - shifted + shifted * np.log(np.where(shifted > 0, shifted, 1.0) / mean)
     assert value == pytest.approx(terms[met].sum(), rel=1e-12)
-    assert scene.negative_log_likelihood(planes, images) == pytest.approx(value, rel=1e-12)
+    assert scene.negative_log_likelihood(samples, images) == pytest.approx(value, rel=1e-12)
 
 
 @pytest.mark.parametrize("plane", range(len(GRIDS)))
@@ -130,7 +130,7 @@ def test_parts_of_a_scene_that_do_not_fit_are_refused(bad: dict[str, Any], words
 def test_planes_of_other_shapes_than_the_scenes_are_refused(shapes: Sequence[tuple[int, int]]) -> None:
     scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS)
     with pytest.raises(GeometryMismatch, match="shapes"):
-        scene.forward([np.ones(shape) for shape in shapes])
+        scene.samples_of([np.ones(shape) for shape in shapes])
 
 
 def test_data_that_stay_on_disk_are_neither_copied_nor_compiled_for(tmp_path: Path) -> None:

@@ -5,14 +5,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from faintfield.recon.likelihood.images import ElementalImages, Image, Likelihood, LikelihoodName
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.operator.scene import SceneOperator
-from faintfield.recon.solver.cross_validation import chosen_weight
+from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.solver.cross_validation import cross_validated_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
-from faintfield.recon.solver.problem import PosedPlane, PosedScene
+from faintfield.recon.solver.problem import SceneProblem
 from tests.recon.small_problems import problem
 
 WEIGHT = 0.8
@@ -20,7 +19,7 @@ VIEWS, SIZE = 9, 12
 GRIDS = PlaneGrid((10, 9), 1.0, (1.0, 1.0)), PlaneGrid((7, 8), 1.5, (0.2, 0.4))
 
 
-def scene(likelihood: LikelihoodName = "shifted-poisson", *, occluded: bool = False, seed: int = 3) -> PosedScene:
+def scene(likelihood: LikelihoodName = "shifted-poisson", *, occluded: bool = False, seed: int = 3) -> SceneProblem:
     """Two planes of unlike grids, which slide over each other from view to view."""
     generator = np.random.default_rng(seed)
     homographies = np.stack([np.eye(3)] * 2 * VIEWS).reshape(2, VIEWS, 3, 3)
@@ -31,13 +30,13 @@ def scene(likelihood: LikelihoodName = "shifted-poisson", *, occluded: bool = Fa
     operator = SceneOperator(homographies, rays, GRIDS, transmission=transmission, dtype=np.float64, workers=1)
     near, far = np.zeros(GRIDS[0].shape), np.zeros(GRIDS[1].shape)
     near[3:7, 2:6], far[1:5, 4:7] = 5.0, 3.0
-    mean = operator.forward([near, far])
+    mean = operator.forward(operator.samples_of([near, far]))
     electrons = generator.poisson(mean + 0.3) + generator.normal(0, 1, mean.shape)
-    judged_by = Likelihood(likelihood, level_e=2.0 if likelihood == "least-squares" else 0.0)
-    return PosedScene(operator, ElementalImages(electrons, 0.3, 1.0, likelihood=judged_by))
+    judged_by = PixelLikelihood(likelihood, level_e=2.0 if likelihood == "least-squares" else 0.0)
+    return SceneProblem(operator, ElementalImages(electrons, 0.3, 1.0, likelihood=judged_by))
 
 
-def solved(posed: PosedScene | PosedPlane, weight: float, tolerance: float = 1e-7, most: int = 4000) -> PmlemIterate:
+def solved(posed: SceneProblem, weight: float, tolerance: float = 1e-7, most: int = 4000) -> PmlemIterate:
     start = posed.start()
     fit = posed.fit(posed.level_e(start))
     for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=tolerance, dual=posed.dual()):
@@ -49,7 +48,7 @@ def solved(posed: PosedScene | PosedPlane, weight: float, tolerance: float = 1e-
 def dense(operator: SceneOperator) -> Image:
     """H as a matrix (pixel, sample), by what it makes of each sample."""
     count = sum(grid.shape[0] * grid.shape[1] for grid in operator.grids)
-    return np.stack([operator.forward(operator.planes_of(one)).ravel() for one in np.eye(count)], axis=1)
+    return np.stack([operator.forward(one).ravel() for one in np.eye(count)], axis=1)
 
 
 def differences() -> Image:
@@ -66,7 +65,7 @@ def differences() -> Image:
     return matrix.reshape(-1, index.size)
 
 
-def objective_and_gradient(posed: PosedScene, matrix: Image, f: Image) -> tuple[float, Image]:
+def objective_and_gradient(posed: SceneProblem, matrix: Image, f: Image) -> tuple[float, Image]:
     """The negative log-likelihood of all planes and its gradient, by formulas of their own."""
     rows = matrix[matrix.any(axis=1)]
     g = posed.images.electrons.ravel()[matrix.any(axis=1)]
@@ -78,7 +77,7 @@ def objective_and_gradient(posed: PosedScene, matrix: Image, f: Image) -> tuple[
     return float(np.sum(m - y * np.log(m))), rows.T @ (1 - y / m)
 
 
-def primal_dual(posed: PosedScene, weight: float, passes: int) -> Image:
+def primal_dual(posed: SceneProblem, weight: float, passes: int) -> Image:
     """The optimum by Condat and Vũ's iteration with fixed steps."""
     matrix, gradient_of = dense(posed.operator), differences()
     samples = matrix.shape[1]
@@ -115,12 +114,19 @@ def test_the_objective_never_rises() -> None:
     assert objectives[-1] < objectives[0] - 10
 
 
-def test_one_plane_together_is_one_plane_alone() -> None:
+def test_a_scene_of_one_plane_is_that_plane() -> None:
     posed = problem()
-    operator: PlaneOperator = posed.operator
-    alone = solved(PosedPlane(operator, posed.images), 1.5)
-    together = solved(PosedScene(operator._scene, posed.images), 1.5)  # noqa: SLF001 - the very same operator
-    np.testing.assert_allclose(together.plane.reshape(operator.grid.shape), alone.plane, rtol=1e-4, atol=1e-5)
+    plane = posed.operator
+    homographies, rays = posed.homographies[np.newaxis], posed.rays
+    scene_of_one = SceneOperator(homographies, rays, [plane.grid], dtype=np.float64, workers=1)
+    alone = solved(SceneProblem(plane, posed.images), 1.5)
+    same = solved(SceneProblem(scene_of_one, posed.images), 1.5)
+    np.testing.assert_array_equal(same.plane, alone.plane.ravel())
+    # A transmission of one changes nothing but the way to the metric, which is that of several planes
+    through = np.ones((1, *plane.images_shape))
+    general = SceneOperator(homographies, rays, [plane.grid], transmission=through, dtype=np.float64, workers=1)
+    together = solved(SceneProblem(general, posed.images), 1.5)
+    np.testing.assert_allclose(together.plane.reshape(plane.grid.shape), alone.plane, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("occluded", [False, True])
@@ -140,7 +146,7 @@ def test_views_that_are_left_out_do_not_count() -> None:
     generator = np.random.default_rng(1)
     electrons = posed.images.electrons.copy()
     electrons[[1, 4, 6, 7]] = generator.normal(100, 1, (4, SIZE, SIZE))
-    other = PosedScene(posed.operator, ElementalImages(electrons, 0.3, 1.0))
+    other = SceneProblem(posed.operator, ElementalImages(electrons, 0.3, 1.0))
     np.testing.assert_allclose(posed.start(kept), other.start(kept), rtol=1e-12)
     first, second = posed.fit(1.0, kept), other.fit(1.0, kept)
     value, gradient = first.value_and_gradient(posed.start())
@@ -150,9 +156,9 @@ def test_views_that_are_left_out_do_not_count() -> None:
     assert not np.allclose(posed.fit(1.0).metric(posed.start()), first.metric(posed.start()))
 
 
-def test_held_out_views_choose_one_weight_for_all_planes() -> None:
+def test_validation_views_choose_one_weight_for_all_planes() -> None:
     posed = scene()
-    chosen = chosen_weight(posed, posed.usual_weight(posed.start()), Penalty())
-    weights = [tried.weight for tried in chosen.tried]
+    chosen = cross_validated_weight(posed, posed.usual_weight(posed.start()), Penalty())
+    weights = [tried.weight for tried in chosen.candidates]
     assert min(weights) <= chosen.weight <= max(weights)
-    assert chosen.nearest.plane.shape == (10 * 9 + 7 * 8,)
+    assert chosen.solution.plane.shape == (10 * 9 + 7 * 8,)

@@ -1,7 +1,6 @@
 """Solvers against dense algebra, an independent optimiser and closed forms, on planes of a hundred samples."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from itertools import islice, pairwise
 from typing import Any
 
@@ -13,10 +12,11 @@ from scipy.stats import norm, poisson
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.one_step_late import (
     Iterate,
-    Step,
+    IterationStep,
     mlem,
     oscillates,
     pmlem_one_step_late,
@@ -24,7 +24,6 @@ from faintfield.recon.solver.one_step_late import (
     updated_samples,
 )
 from faintfield.recon.solver.penalties import total_variation, total_variation_gradient
-from faintfield.recon.solver.starts import back_projection, smooth_start, universal_penalty_weight
 
 SHAPE = (9, 12)
 
@@ -181,7 +180,7 @@ def test_samples_seen_by_too_few_views_keep_their_start() -> None:
     assert (plane[~kept] != start[~kept]).all()
 
 
-def run(penalty_weight: float, epsilon: float) -> list[Step]:
+def run(penalty_weight: float, epsilon: float) -> list[IterationStep]:
     operator = shifted_views(6)
     images = drawn(operator, box(1, 3))
     start = smooth_start(operator, images)
@@ -201,8 +200,8 @@ def test_a_large_weight_is_seen_to_swing_and_a_small_one_to_settle() -> None:
     assert (sensitivity[updated] > 2 * weight).all()
 
 
-def history(changes: Sequence[float], alternation: float) -> list[Step]:
-    return [Step(k + 1, change, alternation) for k, change in enumerate(changes)]
+def history(changes: Sequence[float], alternation: float) -> list[IterationStep]:
+    return [IterationStep(k + 1, change, alternation) for k, change in enumerate(changes)]
 
 
 @pytest.mark.parametrize(
@@ -262,53 +261,3 @@ def test_arguments_out_of_range_are_refused_before_the_first_pass(changed: dict[
     good: dict[str, Any] = {"start": np.ones(SHAPE), "penalty_weight": 0.1, "epsilon": 1.0}
     with pytest.raises(ValueError, match=words):
         pmlem_one_step_late(operator, images, **{**good, **changed})
-
-
-@pytest.mark.parametrize("views", [None, [0, 3]])
-@pytest.mark.parametrize("estimate", [back_projection, smooth_start])
-def test_a_constant_plane_stays_constant_under_flat_field_mask_and_background(
-    views: list[int] | None, estimate: Callable[..., Image]
-) -> None:
-    generator = np.random.default_rng(3)
-    valid = generator.random((4, 11, 9)) < 0.8
-    operator = shifted_views(4, unseen_columns=4, flat=generator.uniform(0.4, 1, (11, 9)), valid=valid)
-    background_e = generator.uniform(0, 5, (1, 11, 9))
-    images = ElementalImages(operator.forward(np.full(SHAPE, 2.5)) + background_e, background_e)
-    plane = estimate(operator, images) if estimate is smooth_start else estimate(operator, images, views)
-    seen = operator.coverage(views) > 1e-3
-    assert 0 < seen.sum() < seen.size
-    np.testing.assert_allclose(plane[seen], 2.5, rtol=1e-12)
-
-
-def test_back_projection_without_flat_field_is_divided_by_the_number_of_views_and_zero_where_none_sees() -> None:
-    operator = shifted_views(1, unseen_columns=4)
-    electrons = np.random.default_rng(3).normal(size=operator.images_shape)
-    plane = back_projection(operator, ElementalImages(electrons, background_e=0.5))
-    np.testing.assert_allclose(plane[:, :-4], electrons[0, 1:-1, 1:] - 0.5, rtol=1e-12)
-    np.testing.assert_array_equal(plane[:, -4:], 0.0)
-
-
-def test_a_start_is_positive_even_where_the_data_say_darkness() -> None:
-    operator = shifted_views(3, unseen_columns=5)
-    assert smooth_start(operator, ElementalImages(np.full(operator.images_shape, -1.0))).min() > 0
-    electrons = np.where(np.arange(operator.images_shape[2]) < 3, 50.0, -1.0) * np.ones(operator.images_shape)
-    level_e = operator.adjoint(electrons).sum() / operator.coverage().sum()
-    start = smooth_start(operator, ElementalImages(electrons))
-    assert start.min() == pytest.approx(0.01 * level_e, rel=1e-9)
-    assert start.max() > 2 * level_e
-
-
-def test_a_start_takes_the_mean_level_far_from_what_is_seen() -> None:
-    operator = shifted_views(3, unseen_columns=10)
-    start = smooth_start(operator, ElementalImages(np.full(operator.images_shape, 7.0)))
-    assert (operator.coverage()[:, 3:] == 0).all()
-    np.testing.assert_allclose(start, 7.0, rtol=1e-12)
-
-
-def test_the_universal_weight_is_the_noise_of_the_likelihoods_gradient() -> None:
-    operator = shifted_views(6)
-    images = drawn(operator, box(2, 6), background_e=0.5, variance_e2=12.0)
-    weight = universal_penalty_weight(operator, images, np.full(SHAPE, 3.0))
-    assert weight == pytest.approx(0.7 * np.sqrt(6 / 15.5), rel=1e-12)
-    brighter = replace(images, background_e=0.5 + 15.5 * 3)
-    assert universal_penalty_weight(operator, brighter, np.full(SHAPE, 3.0)) == pytest.approx(weight / 2, rel=1e-12)

@@ -7,11 +7,11 @@ from faintfield.pipelines.reconstruction.planes import Objective, Settings, cert
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
-from faintfield.recon.solver.problem import PosedScene
+from faintfield.recon.solver.problem import SceneProblem
 from faintfield.recon.solver.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
-from tests.recon.test_held_out import dark_views
-from tests.recon.test_held_out import scene as pieces
+from tests.recon.test_cross_validation import dark_views
+from tests.recon.test_cross_validation import scene as pieces
 from tests.recon.test_scene_fit import scene
 
 
@@ -79,7 +79,7 @@ def test_each_plane_of_a_scene_has_its_own_as_if_the_others_were_known() -> None
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
     settings = Settings(penalty_weight=0.8, uncertainty=True)
-    found = certified(Objective.of(PosedScene(posed.operator, images), settings), settings)
+    found = certified(Objective.of(SceneProblem(posed.operator, images), settings), settings)
     for solution, grid in zip(found, posed.operator.grids, strict=True):
         assert solution.beside["sigma"].shape == grid.shape
         assert solution.beside["sigma"].min() > 0

@@ -5,26 +5,26 @@ import pytest
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane import PlaneOperator
-from faintfield.recon.solver.cross_validation import chosen_weight, held_out_views
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.problem import PosedPlane
-from faintfield.recon.solver.starts import smooth_start, universal_penalty_weight
+from faintfield.recon.solver.problem import SceneProblem
 
 
 @pytest.mark.parametrize("views", [4, 5, 9, 13, 25, 49, 50, 81, 98])
 def test_folds_are_disjoint_and_cover_all_views(views: int) -> None:
     count = max(2, min(7, views // 2))
-    folds = [held_out_views(views, fold) for fold in range(count)]
+    folds = [validation_views(views, fold) for fold in range(count)]
     assert sorted(np.concatenate(folds).tolist()) == list(range(views))
     assert all(0.5 <= len(fold) * count / views <= 2 for fold in folds)
 
 
 def test_in_a_grid_of_seven_by_seven_each_row_and_column_gives_one() -> None:
     for fold in range(7):
-        rows, columns = np.divmod(held_out_views(49, fold), 7)
+        rows, columns = np.divmod(validation_views(49, fold), 7)
         assert sorted(rows.tolist()) == sorted(columns.tolist()) == list(range(7))
 
 
@@ -59,10 +59,10 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
                 break
         return float(np.mean((iterate.plane - truth)[8:-8, 8:-8] ** 2))
 
-    chosen = chosen_weight(PosedPlane(operator, images), guess / 3, Penalty())  # a guess that is far off
+    chosen = cross_validated_weight(SceneProblem(operator, images), guess / 3, Penalty())  # a guess that is far off
     best = min(error(guess * 2 ** (step / 2)) for step in range(-3, 4))
     assert error(chosen.weight) <= 1.1 * best
-    scores = {tried.weight: tried.held_out for tried in chosen.tried}
+    scores = {tried.weight: tried.loss for tried in chosen.candidates}
     assert min(scores) < chosen.weight < max(scores)
     assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
     assert chosen.passes < 60 * 7  # each of seven folds: these views have few pixels
@@ -71,7 +71,7 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
 def test_too_few_views_are_refused() -> None:
     few = PlaneOperator(np.stack([np.eye(3)] * 3), np.zeros((4, 4, 2)), PlaneGrid((4, 4), 1.0, (0.0, 0.0)))
     with pytest.raises(ValueError, match="at least 4 views"):
-        chosen_weight(PosedPlane(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
+        cross_validated_weight(SceneProblem(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
 
 
 def test_views_that_see_nothing_are_neither_kept_nor_held_out() -> None:
@@ -79,9 +79,9 @@ def test_views_that_see_nothing_are_neither_kept_nor_held_out() -> None:
     aside = np.stack([np.eye(3)] * 49)
     aside[:, 0, 2] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
     rays = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1)
-    posed = PosedPlane(PlaneOperator(aside, rays, operator.grid), images)
+    posed = SceneProblem(PlaneOperator(aside, rays, operator.grid), images)
     assert posed.views.tolist() == list(range(3, 49, 7))
-    assert np.isfinite([tried.held_out for tried in chosen_weight(posed, 1.0, Penalty()).tried]).all()
+    assert np.isfinite([tried.loss for tried in cross_validated_weight(posed, 1.0, Penalty()).candidates]).all()
 
 
 def test_a_solver_that_finds_no_way_down_ends_the_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,4 +93,4 @@ def test_a_solver_that_finds_no_way_down_ends_the_candidate(monkeypatch: pytest.
         return value, -gradient
 
     monkeypatch.setattr(DataFit, "value_and_gradient", misled)
-    assert chosen_weight(PosedPlane(operator, images), 1.0, Penalty()).tried
+    assert cross_validated_weight(SceneProblem(operator, images), 1.0, Penalty()).candidates

@@ -1,0 +1,109 @@
+# mypy: disable-error-code="no-untyped-def"
+"""Where a block of pixels of one detector row lies on each plane, compiled."""
+
+import numpy as np
+
+from faintfield.recon.elementary import compiled, inlined
+from faintfield.recon.operator.block_layout import (
+    BLOCK_PX,
+    COLUMN,
+    COLUMN_TAPS,
+    MARGIN,
+    ROW,
+    ROW_TAPS,
+    WEIGHT,
+    place_of,
+)
+from faintfield.recon.pointers import index
+
+# A pixel this far outside the samples (in samples) still sees their edge: rounding must not decide whether the border
+# of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
+EDGE_TOLERANCE = 1e-3
+
+# How a block lies on a plane; the last four are in step with it, with so many rows and columns of taps.
+OUTSIDE, SCATTERED, IN_STEP_2_2, IN_STEP_2_3, IN_STEP_3_3, IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
+
+
+@compiled
+def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, scratch, blocks):
+    """Find where a block of pixels lies on every plane; return whether it sees any.
+
+    `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that sample's row and column.
+    """
+    meets = False
+    for plane in range(index(planes)):
+        start, height, width = (
+            layout[index(3) * plane],
+            layout[index(3) * plane + index(1)],
+            layout[index(3) * plane + index(2)],
+        )
+        row_from, row_to, column_from, column_to = _locate(
+            homographies, matrix + index(9) * plane * views, maps, layer, pixel, height, width, scratch, place_of(plane)
+        )
+        start += row_from * width + column_from
+        how = _arrangement(row_from, row_to, column_from, column_to, start, width, samples)
+        block = index(4) * plane
+        blocks[block], blocks[block + index(1)] = how, start
+        blocks[block + index(2)], blocks[block + index(3)] = row_from, column_from
+        meets |= how != OUTSIDE
+    return meets
+
+
+@compiled
+def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, place):
+    """Find where a block's rays meet a plane; return the range of the rows, and that of column minus pixel.
+
+    Rows `_COLUMN` (minus the pixel's number), `_ROW` and `_WEIGHT` of `place` are written. The weight is the pixel's
+    response, or zero where it does not see the plane: all four samples must exist, so that no edge of the plane dims
+    the model, but points up to `EDGE_TOLERANCE` outside count as on the edge. If no pixel sees it, ranges are empty.
+    """
+    number = type(scratch[0])  # Python numbers would promote float32 to float64
+    zero, one, margin = number(0), number(1), number(EDGE_TOLERANCE)
+    last_row, last_column = number(height - 1), number(width - 1)
+    greatest, least = np.int32(2**30), np.int32(-(2**30))
+    row_from, row_to, column_from, column_to = greatest, least, greatest, least
+    # In local variables, or the compiler would load them again for every pixel, after each store to the scratch
+    a, b, c = homographies[matrix], homographies[matrix + index(1)], homographies[matrix + index(2)]
+    d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
+    g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
+    for k in range(index(BLOCK_PX)):
+        at = pixel + k
+        x, y, response = maps[at], maps[at + layer], maps[at + layer + layer]
+        scale = g * x + h * y + i
+        inverse = one / scale
+        column, row = (a * x + b * y + c) * inverse, (d * x + e * y + f) * inverse
+        # Comparisons with NaN are false: such a pixel is placed at zero, and does not see the plane
+        within_column = column if column > zero else zero
+        within_column = within_column if within_column < last_column else last_column
+        within_row = row if row > zero else zero
+        within_row = within_row if within_row < last_row else last_row
+        # scale > 0 also means that the plane is in front of the camera
+        sees = (scale > zero) & (abs(column - within_column) <= margin) & (abs(row - within_row) <= margin)
+        advance = within_column - number(np.int32(k))
+        scratch[place + index(COLUMN) + k] = advance
+        scratch[place + index(ROW) + k] = within_row
+        scratch[place + index(WEIGHT) + k] = response if sees else zero
+        whole_column, whole_row = np.int32(np.floor(advance)), np.int32(within_row)
+        row_from, row_to = min(row_from, whole_row if sees else greatest), max(row_to, whole_row if sees else least)
+        column_from = min(column_from, whole_column if sees else greatest)
+        column_to = max(column_to, whole_column if sees else least)
+    return row_from, row_to, column_from, column_to
+
+
+@inlined
+def _arrangement(row_from, row_to, column_from, column_to, start, stride, samples):
+    """Return how a block lies on a plane.
+
+    Taps of pixels that do not see the plane may lie outside it: their weights are zero, but the samples must exist.
+    """
+    if row_to < row_from:
+        return OUTSIDE
+    rows, columns = row_to - row_from + 2, column_to - column_from + 2
+    end = start + (ROW_TAPS - 1) * stride + BLOCK_PX + MARGIN
+    if rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
+        return SCATTERED
+    if columns > 3:
+        return IN_STEP_3_4
+    if rows > 2:
+        return IN_STEP_3_3
+    return IN_STEP_2_3 if columns > 2 else IN_STEP_2_2

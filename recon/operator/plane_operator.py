@@ -1,0 +1,52 @@
+"""H of a single plane, for callers that have one plane: its samples are an array (row, column)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.scene_operator import SceneOperator
+
+
+class PlaneOperator(SceneOperator):
+    """H of one plane, a scene of one, whose samples have the shape (row, column).
+
+    Parameters
+    ----------
+    plane_from_ray : array (view, 3, 3)
+        Homography from a ray (x, y, 1) to plane coordinates (x, y, 1) in mm; the homogeneous scale is positive for
+        points in front of the camera.
+    rays, flat, valid, lattice_of_view, dtype, workers
+        As for `recon.operator.scene_operator.SceneOperator`.
+    grid : PlaneGrid
+        The samples of the plane.
+
+    Raises
+    ------
+    GeometryMismatch
+        Shapes do not fit together, a number is not finite, or no pixel of any view sees the plane.
+    """
+
+    def __init__(
+        self,
+        plane_from_ray: NDArray[np.floating],
+        rays: NDArray[np.floating],
+        grid: PlaneGrid,
+        *,
+        flat: NDArray[np.floating] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        lattice_of_view: NDArray[np.intp] | None = None,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
+        workers: int | None = None,
+    ) -> None:
+        super().__init__(
+            plane_from_ray[np.newaxis],
+            rays,
+            [grid],
+            flat=flat,
+            valid=valid,
+            lattice_of_view=lattice_of_view,
+            dtype=dtype,
+            workers=workers,
+        )
+        self.grid = grid
+        self.samples_shape = grid.shape

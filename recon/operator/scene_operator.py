@@ -1,0 +1,277 @@
+"""The operator H of eq. (1): what each detector pixel of each view sees of the planes of a scene, and its adjoint."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator import kernels
+from faintfield.recon.operator.block_layout import make_workspace
+from faintfield.recon.operator.geometry import scene_geometry
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.threads import run_in_threads
+
+type ViewSelection = Sequence[int] | NDArray[np.integer] | None
+
+
+class SceneOperator:
+    """H of the planes of a scene, `g = Σ_z H_z f_z`: matrix-free and linear, with an adjoint that shares its weights.
+
+    One camera takes every view, so the lens (distortion included) is one shared map from detector pixel to ray, and a
+    view is one homography from rays to each plane. H interpolates a plane bilinearly at each detector pixel; Hᵀ spreads
+    each pixel to the same four samples with the same weights. The images themselves are never resampled. A pixel sees a
+    plane when all four samples around its point exist; otherwise its weights on that plane are zero.
+
+    *Samples* are an array of the shape `samples_shape`: those of all planes, one plane after the other. Methods that
+    take `views` use all views by default. `recon.operator.plane_operator.PlaneOperator` is the scene of one plane.
+
+    Parameters
+    ----------
+    plane_from_ray : array (plane, view, 3, 3)
+        Homographies from a ray (x, y, 1) to the coordinates (x, y, 1) of each plane in mm; the homogeneous scale is
+        positive for points in front of the camera.
+    rays : array (row, column, 2) or (lattice, row, column, 2)
+        Where each detector pixel looks: x, y at unit depth, lens distortion undone.
+    grids : sequence of PlaneGrid
+        The samples of each plane.
+    flat : array (row, column) or (lattice, row, column), optional
+        Relative response of each pixel (vignetting); zero for pixels that never count.
+    valid : bool array (view, row, column), optional
+        False for pixels that do not count in one view.
+    transmission : float array (plane, view, row, column), optional
+        Fraction of a plane's light that reaches a pixel past nearer planes; multiplies H and Hᵀ. One by default.
+    lattice_of_view : int array (view,), optional
+        The lattice of detector pixels of each view; the first by default.
+    dtype : dtype
+        Type of samples and images: float32 for work, float64 for tests.
+    workers : int, optional
+        Number of threads; as many as the process may use by default. The last digits of sums depend on it.
+
+    Raises
+    ------
+    GeometryMismatch
+        Shapes do not fit together, a number is not finite, a transmission is negative, or no pixel of any view sees one
+        of the planes.
+
+    Notes
+    -----
+    f is in expected electrons per detector pixel before the flat field; see docs/physics.md, "The operator".
+    """
+
+    def __init__(
+        self,
+        plane_from_ray: NDArray[np.floating],
+        rays: NDArray[np.floating],
+        grids: Sequence[PlaneGrid],
+        *,
+        flat: NDArray[np.floating] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        transmission: NDArray[np.floating] | None = None,
+        lattice_of_view: NDArray[np.intp] | None = None,
+        dtype: type[np.float32] | type[np.float64] = np.float32,
+        workers: int | None = None,
+    ) -> None:
+        self.grids = tuple(grids)
+        self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
+        self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
+        rays = rays[np.newaxis] if rays.ndim == 3 else rays
+        self._geometry = scene_geometry(
+            plane_from_ray, rays, self.grids, flat, valid, transmission, lattice_of_view, self.dtype
+        )
+        self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
+        self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
+        self._size = sum(grid.shape[0] * grid.shape[1] for grid in self.grids)
+        self.samples_shape: tuple[int, ...] = (self._size,)
+        self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), self._geometry.lattice_of_view
+        # Each pixel that sees the scene has weights that sum to its response: H 1 is known without a sweep
+        self.row_sums_are_response = len(self.grids) == 1 and transmission is None
+        self._sweep(kernels.REACH, self.all_views, self.all_views)
+        self._check_seen()
+
+    def forward(self, samples: Image, views: ViewSelection = None) -> Image:
+        """Return H f: the planes as each view sees them together, (view, row, column)."""
+        chosen = self._views(views)
+        seen = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
+        image_of_view = np.zeros(self.images_shape[0], np.intp)
+        image_of_view[chosen] = np.arange(len(chosen))
+        self._sweep(kernels.FORWARD, chosen, image_of_view, samples=self._flat(samples), seen=seen)
+        return seen
+
+    def adjoint(self, images: Image, views: ViewSelection = None) -> Image:
+        """Return Hᵀ g (samples) of images (view, row, column), summed over `views`."""
+        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=self._images(images))[1]
+
+    def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
+        """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
+        return self._sweep(kernels.ADJOINT, self._views(views), self.lattice_of_view, images=self._map(value))[1]
+
+    def sensitivity(self, views: ViewSelection = None) -> Image:
+        """Return s = Hᵀ 1 (samples): without flat field, the number of views that see each sample."""
+        return self.adjoint_of_map(1.0, views)
+
+    def coverage(self, views: ViewSelection = None) -> Image:
+        """Return Hᵀ H 1 (samples), by which a back-projection is divided to keep constant planes constant."""
+        if self.row_sums_are_response:
+            return self.adjoint_of_map(self.response(), views)
+        seen, chosen = np.zeros(self.images_shape, self.dtype), self._views(views)
+        seen[chosen] = self.forward(np.ones(self.samples_shape, self.dtype), chosen)
+        return self.adjoint(seen, chosen)
+
+    @cached_property
+    def seeing_views(self) -> NDArray[np.intp]:
+        """The views in which some pixel that counts sees one of the planes."""
+        return np.array([view for view in self.all_views.tolist() if self.sensitivity([view]).any()])
+
+    def response(self) -> Image:
+        """Return the relative response of each pixel (lattice, row, column)."""
+        maps = self._geometry.maps.reshape(3, *self.maps_shape[:2], -1)
+        return np.asarray(maps[2, ..., : self.maps_shape[2]])
+
+    def value_and_ratio(
+        self, samples: Image, images: ElementalImages, views: ViewSelection = None
+    ) -> tuple[float, Image]:
+        """Return the negative log-likelihood of samples and Hᵀ r (samples), in one sweep.
+
+        r is the ratio of `recon.likelihood.pixel_models`: the gradient of the negative log-likelihood is s − Hᵀ r.
+        Terms that do not depend on f are left out.
+        """
+        return self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views)
+
+    def adjoint_of_ratio(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> Image:
+        """Return Hᵀ r (samples) alone: for shifted Poisson data Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ], as in eq. (2)."""
+        return self._likelihood(kernels.RATIO, samples, images, views)[1]
+
+    def negative_log_likelihood(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> float:
+        """Return the negative log-likelihood alone, without terms that do not depend on f, in a sweep that only reads.
+
+        For the shifted Poisson model it is `Σ m − y + y ln(y/m)`, with `y = (g + σ²)₊` and `m = H f + b + σ²`. The sum
+        runs over the pixels that see a plane.
+        """
+        return self._likelihood(kernels.VALUE, samples, images, views)[0]
+
+    def planes_of[Number: np.generic](self, samples: NDArray[Number]) -> list[NDArray[Number]]:
+        """Return each plane (row, column) of samples, as views into them."""
+        parts = np.split(samples.reshape(-1), self._geometry.layout[1:, 0])
+        return [part.reshape(grid.shape) for part, grid in zip(parts, self.grids, strict=True)]
+
+    def samples_of(self, planes: Sequence[Image]) -> Image:
+        """Return the samples of planes (row, column); a single plane is not copied."""
+        if [plane.shape for plane in planes] != [grid.shape for grid in self.grids]:
+            shapes = " and ".join(str(plane.shape) for plane in planes)
+            wanted = " and ".join(str(grid.shape) for grid in self.grids)
+            raise GeometryMismatch(
+                f"the planes given have the shapes {shapes}, those of the operator {wanted}; give them those"
+            )
+        flat = [np.ascontiguousarray(plane, self.dtype).reshape(-1) for plane in planes]
+        return (flat[0] if len(flat) == 1 else np.concatenate(flat)).reshape(self.samples_shape)
+
+    def map_of_views(self, value: float | Image, views: NDArray[np.intp]) -> float | Image:
+        """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
+        return value if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
+
+    def _check_seen(self) -> None:
+        """Refuse planes that no pixel sees."""
+        for grid, sensitivity in zip(self.grids, self.planes_of(self.sensitivity()), strict=True):
+            if not sensitivity.any():
+                raise GeometryMismatch(
+                    f"no pixel of any of the {len(self.all_views)} views sees the plane of {grid.shape[1]} x "
+                    f"{grid.shape[0]} samples at {grid.pitch_mm:.3g} mm; check its depth, the poses and their signs, "
+                    "and that not all pixels are masked (saturated, hot)"
+                )
+
+    def _likelihood(
+        self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection
+    ) -> tuple[float, Image]:
+        """Run one of the sweeps that compare samples with the data."""
+        if images.valid is not None and not self._geometry.valid.size:
+            raise GeometryMismatch("the images have pixels that do not count; make the operator with their `valid`")
+        likelihood = images.likelihood
+        pixels = kernels.PixelModel(
+            likelihood.model,
+            _read_only(self._map(images.background_e)),
+            _read_only(self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0)),
+            likelihood.level_e,
+        )
+        flat, electrons, chosen = self._flat(samples), self._images(images.electrons), self._views(views)
+        return self._sweep(operation, chosen, self.all_views, samples=flat, images=electrons, pixels=pixels)
+
+    def _sweep(
+        self,
+        operation: int,
+        views: NDArray[np.intp],
+        image_of_view: NDArray[np.intp],
+        *,
+        samples: Image | None = None,
+        images: Image | None = None,
+        seen: Image | None = None,
+        pixels: kernels.PixelModel | None = None,
+    ) -> tuple[float, Image]:
+        """Run one kernel on all workers; return the sums of their values and of their accumulators."""
+        scatters, nothing = operation in kernels.SCATTERING, _read_only(np.zeros(1, self.dtype))
+        sums = [np.zeros(self._size if scatters else 1, self.dtype) for _ in range(self._workers)]
+        planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
+        pixels = pixels or kernels.PixelModel(0, nothing, nothing, 0.0)
+
+        def work(worker: int) -> float:
+            written = np.zeros(1, self.dtype) if seen is None else seen.reshape(-1)
+            arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
+            space = make_workspace(len(self.grids), self.dtype)
+            share = (_read_only(views), worker, self._workers)
+            return float(kernels.sweep(operation, *arrays, pixels, self._geometry, space, *share))
+
+        values = run_in_threads(work, range(self._workers))
+        for other in sums[1:]:
+            sums[0] += other
+        return sum(values), sums[0].reshape(self.samples_shape) if scatters else sums[0]
+
+    def _flat(self, samples: Image) -> Image:
+        """Return samples (sample,) in the operator's dtype, copied only where they have to be."""
+        if samples.shape != self.samples_shape:
+            raise GeometryMismatch(
+                f"samples have shape {samples.shape}, the operator {self.samples_shape}; give samples of that shape"
+            )
+        return np.ascontiguousarray(samples, self.dtype).reshape(-1)
+
+    def _images(self, images: Image) -> Image:
+        if images.shape != self.images_shape:
+            raise GeometryMismatch(
+                f"images have shape {images.shape}, the operator {self.images_shape}; give images of that shape"
+            )
+        return np.ascontiguousarray(images, self.dtype)
+
+    def _map(self, value: float | Image) -> Image:
+        try:
+            return np.ascontiguousarray(np.broadcast_to(value, self.maps_shape), self.dtype)
+        except ValueError:
+            raise GeometryMismatch(
+                f"a map has shape {np.shape(value)}, the operator's lattices {self.maps_shape}; give "
+                "one map per lattice, or a number"
+            ) from None
+
+    def _views(self, views: ViewSelection) -> NDArray[np.intp]:
+        """Return the selected views, each at most once: the kernels do not check them."""
+        if views is None:
+            return self.all_views
+        chosen = np.asarray(views)
+        if chosen.size == 0:
+            return chosen.astype(np.intp)
+        if chosen.dtype.kind not in "iu" or np.unique(chosen).size < chosen.size:
+            raise ValueError(f"views must be whole numbers, none of them twice, got {views}")
+        if chosen.min() < 0 or chosen.max() >= len(self.all_views):
+            raise ValueError(f"views must lie within 0 and {len(self.all_views) - 1}, got {views}")
+        return chosen.astype(np.intp)
+
+
+def _read_only[Number: np.generic](array: NDArray[Number]) -> NDArray[Number]:
+    """Return the elements of an array (element,) as a view that cannot be written to.
+
+    To the compiler, arrays that can and cannot be written to are different types, and a memory map may be of either.
+    """
+    flat = array.reshape(-1)
+    flat.flags.writeable = False
+    return flat

@@ -1,0 +1,73 @@
+"""The start of every reconstruction: back-projection, smooth positive samples, a penalty weight from the noise."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
+from faintfield.recon.smoothing import blurred
+
+# Spacings of the blur, which has a standard deviation of 2 samples.
+_START_BLUR = (1, 1, 1, 1, 2)
+
+# Start level in electrons where the mean of the views is not positive: a start must be above zero.
+_MIN_LEVEL_E = 1e-6
+
+
+def back_projection(operator: SceneOperator, images: ElementalImages, views: ViewSelection = None) -> Image:
+    """Return `Hᵀ(g − b) / Hᵀ H 1` (samples): the mean of what the views say of each sample.
+
+    It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that
+    contribute, as in the paper.
+    """
+    light = operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
+    coverage = operator.coverage(views)
+    return np.divide(light, coverage, out=np.zeros_like(light), where=coverage > 0)
+
+
+def smooth_start(operator: SceneOperator, images: ElementalImages, views: ViewSelection = None) -> Image:
+    """Return positive samples to start from: the back-projection, blurred, at least a hundredth of its mean.
+
+    A multiplicative iteration can neither leave zero nor start below it. The blur weights by coverage, so that samples
+    that no view sees take the level of their neighbours. Several planes share the light, since the coverage of each
+    counts what its pixels see of all.
+    """
+    coverages = operator.planes_of(operator.coverage(views))
+    lights = operator.planes_of(
+        operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
+    )
+    mean = sum(float(x.sum(dtype=np.float64)) for x in lights) / sum(float(x.sum(dtype=np.float64)) for x in coverages)
+    level = max(mean, _MIN_LEVEL_E)
+    starts = []
+    for light, coverage in zip(lights, coverages, strict=True):
+        covered = blurred(coverage, _START_BLUR)
+        start = np.full_like(light, level)
+        np.divide(blurred(light, _START_BLUR), covered, out=start, where=covered > 1e-3 * covered.max())
+        starts.append(np.maximum(start, 0.01 * level, out=start))
+    return operator.samples_of(starts)
+
+
+def well_seen_samples(sensitivity: Image) -> NDArray[np.bool_]:
+    """Return which samples represent a plane: those seen at least a hundredth as much as the best seen."""
+    return np.asarray(sensitivity > 0.01 * sensitivity.max())
+
+
+def mean_light_e(operator: SceneOperator, samples: Image) -> float:
+    """Return the mean light of a pixel: the sum of the means over each plane's well-seen samples."""
+    planes = zip(operator.planes_of(samples), operator.planes_of(operator.sensitivity()), strict=True)
+    return sum(float(plane[well_seen_samples(seen)].mean(dtype=np.float64)) for plane, seen in planes)
+
+
+def universal_penalty_weight(operator: SceneOperator, images: ElementalImages, samples: Image) -> float:
+    """Return a penalty weight from the noise alone: β = 0.7 √( s / (f + b + σ²) ), from the median of s and means.
+
+    The noise of the likelihood's gradient has the standard deviation √( s / (f + b + σ²) ) at each sample, and eq. (3)
+    is of the order of one, so this weight removes fluctuations of about that size. It is a starting point that needs no
+    tuning, not the best weight for a scene.
+    """
+    sensitivity = operator.sensitivity()
+    seen = well_seen_samples(sensitivity)
+    # A pixel of a scene sees the light of all planes
+    light_e = samples if len(operator.grids) == 1 else np.full_like(samples, mean_light_e(operator, samples))
+    per_view_e = light_e[seen].mean() + np.mean(images.known_variance_e2())
+    return float(0.7 * np.sqrt(np.median(sensitivity[seen]) / per_view_e))
