@@ -75,17 +75,17 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.recon.operator.grid import PlaneGrid as PlaneGrid
     from faintfield.recon.operator.plane_operator import PlaneOperator as PlaneOperator
     from faintfield.recon.solver.data_fit import DataFit as DataFit
-    from faintfield.recon.solver.pmlem import pmlem as pmlem
     from faintfield.recon.solver.initialization import back_projection as back_projection
     from faintfield.recon.solver.initialization import smooth_start as smooth_start
     from faintfield.recon.solver.initialization import universal_penalty_weight as universal_penalty_weight
+    from faintfield.recon.solver.pmlem import pmlem as pmlem
     from faintfield.rig.devices import open_rig as open_rig
     from faintfield.rig.devices import open_stage as open_stage
     from faintfield.rig.errors import OutsideTravel as OutsideTravel
     from faintfield.rig.errors import RigError as RigError
     from faintfield.rig.plan import CapturePlan as CapturePlan
-    from faintfield.rig.plan import Grid as Grid
     from faintfield.rig.plan import CaptureStep as CaptureStep
+    from faintfield.rig.plan import Grid as Grid
     from faintfield.rig.session.access import taken_frames as taken_frames
     from faintfield.rig.settings import RigSettings as RigSettings
     from faintfield.rig.stages.protocol import MotionLimits as MotionLimits

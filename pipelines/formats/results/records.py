@@ -71,7 +71,7 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     certificate: Certificate | None
     mean_e: float
     passes_before: float | UnsetType = UNSET
-    penalty_weight_curve: list[WeightScore] | None | UnsetType = UNSET
+    penalty_weight_curve: list[WeightScore] | UnsetType | None = UNSET
     penalty: PenaltyRecord | UnsetType = UNSET
     likelihood: str | UnsetType = UNSET
     occlusion: bool | UnsetType = UNSET
