@@ -16,7 +16,8 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import building_folder, write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, LoadedSet, load_set, write_set
+from faintfield.pipelines.formats.sets.elemental_file import write_set
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
 from faintfield.pipelines.reconstruction.brightness import brightness
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
@@ -125,7 +126,7 @@ def object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray(levels > threshold)
 
 
-def _light(loaded: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
+def _light(loaded: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
     """Return what a bright view says of the light: electrons above the dark level, never negative."""
     frame = checked_frame(loaded, path, layouts[0])
     light = np.zeros(frame.pixels_dn.shape, np.float32)
@@ -139,7 +140,7 @@ def _light(loaded: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArr
     return light
 
 
-def _names(loaded: LoadedSet) -> list[str]:
+def _names(loaded: ElementalSet) -> list[str]:
     """Return the file names of the dark views: those of the bright ones where that keeps them apart."""
     stems = [Path(view.image).stem for view in loaded.settings.view]
     if len({*stems, *_TAKEN}) < len(stems) + len(_TAKEN):
@@ -148,7 +149,7 @@ def _names(loaded: LoadedSet) -> list[str]:
 
 
 def _write_dark_views(
-    loaded: LoadedSet,
+    loaded: ElementalSet,
     layouts: list[ChannelLayout],
     folder: Path,
     sensor: SimulatedSensor,

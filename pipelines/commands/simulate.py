@@ -13,7 +13,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import building_folder, write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_frame, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
 from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
@@ -224,7 +224,7 @@ def _write_toml(
     )
     nodes = grid_nodes(experiment.rows, experiment.columns)
     views = [View(name, tuple(pose.tolist()), node) for name, pose, node in zip(names, poses, nodes, strict=True)]
-    write_set(folder, ElementalSet(1, experiment.exposure_s, experiment.reference_view, camera, noise, views))
+    write_set(folder, ElementalSetFile(1, experiment.exposure_s, experiment.reference_view, camera, noise, views))
 
 
 def _write_truth(

@@ -135,7 +135,7 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def exclusive(folder: Path) -> Iterator[None]:
     """Have a folder of results to oneself, made if need be; it goes again if nothing was put into it.
 
     Raises

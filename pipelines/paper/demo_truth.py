@@ -17,7 +17,7 @@ from faintfield.pipelines.commands.simulate import NOISE_FREE, write_ground_trut
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.measured_poses import read_geometry
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
@@ -58,7 +58,7 @@ def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
     return {node: relative(pose, reference) for node, pose in recorded.items()}
 
 
-def true_set(session: Path, truth: Path) -> LoadedSet:
+def true_set(session: Path, truth: Path) -> ElementalSet:
     """Return a session's dark-scene views with the lens, the poses, the response and the noise that they really had."""
     loaded, free = nominal_session(session), load_set(truth / NOISE_FREE)
     poses = {view.node: view.rt_cam_ref for view in free.settings.view}

@@ -11,7 +11,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, read_picture, write_imported_set
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
-from faintfield.pipelines.formats.sets.elemental_set import Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 
 # Without a pitch the unit of length is free: the plane on which the pictures are aligned is put here.

@@ -11,7 +11,7 @@ import msgspec
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -79,7 +79,7 @@ def read_geometry(path: Path) -> GeometryFile:
     return geometry
 
 
-def with_measured_geometry(loaded: LoadedSet, path: Path) -> LoadedSet:
+def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
     """Return a set with the lens of a geometry.json and each view at its node's measured pose.
 
     Raises
