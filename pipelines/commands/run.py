@@ -19,8 +19,8 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
 from faintfield.pipelines.formats.hashes import Hashes
 from faintfield.pipelines.formats.provenance import first_difference, provenance
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, files_beside
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, GeometryRecord
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import RECONSTRUCTION_FILE, REPORT_FILE, write_report
 from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_depths
@@ -113,7 +113,7 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
     """Return the steps from a captured session to the planes of a request, in order."""
     out = session / RECONSTRUCTIONS
     # Not those of the request: other planes need no other geometry
-    gated_mm = list(read_plan(session).rig.scene.depth_mm) or [500.0, 700.0]
+    gated_mm = list(read_plan(session).rig.scene.depth_mm) or list(DEFAULT_DEPTHS_MM)
     of_geometry = {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}
     folders = [(name, folder_of_method(out, name, request.methods)) for name in request.methods]
     records: dict[str, dict[str, Any] | None] = {
@@ -145,7 +145,7 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
             (),
             lambda: _frames(session, "charuco"),
             {GEOMETRY_FILE: of_geometry},
-            files_beside,
+            lambda content: msgspec.convert(content, GeometryRecord).files_beside(),
             measure_geometry,
         ),
         Step(

@@ -15,7 +15,8 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_MAPS, FittedNoise, read_fitted_noise
+from faintfield.pipelines.formats.results.fitted_noise import FittedNoise, read_fitted_noise
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
