@@ -134,7 +134,7 @@ def _say_result(board_set: BoardSet, measured: RigGeometry, stage: StageReport, 
         say(f"without a pose, since no board ties them to the rest: nodes {sorted(missing)}; take them again")
     if stage.node_residual_rms_mm.value is not None:
         say(f"nodes lie {stage.node_residual_rms_mm.value:.3f} mm rms off the regular grid that fits best")
-    for doubt in (*measured.doubts, *stage.doubts):
+    for doubt in (*measured.warnings, *stage.warnings):
         say(doubt)
     repeatability = measured.repeatability
     if repeatability is not None and repeatability.sd_mm > _MOST_REPEATABILITY_MM:

@@ -71,8 +71,8 @@ def holdout_rows(geometry: dict[str, Any]) -> list[dict[str, str]]:
             why = "none can be left out: there is one only"
         return [{"words": words, "value": "–", "why": why}]
     added_px = geometry["rms_inlier_px"] * np.sqrt(max(ratio**2 - 1, 0))
-    limit = f"limit {limits.most_holdout_ratio:g}"
-    if ratio > limits.most_holdout_ratio:
+    limit = f"limit {limits.max_holdout_ratio:g}"
+    if ratio > limits.max_holdout_ratio:
         limit += ", waived: what it adds to so small a residual is negligible"
     return [
         {"words": words, "value": figure(ratio), "why": limit},

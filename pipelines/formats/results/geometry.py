@@ -37,7 +37,7 @@ def geometry_content(
         "format": 1,
         **_summary(geometry, settings),
         "boards": _board_entries(geometry, boards),
-        "stage": asdict(stage),
+        "stage": {"doubts" if name == "warnings" else name: value for name, value in asdict(stage).items()},
         **record,
     }
 
@@ -83,7 +83,7 @@ def _summary(geometry: RigGeometry, settings: GeometrySettings) -> dict[str, Any
         "corners": geometry.corners,
         "outliers": geometry.outliers,
         "holdout_ratio": geometry.holdout_ratio,
-        "doubts": geometry.doubts,
+        "doubts": geometry.warnings,
         "transfer_sigma_px": {
             f"{depth:g}": rms_over_views(transfer_sigma_at(geometry, depth)) for depth in settings.depths_mm
         },
