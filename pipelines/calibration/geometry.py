@@ -100,7 +100,7 @@ def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> Geo
         corners=rig.corners,
         outliers=rig.outliers,
         holdout_ratio=rig.holdout_ratio,
-        warnings=rig.doubts,
+        warnings=rig.warnings,
         transfer_sigma_px={
             f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in measured.settings.depths_mm
         },
@@ -205,7 +205,7 @@ def _stage_record(stage: StageReport) -> StageRecord:
     figures: dict[str, Any] = {
         name: StageFigure(**asdict(value)) for name, value in vars(stage).items() if isinstance(value, Estimate)
     }
-    return StageRecord(**figures, residuals_mm=stage.residuals_mm, warnings=stage.doubts)
+    return StageRecord(**figures, residuals_mm=stage.residuals_mm, warnings=stage.warnings)
 
 
 def _corners_npz(observations: Sequence[BoardObservation]) -> bytes:

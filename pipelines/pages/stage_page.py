@@ -61,8 +61,8 @@ def holdout_rows(geometry: GeometryRecord) -> list[Row]:
         why = "there is one only" if len(geometry.boards) < 2 else "some node would see no other board"
         return [Row(words, "–", why=f"none can be left out: {why}")]
     added_px = geometry.rms_inlier_px * np.sqrt(max(ratio**2 - 1, 0))
-    limit = f"limit {limits.most_holdout_ratio:g}"
-    if ratio > limits.most_holdout_ratio:
+    limit = f"limit {limits.max_holdout_ratio:g}"
+    if ratio > limits.max_holdout_ratio:
         limit += ", waived: what it adds to so small a residual is negligible"
     never = f"px; up to {limits.negligible_holdout_px:g} px is never refused"
     return [

@@ -2,12 +2,12 @@
 
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from faintfield.calib.lens import Lens
+from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
@@ -42,7 +42,7 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
     """
     name, count = _LENS_MODELS[lens_model]
     distortion = [*lens.distortion, *[0.0] * (count - len(lens.distortion))]
-    model = _mrcal().cameramodel(
+    model = load_mrcal().cameramodel(
         intrinsics=(name, np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *distortion])),
         imagersize=np.array(lens.size_px, np.int32),
         rt_cam_ref=np.array(rt_cam_ref, np.float64) * [1, 1, 1, 1e-3, 1e-3, 1e-3],
@@ -75,7 +75,7 @@ def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:
 
 def _read(path: Path, images: Path) -> PosedImage:
     """Return the image of a camera model with its lens and pose."""
-    mrcal = _mrcal()
+    mrcal = load_mrcal()
     try:
         model = mrcal.cameramodel(str(path))
     except Exception as failure:  # mrcal raises exceptions of many types
@@ -102,10 +102,3 @@ def _image_of(path: Path, folder: Path) -> Path:
         if image.is_file():
             return image
     raise MissingFile(f"{folder}: holds no image named {path.stem}; put it there, or name its folder with --images")
-
-
-def _mrcal() -> Any:
-    """Return mrcal, which takes a while to load."""
-    import mrcal
-
-    return mrcal
