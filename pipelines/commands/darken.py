@@ -88,7 +88,8 @@ def darken(
         write_png(folder / OBJECT_REGION, mask_picture(region))
         photons = float(reference_light[region].mean()) * scale / quantum_efficiency
         record = provenance("darken", options, dict(loaded.input_hashes()))
-        write_json(folder / "provenance.json", record | {"scale_e": scale, "photons_on_object": photons})
+        made = msgspec.structs.asdict(record) | {"scale_e": scale, "photons_on_object": photons}
+        write_json(folder / "provenance.json", made)
     figures = brightness(load_set(out))
     known = {"quantum_efficiency": quantum_efficiency, "read_noise_e": read_noise_e}
     inform(f"{out}: SNR {figures.snr:.3f} measured for {snr:g} asked; {photons:.2f} photons per pixel on the object")

@@ -81,7 +81,7 @@ def figures(
         started = time.monotonic()
         remove(out / f"figure{number}_provenance.json")
         made[f"figure{number}"] = makers[number]()
-        record = provenance("figures", options, {}) | {"wall_time_s": time.monotonic() - started}
+        record = msgspec.structs.asdict(provenance("figures", options, {})) | {"wall_time_s": time.monotonic() - started}
         write_json(out / f"figure{number}_provenance.json", record)
         inform(f"figure {number}: {time.monotonic() - started:.1f} s")
     return {"out": str(out), "report": str(_write_page(out)), "figures": made}

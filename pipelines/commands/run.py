@@ -7,15 +7,14 @@ import msgspec
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, GeometryRecord
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
 from faintfield.pipelines.formats.results.records import (
-    DEFAULT_DEPTHS_MM,
     RECONSTRUCTION_FILE,
     REPORT_FILE,
     Method,
     ReconstructionRecord,
 )
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, files_beside
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_depths
@@ -107,7 +106,7 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
             (),
             inputs=lambda: _frames(session, "charuco"),
             results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
-            sidecars=lambda content: files_beside(msgspec.json.decode(content)),
+            sidecars=lambda content: msgspec.json.decode(content, type=GeometryRecord).files_beside(),
             make=measure_geometry,
         ),
         *_steps_of_request(session, request),

@@ -6,16 +6,16 @@ from typing import Any
 
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
+from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.result_files import Errors, Result, read_result
 from faintfield.pipelines.formats.results.stacks import at_depths
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE
 from faintfield.pipelines.pages.page import template
 from faintfield.pipelines.pages.report_calibration import (
-    NOISE_FILE,
+    calibration_origins,
     find_beside,
     geometry_section,
     noise_section,
-    records,
 )
 from faintfield.pipelines.pages.report_depth import depth_sections
 from faintfield.pipelines.pages.report_lead import facts
@@ -66,25 +66,27 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     results = results_below(directory)
     inputs = {name: digest for result in results.values() for name, digest in result["inputs"].items()}
     noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
-    calibrations = {
-        "noise": noise_section(directory, noise, inputs) if noise else None,
-        "geometry": geometry_section(directory, geometry, inputs) if geometry else None,
-    }
+    of_noise = noise_section(directory, noise, inputs) if noise else None
+    of_geometry = geometry_section(directory, geometry, inputs) if geometry else None
     sets = set_sections(_below(directory, OVERVIEW_FILE))
     planes = read_planes(directory, results)
     shown, errors = _plane_sections(planes, results), _error_sections(directory, planes)
     led_by = [row for row in errors["metrics"] if _is_of(row, shown["best"])]
+    the_set = sets[0] if sets else None
     page = template("report.html").render(
         title=_title(directory, results),
-        facts=facts(sets[0] if sets else None, **calibrations, against_truth=errors["geometry_off"], errors=led_by),
+        facts=facts(
+            sets[0] if sets else None, of_noise, of_geometry, against_truth=errors["geometry_off"], errors=led_by
+        ),
         sets=sets,
         **shown,
         depth_maps=depth_sections(directory, results),
-        **calibrations,
+        noise=of_noise,
+        geometry=of_geometry,
         **errors,
         links=_links(directory),
         results=[_origin(directory, folder, result) for folder, result in results.items()],
-        calibrations=records(calibrations.values()),
+        calibrations=calibration_origins(of_noise, of_geometry),
     )
     path = directory / REPORT_FILE
     write_whole(path, page)

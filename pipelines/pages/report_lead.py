@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 
 from faintfield.pipelines.pages.page import figure
+from faintfield.pipelines.pages.report_calibration import GeometrySection, NoiseSection
 
 
 def facts(
     the_set: dict[str, Any] | None,
-    noise: dict[str, Any] | None,
-    geometry: dict[str, Any] | None,
+    noise: NoiseSection | None,
+    geometry: GeometrySection | None,
     *,
     against_truth: dict[str, Any] | None,
     errors: list[dict[str, Any]],
@@ -21,8 +22,8 @@ def facts(
     ----------
     the_set : dict, optional
         The dark scene, of `set_sections`.
-    noise, geometry : dict, optional
-        Of `noise_section` and `geometry_section`.
+    noise, geometry : NoiseSection, GeometrySection, optional
+        The calibrations.
     against_truth : dict, optional
         The `geometry` of metrics.json.
     errors : list of dict
@@ -55,31 +56,31 @@ def _light(the_set: dict[str, Any]) -> list[dict[str, str]]:
     return found
 
 
-def _poses(geometry: dict[str, Any] | None, against_truth: dict[str, Any] | None) -> dict[str, str]:
+def _poses(geometry: GeometrySection | None, against_truth: dict[str, Any] | None) -> dict[str, str]:
     """Return how well the camera's places are known."""
     if geometry is None:
         return _fact("Poses", "as stated", "by the set; not measured")
-    content = geometry["content"]
-    sigma_mm = [node["sigma_mm"] for node in content["nodes"] if node["node"] != content["reference_node"]]
+    record = geometry.record
+    sigma_mm = [node.sigma_mm for node in record.nodes if node.node != record.reference_node]
     known = f"± {_length(float(np.sqrt(np.mean(np.square(sigma_mm))))) if sigma_mm else '–'}"
-    means = f"σ of a node’s position, of {len(content['nodes'])} nodes"
-    if (off := content["stage"]["node_residual_rms_mm"]["value"]) is not None:
+    means = f"σ of a node’s position, of {len(record.nodes)} nodes"
+    if (off := record.stage.node_residual_rms_mm.value) is not None:
         means += f"; they lie {_length(off)} rms off a regular grid"
     if against_truth:
         means += f". Against the truth: {_length(against_truth['centre_rms_mm'])} rms"
-    return _fact("Poses, measured" if geometry["used"] else "Poses, not used here", known, means)
+    return _fact("Poses, measured" if geometry.used else "Poses, not used here", known, means)
 
 
-def _noise(noise: dict[str, Any] | None, the_set: dict[str, Any] | None) -> dict[str, str]:
+def _noise(noise: NoiseSection | None, the_set: dict[str, Any] | None) -> dict[str, str]:
     """Return the sensor's noise."""
     if noise is None:
         assert the_set is not None
         return _fact("Read noise", f"{figure(the_set['read_noise_e'])} e⁻", "as the set states it")
-    read, dark = noise["content"]["read_noise_e"], noise["content"]["dark_current_e_per_s"]
-    means = [f"± {figure(read['se'], 2)}"] if read.get("se") else []
-    means += [] if dark["value"] is None else [f"dark current {figure(dark['value'])} e⁻/s"]
-    name = "Read noise, measured" if noise["used"] else "Read noise, not used here"
-    return _fact(name, f"{figure(read['value'])} e⁻", "; ".join(means))
+    read, dark = noise.record.read_noise_e, noise.record.dark_current_e_per_s
+    means = [f"± {figure(read.se, 2)}"] if read.se else []
+    means += [] if dark.value is None else [f"dark current {figure(dark.value)} e⁻/s"]
+    name = "Read noise, measured" if noise.used else "Read noise, not used here"
+    return _fact(name, f"{figure(read.value)} e⁻", "; ".join(means))
 
 
 def _length(length_mm: float) -> str:

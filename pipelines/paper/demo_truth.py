@@ -1,6 +1,5 @@
 """What only the simulated world knows of a session, and how far off its results are."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +14,10 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.commands.reconstruct import folder_of_method
 from faintfield.pipelines.commands.simulate import NOISE_FREE, write_ground_truth
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE
+from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import read_geometry
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.planes import Method
@@ -115,12 +114,10 @@ def _geometry_errors(session: Path) -> dict[str, Any]:
 def _noise_errors(session: Path) -> dict[str, Any]:
     """Return what was measured of the sensor beside what is true."""
     sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
-    measured = json.loads((session / NOISE_FILE).read_bytes())
+    measured = read_noise(session / NOISE_FILE)
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
-    return {
-        name: {"value": measured[name]["value"], "se": measured[name].get("se"), "truth": getattr(sensor, name)}
-        for name in names
-    }
+    found: dict[str, Measured] = {name: getattr(measured, name) for name in names}
+    return {name: {"value": it.value, "se": it.se, "truth": getattr(sensor, name)} for name, it in found.items()}
 
 
 def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:

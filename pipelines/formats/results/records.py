@@ -23,9 +23,6 @@ JOINT_METHODS: tuple[Method, ...] = ("joint", "occlusion")
 # Where poses come from: as the set states them, measured, where the stage was told to go, or known to the simulator.
 type Poses = Literal["stated", "measured", "nominal", "true"]
 
-# Depths in mm of the two objects of the paper's experiment, the default of the demo, of `figures` and of `geometry`.
-DEFAULT_DEPTHS_MM = (500.0, 700.0)
-
 
 class Certificate(Struct, frozen=True, kw_only=True):
     """How far an iteration came.
