@@ -63,8 +63,8 @@ def _launch(
         result: Any = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
-    elif isinstance(result, dict) and "report" in result:
-        sys.stdout.write(f"{result['report']}\n")
+    elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
+        sys.stdout.write(f"{report}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

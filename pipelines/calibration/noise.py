@@ -98,7 +98,9 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         temperature_c=temperature_c,
         frames=settings.frame,
         warnings=list(dict.fromkeys(warnings)),
-        provenance=NoiseProvenance(**msgspec.structs.asdict(provenance("noise", {}, _input_hashes(sensor.folder, settings)))),
+        provenance=NoiseProvenance(
+            **msgspec.structs.asdict(provenance("noise", {}, _input_hashes(sensor.folder, settings)))
+        ),
     )
 
 

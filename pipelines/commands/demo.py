@@ -6,25 +6,26 @@ from typing import Any, get_args
 
 from faintfield.pipelines.arguments import Positive, Seed
 from faintfield.pipelines.commands.capture import capture
-from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
-from faintfield.pipelines.commands.run import run_steps, session_steps
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.commands.simulate import NOISE_FREE
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.demo_rig import DemoSize, demo_rig
 from faintfield.pipelines.paper.demo_truth import demo_metrics, true_set, write_truth
-from faintfield.pipelines.reconstruction.accuracy import METRICS_FILE
-from faintfield.pipelines.reconstruction.planes import TOGETHER, Method
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+from faintfield.pipelines.reconstruction.steps import run_steps
 
 # By this file a folder is known as one that an earlier demo made, and that the next may replace.
 _MARK = "demo.json"
 
 # All that find each plane by itself; what finds planes together would take the demo too long.
-_METHODS: list[Method] = [method for method in get_args(Method.__value__) if method not in TOGETHER]
+_METHODS: list[Method] = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 
 
 def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.16, seed: Seed = 1) -> dict[str, Any]:
@@ -57,10 +58,10 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     run_steps(session, session_steps(session, Request(depths, _METHODS)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
-    reconstruct_set(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
+    reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
     alone = Request(depths, [DEFAULT_METHOD])
-    reconstruct_set(nominal_session(session), out / "nominal", alone)
-    reconstruct_set(true_set(session, truth), out / "true", alone)
+    reconstruct_and_report(nominal_session(session), out / "nominal", alone)
+    reconstruct_and_report(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth, _METHODS, DEFAULT_METHOD)
     write_json(out / METRICS_FILE, metrics)
     return {"out": str(out), "report": str(write_report(out)), "metrics": metrics}

@@ -16,18 +16,19 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
+from faintfield.pipelines.formats.results.records import Method
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, as_csv, as_rows, curves, is_monotone, measure, over_best
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
-from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.pipelines.reconstruction.run import Outcome
 from faintfield.recon.smoothing import blurred
 
 PAGE_FILE = "figures.html"
 
-_DEPTHS_MM = [500.0, 700.0]
 _SCENE, _BRIGHT, _DARK = "dark-scene", "bright", "dark"
 
 # Detail is what this blur removes; its standard deviation is 2 samples.
@@ -81,7 +82,9 @@ def figures(
         started = time.monotonic()
         remove(out / f"figure{number}_provenance.json")
         made[f"figure{number}"] = makers[number]()
-        record = msgspec.structs.asdict(provenance("figures", options, {})) | {"wall_time_s": time.monotonic() - started}
+        record = msgspec.structs.asdict(provenance("figures", options, {})) | {
+            "wall_time_s": time.monotonic() - started
+        }
         write_json(out / f"figure{number}_provenance.json", record)
         inform(f"figure {number}: {time.monotonic() - started:.1f} s")
     return {"out": str(out), "report": str(_write_page(out)), "figures": made}
@@ -126,31 +129,34 @@ def _figure3(out: Path) -> dict[str, Any]:
     loaded = load_set(out / _SCENE)
     dark = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
     reference = read_frame(out / _SCENE / NOISE_REFERENCE).pixels_dn
-    metrics = result["metrics"]
-    measured = metrics["snr"]["measured"]
+    metrics = result.metrics
+    assert metrics is not None
+    measured = metrics.snr.measured
+    assert measured is not None
     picture = draw_figure3(dark, reference, grey_scale_dn(dark), measured, planes)
     rows = [
         {
-            **{key: row[key] for key in ("depth_mm", "object", "method", "mse_bright", "mse_texture", "psnr_db")},
-            "penalty_weight": record["penalty_weight"],
-            "passes": record["passes"],
+            **{
+                key: getattr(row, key)
+                for key in ("depth_mm", "object", "method", "mse_bright", "mse_texture", "psnr_db")
+            },
+            "penalty_weight": record.penalty_weight,
+            "passes": record.passes,
         }
-        for row, record in zip(metrics["planes"], result["planes"], strict=True)
+        for row, record in zip(metrics.planes, result.planes, strict=True)
     ]
-    figures_of_light = {key: metrics[key] for key in ("snr", "photons_per_px")}
+    figures_of_light = {"snr": metrics.snr, "photons_per_px": metrics.photons_per_px}
     return _written(out, 3, picture, rows, figures_of_light | {"planes": rows})
 
 
-def _reconstructed(elemental_set: Path, out: Path, method: Method) -> tuple[list[Any], dict[str, Any]]:
+def _reconstructed(elemental_set: Path, out: Path, method: Method) -> tuple[list[Any], Outcome]:
     """Reconstruct both planes of a set by a method, and return them with what `reconstruct` says."""
     from faintfield.pipelines.paper.figure_drawings import Shown
 
-    result = reconstruct(elemental_set, out=out, depth_mm=[*_DEPTHS_MM], method=[method])
+    result = reconstruct(elemental_set, out=out, depth_mm=[*DEFAULT_DEPTHS_MM], method=[method])
     planes = [
-        Shown(
-            read_frame(out / record["file"]).pixels_dn, *(record[key] for key in ("depth_mm", "pitch_mm", "origin_mm"))
-        )
-        for record in result["planes"]
+        Shown(read_frame(out / record.file).pixels_dn, record.depth_mm, record.pitch_mm, record.origin_mm)
+        for record in result.planes
     ]
     return planes, result
 

@@ -118,7 +118,9 @@ def reconstruct(
         Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
     """
     runner = make_runner(workers, scheduler)
-    selection = select_planes(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or [], depth_map=depth_map)
+    selection = select_planes(
+        depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or [], depth_map=depth_map
+    )
     methods = selected_methods(method or [], joint=joint, occlusion=occlusion)
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
@@ -128,9 +130,7 @@ def reconstruct(
     return reconstruct_and_report(loaded, out, request, runner)
 
 
-def reconstruct_and_report(
-    loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially
-) -> Outcome:
+def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
     """Reconstruct planes of a set into `out`, and write the report of them.
 
     Raises

@@ -13,6 +13,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import building_folder, write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_frame, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
@@ -233,7 +234,7 @@ def _write_truth(
     rendered: _Rendered,
     scale_e: float,
     snr: float,
-    poses: str,
+    poses: Poses,
     mosaic: tuple[str, ...] | None,
 ) -> Truth:
     """Write what only the simulator knows, and return it."""

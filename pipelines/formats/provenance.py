@@ -1,4 +1,4 @@
-"""What every result records of its making (command, options, hashes of inputs, versions), and whether it still holds."""
+"""What every result records of its making (command, options, inputs, versions), and whether it is still current."""
 
 import platform
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""The camera in a report: its noise, its geometry, and the light and noise that its pixels were made of."""
+"""The camera in a report: its noise and its geometry."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,6 @@ from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseProvenance, NoiseRecord, read_noise
 from faintfield.pipelines.pages.page import data_uri
-from faintfield.recon.metrics import noise_variance_e2
 
 if TYPE_CHECKING:
     from faintfield.pipelines.pages.stage_page import Row
@@ -135,57 +134,6 @@ def _origin(directory: Path, path: Path, inputs: dict[str, str]) -> dict[str, An
 def _link(directory: Path, path: Path) -> str:
     """Return a file's address relative to the page's folder."""
     return path.resolve().relative_to(directory.resolve(), walk_up=True).as_posix()
-
-
-def photon_budget(overview: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the light on a pixel by each formula, and the shares of the variance of eq. (6); None without light.
-
-    Light is in electrons, and in photons too where the quantum efficiency is known.
-
-    Parameters
-    ----------
-    overview : dict
-        The contents of overview.json.
-    """
-    efficiency, dark_e = overview.get("quantum_efficiency"), overview.get("dark_e")
-    light, exposure_s = overview["brightness"], overview["exposure_s"]
-    signal_e = light["mean_signal_e"]
-    if dark_e is None or signal_e <= 0:
-        return None
-    counts = (
-        ("the paper’s linear formula, eq. (7)", light["electrons_linear"]),
-        ("moments: a uniform object of this SNR, eq. (4) being a ratio of powers", light["electrons_from_moments"]),
-        ("counted: mean signal above dark", signal_e),
-    )
-    variance = noise_variance_e2(
-        signal_e / exposure_s,
-        exposure_s,
-        quantum_efficiency=1.0,
-        dark_current_e_per_s=dark_e / exposure_s,
-        read_noise_e=overview["read_noise_e"],
-    )
-    parts = (("read noise", overview["read_noise_e"] ** 2), ("light", signal_e), ("dark current", dark_e))
-    return {
-        "light": [
-            {"words": words, **_in_photons(electrons, efficiency, exposure_s, overview["views"])}
-            for words, electrons in counts
-            if electrons is not None
-        ],
-        "in_photons": efficiency is not None,
-        "variance_e2": variance,
-        "shares": [{"words": words, "e2": part, "share": part / variance} for words, part in parts],
-    }
-
-
-def _in_photons(electrons: float, efficiency: float | None, exposure_s: float, views: int) -> dict[str, float | None]:
-    """Return light per pixel in electrons and photons of one view, photons per second, and photons of all views."""
-    photons = None if efficiency is None else electrons / efficiency
-    return {
-        "electrons": electrons,
-        "photons": photons,
-        "flux": None if photons is None else photons / exposure_s,
-        "all_views": None if photons is None else photons * views,
-    }
 
 
 def calibration_origins(noise: NoiseSection | None, geometry: GeometrySection | None) -> list[dict[str, Any]]:

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -11,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.commands.reconstruct import folder_of_method
 from faintfield.pipelines.commands.simulate import NOISE_FREE, write_ground_truth
 from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.results.geometry import read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
+from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
-from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.pipelines.reconstruction.request import folder_of_method
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.cameras.simulated import TRUE_POSE
 from faintfield.rig.session.access import read_plan, taken_frames
@@ -77,7 +76,7 @@ def true_set(session: Path, truth: Path) -> ElementalSet:
     )
 
 
-def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method], compared: Method) -> dict[str, Any]:
+def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method], compared: Method) -> Metrics:
     """Return the contents of metrics.json: geometry, noise and planes against the truth."""
     depths = read_plan(session).rig.scene.depth_mm
     results = session / RECONSTRUCTIONS
@@ -92,32 +91,33 @@ def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method
         planes = {(compared, depth): out / loaded.poses / f"{plane_name(depth)}.tiff" for depth in depths}
         assessed = assess(loaded, planes, truth)
         assert assessed is not None
-        metrics["planes"] += assessed["planes"]
-    return {"geometry": _geometry_errors(session), "noise": _noise_errors(session), **metrics}
+        metrics.planes.extend(assessed.planes)
+    return msgspec.structs.replace(metrics, geometry=_geometry_errors(session), noise=_noise_errors(session))
 
 
-def _geometry_errors(session: Path) -> dict[str, Any]:
+def _geometry_errors(session: Path) -> GeometryErrors:
     """Return by how much the measured camera centres, and directions, are off in the reference frame."""
     poses = true_poses(session)
     measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session).nodes}
     shared = sorted(measured.keys() & poses.keys())
     off_mm = np.array([_centre_mm(measured[node]) - _centre_mm(poses[node]) for node in shared])
     turned_rad = np.array([relative(measured[node], poses[node])[:3] for node in shared])
-    return {
-        "nodes": len(shared),
-        "centre_rms_mm": float(np.sqrt(np.mean(np.sum(np.square(off_mm), axis=1)))),
-        "centre_rms_axes_mm": np.sqrt(np.mean(np.square(off_mm), axis=0)).tolist(),
-        "rotation_rms_mdeg": float(1e3 * np.degrees(np.sqrt(np.mean(np.sum(np.square(turned_rad), axis=1))))),
-    }
+    x, y, z = np.sqrt(np.mean(np.square(off_mm), axis=0)).tolist()
+    return GeometryErrors(
+        nodes=len(shared),
+        centre_rms_mm=float(np.sqrt(np.mean(np.sum(np.square(off_mm), axis=1)))),
+        centre_rms_axes_mm=(x, y, z),
+        rotation_rms_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(np.sum(np.square(turned_rad), axis=1))))),
+    )
 
 
-def _noise_errors(session: Path) -> dict[str, Any]:
+def _noise_errors(session: Path) -> dict[str, KnownValue]:
     """Return what was measured of the sensor beside what is true."""
     sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
     measured = read_noise(session / NOISE_FILE)
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
     found: dict[str, Measured] = {name: getattr(measured, name) for name in names}
-    return {name: {"value": it.value, "se": it.se, "truth": getattr(sensor, name)} for name, it in found.items()}
+    return {name: KnownValue(it.value, it.se, getattr(sensor, name)) for name, it in found.items()}
 
 
 def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,8 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from faintfield.pipelines.reconstruction.planes import Method, Settings, solve
+from faintfield.pipelines.formats.results.records import Method
+from faintfield.pipelines.reconstruction.planes import Settings, solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.plane import PlaneOperator
 from faintfield.recon.solver.starts import back_projection

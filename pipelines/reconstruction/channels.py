@@ -161,8 +161,9 @@ def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Fr
 
 def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
     """Return the noise model of a lattice; a raw frame brings its own black level and saturation if none is stated."""
-    maps = {name: value for name in _NOISE_MAPS if np.ndim(value := getattr(loaded.noise, name)) == 2}
-    noise = replace(loaded.noise, **{name: lattice.of(value) for name, value in maps.items()})
+    values = {name: getattr(loaded.noise, name) for name in _NOISE_MAPS}
+    maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
+    noise = replace(loaded.noise, **maps)
     if frame is None:
         return noise
     if loaded.offset_from_files and frame.black_dn is not None:

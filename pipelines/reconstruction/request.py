@@ -1,4 +1,4 @@
-"""What `reconstruct` is asked for: planes selected by its options, checked against one another, and resolved for a set."""
+"""What `reconstruct` is asked for: its options select planes, are checked, and are resolved for a set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""Reconstruct the planes of a request, and write them with their provenance, their errors and the overview of the set."""
+"""Reconstruct the planes of a request; write them, their provenance, their errors and the overview of the set."""
 
 import shutil
 import time

@@ -125,7 +125,7 @@ class Channel:
         return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)) ** 2 * cosine)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the views of both colours of a checkerboard of nodes; of even and odd index if nodes are not stated."""
+        """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
         views = self._loaded.settings.view
         odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
         odd = np.repeat(odd, self._phases)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +13,9 @@ from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, MissingPackage
 from faintfield.pipelines.formats.files import building_folder
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import PlaneRecord
+from faintfield.pipelines.formats.results.result_files import results_below
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
-from faintfield.pipelines.pages.report import results_below
 
 # Planes are halved until no side is longer; viewers load the rest only where they look closer.
 _COARSEST_PX = 512
@@ -44,14 +46,14 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> di
     zarr = _zarr()
     folder, planes, colours = _planes_of(directory)
     scale = _scale_of(directory, planes)
-    shape = (colours, len(planes), *planes[0]["shape"])
-    levels = _levels(planes[0]["shape"])
+    shape = (colours, len(planes), *planes[0].shape)
+    levels = _levels(planes[0].shape)
     earlier = _HELD if overwrite and _is_export(out) else ()
     with building_folder(out, replace_only=earlier, reads=[directory]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _metadata(group, directory.resolve().name, scale, planes, shape, levels)
         for index, record in enumerate(progress(planes, "writing planes")):
-            plane = np.atleast_3d(np.asarray(read_frame(folder / Path(record["file"]).name).pixels_dn, np.float32))
+            plane = np.atleast_3d(np.asarray(read_frame(folder / Path(record.file).name).pixels_dn, np.float32))
             for level in range(levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halved(plane)
@@ -78,7 +80,7 @@ def _zarr() -> Any:
     return zarr
 
 
-def _planes_of(directory: Path) -> tuple[Path, list[dict[str, Any]], int]:
+def _planes_of(directory: Path) -> tuple[Path, list[PlaneRecord], int]:
     """Return the folder of the planes, one entry for each in the order of their depths, and how many colours they have.
 
     Raises
@@ -91,16 +93,16 @@ def _planes_of(directory: Path) -> tuple[Path, list[dict[str, Any]], int]:
         names = ", ".join(str(folder) for folder in results)
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
     ((folder, result),) = results.items()
-    planes = planes_in_order(result["planes"])
+    planes = planes_in_order(result.planes)
     if not planes:
         raise BadValue(f"{directory}: holds planes given by a pose only; a stack is of depths: reconstruct some")
-    shapes = sorted({tuple(record["shape"]) for record in planes})
+    shapes = sorted({record.shape for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{directory}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
-    return folder, planes, len(at_depths(result["planes"])) // len(planes)
+    return folder, planes, len(at_depths(result.planes)) // len(planes)
 
 
-def _scale_of(directory: Path, planes: Sequence[dict[str, Any]]) -> Scale:
+def _scale_of(directory: Path, planes: Sequence[PlaneRecord]) -> Scale:
     """Return the scale of planes; OME-Zarr knows one step of depth only."""
     scale = stack_scale(planes)
     if scale.step_mm is None and len(planes) > 1:
@@ -112,7 +114,7 @@ def _scale_of(directory: Path, planes: Sequence[dict[str, Any]]) -> Scale:
 
 
 def _metadata(
-    group: Any, name: str, scale: Scale, planes: Sequence[dict[str, Any]], shape: tuple[int, ...], levels: int
+    group: Any, name: str, scale: Scale, planes: Sequence[PlaneRecord], shape: tuple[int, ...], levels: int
 ) -> None:
     """Make the arrays of all resolutions, and say what their axes are."""
     from ome_zarr_models.v05.axes import Axis
@@ -138,7 +140,7 @@ def _metadata(
             Dataset.build(
                 path=str(level),
                 scale=(1.0, scale.step_mm or 1.0, across, across),
-                translation=(0.0, planes[0]["depth_mm"], y + shift, x + shift),
+                translation=(0.0, planes[0].depth_mm, y + shift, x + shift),
             )
         )
     multiscale = Multiscale(axes=axes, datasets=tuple(datasets), name=name)
@@ -146,7 +148,7 @@ def _metadata(
     group.attrs["faintfield"] = {
         "value": "expected electrons per detector pixel of the reference view",
         "row_and_column": scale.unit,
-        "planes": list(planes),
+        "planes": msgspec.to_builtins(list(planes)),
     }
 
 

@@ -138,7 +138,7 @@ class PlaneFiles:
         return record
 
     def _write_sidecars(self, parts: list[dict[str, NDArray[Any]]], pitch_mm: float) -> dict[str, Path]:
-        """Write what else is known of each sample, remove the files of an earlier plane, and return what was written."""
+        """Write what else is known of the samples, remove the files of an earlier plane, return the paths."""
         written = {}
         for name in _SIDECARS:
             path = self.sidecar_path(name)

@@ -44,6 +44,11 @@ class Certificate(Struct, frozen=True, kw_only=True):
     oscillates: bool | UnsetType = UNSET
     kept_at_start: int | UnsetType = UNSET
 
+    @property
+    def is_bound(self) -> bool:
+        """Whether `value` bounds the distance to the optimum."""
+        return self.value is not UNSET
+
 
 class WeightScore(Struct, frozen=True):
     """A penalty weight that was tried: the negative log-likelihood of the held-out views."""

@@ -29,8 +29,8 @@ class Scale:
     across : float
         Distance of neighbouring samples, in `unit`.
     unit : str
-        "mm" if all planes have the same pitch. By default the pitch of a plane grows with its depth, so that samples are
-        a constant angle apart: then "mrad", thousandths of x/z, which is the same at every depth.
+        "mm" if all planes have the same pitch. By default the pitch of a plane grows with its depth, and its samples
+        are a constant angle apart: then "mrad", thousandths of x/z, which is the same at every depth.
     origin : (float, float)
         x, y of the first sample, in `unit`.
     step_mm : float, optional
@@ -48,15 +48,14 @@ def stack_scale(records: Sequence[PlaneRecord]) -> Scale:
     depths = np.array([record.depth_mm for record in records])
     pitches = np.array([record.pitch_mm for record in records])
     first = records[0]
-    if np.allclose(pitches, pitches[0], rtol=1e-9):
-        across, unit, origin = float(pitches[0]), "mm", first.origin_mm
-    else:
-        per_mrad = 1e3 / first.depth_mm
-        across, unit = float(np.mean(pitches / depths)) * 1e3, "mrad"
-        origin = [start * per_mrad for start in first.origin_mm]
     steps = np.diff(depths)
-    even = len(steps) > 0 and bool(np.ptp(steps) <= _EQUAL_STEPS * np.abs(steps).max())
-    return Scale(across, unit, (float(origin[0]), float(origin[1])), float(steps.mean()) if even else None)
+    equal = len(steps) > 0 and bool(np.ptp(steps) <= _EQUAL_STEPS * np.abs(steps).max())
+    step_mm = float(steps.mean()) if equal else None
+    if np.allclose(pitches, pitches[0], rtol=1e-9):
+        return Scale(float(pitches[0]), "mm", first.origin_mm, step_mm)
+    per_mrad = 1e3 / first.depth_mm
+    x, y = (start * per_mrad for start in first.origin_mm)
+    return Scale(float(np.mean(pitches / depths)) * 1e3, "mrad", (x, y), step_mm)
 
 
 def at_depths(records: Sequence[PlaneRecord]) -> list[PlaneRecord]:
@@ -88,7 +87,32 @@ def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
         return None
     scale = stack_scale(planes)
     colours = max(len(at_depths(records)) // len(planes), 1)
-    labels = [f"{record['depth_mm']:g} mm, {record['pitch_mm']:.4g} mm/px" for record in planes]
+    path = folder / STACK_FILE
+    with writing(path) as file:
+        tifffile.imwrite(
+            file,
+            _slices(folder, planes),
+            shape=(len(planes), colours, *planes[0].shape),
+            dtype=np.float32,
+            imagej=True,
+            byteorder="<",
+            photometric="minisblack",
+            resolution=(1 / scale.across, 1 / scale.across),
+            metadata=_imagej_metadata(planes, scale, colours),
+        )
+    return path
+
+
+def _slices(folder: Path, planes: Sequence[PlaneRecord]) -> Iterator[NDArray[np.float32]]:
+    """Yield each colour of each plane (row, column), one plane in memory at a time."""
+    for record in planes:
+        pixels = np.asarray(read_frame(folder / Path(record.file).name).pixels_dn, np.float32)
+        yield from [pixels] if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+
+
+def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int) -> dict[str, Any]:
+    """Return the calibration of a stack in the words of ImageJ; origins are in samples there."""
+    labels = [f"{record.depth_mm:g} mm, {record.pitch_mm:.4g} mm/px" for record in planes]
     metadata: dict[str, Any] = {
         "axes": "ZCYX",
         "unit": scale.unit,
@@ -101,24 +125,4 @@ def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
         metadata |= {"spacing": scale.step_mm, "zorigin": -planes[0].depth_mm / scale.step_mm}
     if colours > 1:
         metadata["mode"] = "composite"
-    path = folder / STACK_FILE
-    with writing(path) as file:
-        tifffile.imwrite(
-            file,
-            _slices(folder, planes),
-            shape=(len(planes), colours, *planes[0].shape),
-            dtype=np.float32,
-            imagej=True,
-            byteorder="<",
-            photometric="minisblack",
-            resolution=(1 / scale.across, 1 / scale.across),
-            metadata=metadata,
-        )
-    return path
-
-
-def _slices(folder: Path, planes: Sequence[PlaneRecord]) -> Iterator[NDArray[np.float32]]:
-    """Yield each colour of each plane (row, column), one plane in memory at a time."""
-    for record in planes:
-        pixels = np.asarray(read_frame(folder / Path(record.file).name).pixels_dn, np.float32)
-        yield from [pixels] if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+    return metadata

@@ -1,4 +1,4 @@
-"""`elemental.toml`, the way in for anyone's images and poses: its tables, and how they are read, checked and written."""
+"""`elemental.toml`, the format in which anyone states images and poses: its tables, read, checked and written."""
 
 from pathlib import Path
 from typing import Any, Literal
