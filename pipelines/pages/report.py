@@ -75,9 +75,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     the_set = sets[0] if sets else None
     page = template("report.html").render(
         title=_title(directory, results),
-        facts=facts(
-            sets[0] if sets else None, of_noise, of_geometry, against_truth=errors["geometry_off"], errors=led_by
-        ),
+        facts=facts(the_set, of_noise, of_geometry, against_truth=errors["geometry_off"], errors=led_by),
         sets=sets,
         **shown,
         depth_maps=depth_sections(directory, results),
