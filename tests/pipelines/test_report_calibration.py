@@ -10,12 +10,14 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_png
+from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_beside, photon_budget
 from faintfield.pipelines.pages.stage_page import holdout_rows
@@ -42,15 +44,32 @@ def _geometry() -> dict[str, Any]:
     stage: dict[str, Any] = dict.fromkeys((*names, "node_residual_rms_mm"), figure)
     stage["backlash_y_mm"] = {"value": None, "sigma": None, "why": "approached from one side"}
     stage["residuals_mm"] = [[0.1 * k, -0.1, 0.05] for k in range(9)]
-    nodes = [{"node": [r, c], "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4} for r in range(3) for c in range(3)]
+    stage["doubts"] = []
+    nodes = [
+        {"node": [r, c], "rt_cam_ref": [0.0] * 6, "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4}
+        for r in range(3)
+        for c in range(3)
+    ]
+    lens = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 400.0) | {"distortion": [0.0], "sigma": [0.1] * 5}
+    known = dict.fromkeys(("rms_inlier_px", "rms_mrcal_px", "corner_sigma_px"), 0.018)
     return {
-        "nodes": nodes,
+        "lens": {"model": "opencv4", **lens},
+        "size_px": [800, 800],
         "reference_node": [1, 1],
-        "stage": stage,
-        "transfer_sigma_px": {"500": 0.0134},
-        "rms_inlier_px": 0.018,
+        "nodes": nodes,
+        **known,
         "corners": 5450,
         "outliers": 3,
+        "holdout_ratio": None,
+        "doubts": [],
+        "transfer_sigma_px": {"500": 0.0134},
+        "repeatability": None,
+        "boards": [],
+        "stage": stage,
+        "command": "geometry",
+        "options": {"lens": "opencv4", "depth_mm": [500.0], "limit_px": 0.5},
+        "inputs": {},
+        "versions": {},
     }
 
 
@@ -116,11 +135,13 @@ def test_planes_in_the_results_folder_of_a_session_are_titled_by_the_session(
 def test_what_boards_left_out_add_is_told_beside_its_limit(
     ratio: float | None, boards: int, said: list[tuple[str, str]]
 ) -> None:
-    rows = holdout_rows({"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [{}] * boards})
-    for row, (value, why) in zip(rows, said, strict=True):
-        assert row["value"] == value
-        assert why in row["why"]
-        assert ("waived" in row["why"]) == (why == "waived")
+    printed = {"columns": 9, "rows": 7, "square_mm": 40.0, "marker_mm": 30.0, "dictionary": "d", "first_marker_id": 0}
+    board = {"name": "b", **printed, "sweep": 0, "rt_ref_board": [0.0] * 6, "warp_mm": [0.0, 0.0]}
+    content = _geometry() | {"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [board] * boards}
+    for row, (value, why) in zip(holdout_rows(msgspec.convert(content, GeometryRecord)), said, strict=True):
+        assert row.value == value
+        assert why in row.why
+        assert ("waived" in row.why) == (why == "waived")
 
 
 def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_path: Path, done: Command) -> None:
@@ -171,7 +192,7 @@ def test_a_damaged_calibration_is_named(name: str, session: Path, faintfield: Co
     ended = faintfield("report", session)
     assert ended.returncode == 1
     assert "BadValue" in ended.stderr
-    assert f"{name}: is not a result that can be shown" in ended.stderr
+    assert f"{name}: is not the result of `faintfield {name.removesuffix('.json')}`" in ended.stderr
 
 
 def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, done: Command) -> None:
