@@ -74,7 +74,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def run(arguments: Sequence[str]) -> int:
     """Run one command and return its exit code; any other exception than a named failure is a bug."""
-    _load_what_help_lists(arguments)
     try:
         app.meta(arguments, exit_on_error=False, print_error=True)
     except CycloptsError:
@@ -89,16 +88,3 @@ def run(arguments: Sequence[str]) -> int:
         inform("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, no file is half-written")
         return FAILED
     return DONE
-
-
-def _load_what_help_lists(arguments: Sequence[str]) -> None:
-    """Import the commands of a list that is about to be shown: what they do stands in their modules."""
-    level = app
-    for word in arguments:
-        if word.startswith("-"):
-            break
-        if word not in level:
-            return
-        level = level[word]
-    for name in level:
-        level[name]
