@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 from cyclopts import App, CycloptsError, Group, Parameter
@@ -60,11 +60,11 @@ def _launch(
         Add a record to this file: the command, versions, all that is said, with times, and how it ended.
     """
     with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)):
-        result: Any = app(tokens, exit_on_error=False, print_error=True)
+        result: object = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
-    elif isinstance(result, dict) and "report" in result:
-        sys.stdout.write(f"{result['report']}\n")
+    elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
+        sys.stdout.write(f"{report}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
