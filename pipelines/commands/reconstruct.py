@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.files import alone_in, remove, remove_leftovers, require_room, write_json
+from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, require_room, write_json
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, read_plane_poses, tilted_grid
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
@@ -253,7 +253,7 @@ def reconstruct_set(loaded: LoadedSet, out: Path, request: Request, crew: Crew =
 
     Planes that are there, made of the same files with the same options, are not made again.
     """
-    with alone_in(out):
+    with exclusive(out):
         return _reconstructed(loaded, out, request, crew)
 
 

@@ -35,7 +35,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
     DiskFull, CannotWrite
         In words, with the path; the temporary file is gone and what stood at `path` before still stands.
     """
-    with reported_as_cannot_write(path):
+    with translated_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         # The name is known before the file is there: an interrupt at any moment finds what to remove
         unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}{UNFINISHED}")
@@ -63,7 +63,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 @contextmanager
-def building_folder(
+def writing_folder(
     out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = (), reads: Iterable[Path] = ()
 ) -> Iterator[Path]:
     """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
@@ -91,7 +91,7 @@ def building_folder(
         # A link counts both where it leads and where it lies
         if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
-    with reported_as_cannot_write(out):
+    with translated_write_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         # The name is known before the folder is there: an interrupt at any moment finds what to remove
         building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
@@ -135,7 +135,7 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def exclusive(folder: Path) -> Iterator[None]:
     """Have a folder of results to oneself, made if need be; it goes again if nothing was put into it.
 
     Raises
@@ -143,7 +143,7 @@ def alone_in(folder: Path) -> Iterator[None]:
     OutputBusy
         Another command is writing there.
     """
-    with reported_as_cannot_write(folder):
+    with translated_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -165,7 +165,7 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 def remove(path: Path) -> None:
     """Remove a result that others will replace, if it is there."""
-    with reported_as_cannot_write(path):
+    with translated_write_errors(path):
         path.unlink(missing_ok=True)
 
 
@@ -203,7 +203,7 @@ def sha256(path: Path) -> str:
 
 
 @contextmanager
-def reported_as_cannot_write(path: Path) -> Iterator[None]:
+def translated_write_errors(path: Path) -> Iterator[None]:
     """Turn what the system says about a failed write into a named failure with the path in it."""
     try:
         yield

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import building_folder, write_json
+from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME, NOISE_REFERENCE, LoadedSet, load_set, write_set
@@ -81,7 +81,7 @@ def darken_set(bright: LoadedSet, out: Path, options: DarkeningOptions, *, overw
     light = _light(bright, bright.image_paths[bright.reference_view], layouts)
     region, scale_e = _region_and_scale(bright.folder, light, options)
     photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
-    with building_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
+    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
         _write_dark_views(bright, layouts, folder, options, scale_e)
         write_png(folder / OBJECT_REGION, mask_picture(region))
         record = provenance("darken", msgspec.structs.asdict(options), dict(bright.input_hashes()))

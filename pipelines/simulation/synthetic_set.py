@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import building_folder, write_json
+from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME
 from faintfield.pipelines.formats.sets.ground_truth import Truth
@@ -47,7 +47,7 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
     experiment = _experiment(options)
     sensor = experiment.sensor
     dark_e = sensor.dark_current_e_per_s * options.exposure_s
-    with building_folder(out, replace_if=FILE_NAME if overwrite else None) as folder:
+    with writing_folder(out, replace_if=FILE_NAME if overwrite else None) as folder:
         true = experiment.poses_rt_cam_ref(options.position_error_mm, options.rotation_error_mrad * 1e-3, generator)
         scene = render_scene(experiment, true, ("RG", "GB") if options.colour == "bayer" else None)
         if not scene.object_region.any():

@@ -9,13 +9,13 @@ import pytest
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
 from faintfield.pipelines.formats.files import (
-    alone_in,
-    building_folder,
+    exclusive,
     require_room,
     sha256,
     write_json,
     write_whole,
     writing,
+    writing_folder,
 )
 
 
@@ -39,7 +39,7 @@ def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None
     before = os.umask(0o027)
     try:
         write_json(tmp_path / "file", [1])
-        with building_folder(tmp_path / "folder"):
+        with writing_folder(tmp_path / "folder"):
             pass
         assert os.umask(0o027) == 0o027
     finally:
@@ -84,7 +84,7 @@ def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseEx
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
 def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], tmp_path: Path) -> None:
     def stop_half_way() -> None:
-        with building_folder(tmp_path / "out") as folder:
+        with writing_folder(tmp_path / "out") as folder:
             (folder / "part").touch()
             assert not (tmp_path / "out").exists()
             raise failure
@@ -96,7 +96,7 @@ def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], t
 
 def test_a_folder_that_is_built_takes_its_name_at_the_end(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    with building_folder(tmp_path / "out") as folder:
+    with writing_folder(tmp_path / "out") as folder:
         (folder / "part").touch()
         assert not any((tmp_path / "out").iterdir())
     assert _everything_below(tmp_path) == {"out", "out/part"}
@@ -109,7 +109,7 @@ def test_a_folder_is_replaced_whole_or_not_at_all(stops: bool, tmp_path: Path) -
     (out / "deep" / "old").touch()
     (out / "mark").touch()
     try:
-        with building_folder(out, replace_if="mark") as folder:
+        with writing_folder(out, replace_if="mark") as folder:
             (folder / "new").touch()
             if stops:
                 raise _Stop
@@ -140,7 +140,7 @@ def test_what_others_put_there_is_left_alone(
 ) -> None:
     prepare(tmp_path / "out")
     before = _everything_below(tmp_path)
-    with pytest.raises(OutputExists, match=words), building_folder(tmp_path / "out", **earlier):
+    with pytest.raises(OutputExists, match=words), writing_folder(tmp_path / "out", **earlier):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == before
 
@@ -150,7 +150,7 @@ def test_a_folder_of_nothing_but_such_names_is_replaced(tmp_path: Path) -> None:
     out.mkdir()
     for name in ("cameras.txt", "a.model", "b.model"):
         (out / name).touch()
-    with building_folder(out, replace_only=["*.model", "cameras.txt"]) as folder:
+    with writing_folder(out, replace_only=["*.model", "cameras.txt"]) as folder:
         (folder / "c.model").touch()
     assert _everything_below(tmp_path) == {"out", "out/c.model"}
 
@@ -161,7 +161,7 @@ def test_a_link_to_what_is_read_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "out" / "link").symlink_to(tmp_path / "elsewhere")
     with (
         pytest.raises(OutputExists, match="link, which is read"),
-        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
+        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
     ):
         pytest.fail("nothing must be built")
 
@@ -172,7 +172,7 @@ def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path
     (tmp_path / "out" / "mark").touch()
     with (
         pytest.raises(OutputExists, match="which is read"),
-        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
+        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
     ):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == {"out", "out/deep", "out/mark"}
@@ -181,12 +181,12 @@ def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path
 def test_the_working_folder_can_be_filled_when_it_is_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    with building_folder(Path()) as folder:
+    with writing_folder(Path()) as folder:
         (folder / "part").touch()
     assert _everything_below(tmp_path) == {"here", "here/part"}
 
 
-@pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: building_folder(path).__enter__()])
+@pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: writing_folder(path).__enter__()])
 def test_a_place_that_cannot_be_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(CannotWrite, match=r"file.*; name a place that can be written") as refused:
@@ -212,12 +212,12 @@ def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
 
 def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
     folder = tmp_path / "results"
-    with alone_in(folder):
-        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), alone_in(folder):
+    with exclusive(folder):
+        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), exclusive(folder):
             pass
         assert folder.is_dir()
     assert not folder.exists()  # nothing was put into it
-    with alone_in(folder):
+    with exclusive(folder):
         (folder / "plane.tiff").touch()
     assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
 

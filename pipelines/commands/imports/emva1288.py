@@ -13,7 +13,7 @@ from typing import Any
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.files import building_folder, sha256, write_json
+from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseFrame, NoiseSet, write_noise_set
 
@@ -49,7 +49,7 @@ def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, Any]:
         for name, frame in zip(names, read.frames, strict=True)
     ]
     saturation_dn = float(2**read.bits - 1)
-    with building_folder(out) as folder:
+    with writing_folder(out) as folder:
         (folder / "frames").mkdir()
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)

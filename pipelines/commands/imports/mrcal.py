@@ -11,7 +11,7 @@ from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.exchange.posed_images import import_posed, lens_of_each_view
-from faintfield.pipelines.formats.files import building_folder, write_whole
+from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 from faintfield.pipelines.formats.results.geometry import camera_model_text
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
@@ -89,7 +89,7 @@ def export_mrcal(
         if name in models:
             raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
         models[name] = camera_model_text(replace(lens, distortion=padded), _LENS_MODEL[count], pose)
-    with building_folder(out, replace_only=[f"*{_SUFFIX}"] if overwrite else ()) as folder:
+    with writing_folder(out, replace_only=[f"*{_SUFFIX}"] if overwrite else ()) as folder:
         for name, text in models.items():
             write_whole(folder / name, text)
     return {"out": str(out), "views": len(models)}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, MissingPackage
-from faintfield.pipelines.formats.files import building_folder
+from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
 
@@ -108,7 +108,7 @@ def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = Fal
     """
     zarr = require_zarr()
     earlier = _HELD if overwrite and _is_export(out) else ()
-    with building_folder(out, replace_only=earlier, reads=[stack.folder]) as building:
+    with writing_folder(out, replace_only=earlier, reads=[stack.folder]) as building:
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(group, stack, name)
         for index, record in enumerate(progress(stack.planes, "writing planes")):
