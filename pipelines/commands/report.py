@@ -1,4 +1,4 @@
-"""`faintfield report`: draw report.html anew."""
+"""`faintfield report`: write report.html again."""
 
 from pathlib import Path
 from typing import Any
@@ -8,11 +8,11 @@ from faintfield.pipelines.pages.report import write_report
 
 
 def report(directory: Path, /) -> dict[str, Any]:
-    """Draw report.html anew from the results in a folder and the folders within it.
+    """Write report.html again from the results in a folder and the folders within it.
 
-    It leads with the planes beside what the camera saw; then come sliders, errors, the noise and the geometry of the
-    camera where noise.json and geometry.json lie there or in one of the two folders above, the set and its light, and
-    how everything was made.
+    The page begins with the planes next to what the camera saw. Then come sliders; errors; noise and geometry of the
+    camera, if noise.json and geometry.json are in the folder or in one of the two above; the set and its light; and how
+    everything was made.
 
     Parameters
     ----------
