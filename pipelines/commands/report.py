@@ -1,13 +1,20 @@
 """`faintfield report`: write report.html again."""
 
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.pages.report import write_report
 
 
-def report(directory: Path, /) -> dict[str, Any]:
+class Reported(msgspec.Struct, frozen=True):
+    """The result of `faintfield report`."""
+
+    report: str
+
+
+def report(directory: Path, /) -> Reported:
     """Write report.html again from the results in a folder and the folders within it.
 
     The page begins with the planes next to what the camera saw. Then come sliders; errors; noise and geometry of the
@@ -21,4 +28,4 @@ def report(directory: Path, /) -> dict[str, Any]:
     """
     path = write_report(directory)
     inform(f"{path}")
-    return {"report": str(path)}
+    return Reported(str(path))

@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, loa
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.paper.figure4 import is_monotone, mean_curves, measure_errors, over_best
 from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
-from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
+from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, tv_denoiser
 from faintfield.pipelines.paper.figure_records import (
     DarkPlaneRow,
     DetailRow,
@@ -62,8 +62,12 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
     ------
     OutputExists
         `out` holds something other than earlier figures.
+    MissingPackage
+        Figure 4 is asked for, and scikit-image is not installed.
     """
     check_free(out, replace_if=PAGE_FILE)
+    if 4 in options.only:
+        tv_denoiser()
     if {2, 3} & set(options.only):
         inform("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm")
         scene = SyntheticOptions(snr=options.snr, seed=options.seed, size_px=options.size_px)

@@ -3,6 +3,7 @@
 import csv
 import json
 import statistics
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -150,6 +151,17 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, faintfield: Co
     ended = faintfield("figures", tmp_path)
     assert ended.returncode == 1
     assert "OutputExists" in ended.stderr
+
+
+def test_without_scikit_image_the_extra_is_named_before_any_work(
+    tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.restoration", None)
+    ended = faintfield("figures", tmp_path / "out")
+    assert ended.returncode == 1
+    assert "MissingPackage: scikit-image is not installed" in ended.stderr
+    assert "pip install 'faintfield[figures]'" in ended.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_exposures_have_the_snr_they_are_named_by(star: StagedObject) -> None:
