@@ -24,7 +24,7 @@ def _everything_below(folder: Path) -> set[str]:
 
 
 class _Stop(BaseException):
-    """Something that no one expects."""
+    """An exception that no code expects."""
 
 
 @pytest.mark.parametrize("content", ["words – with a dash\n", b"\0\xff bytes"])
@@ -35,7 +35,7 @@ def test_what_is_written_is_there_and_nothing_else(content: str | bytes, tmp_pat
     assert _everything_below(tmp_path) == {"new", "new/folder", "new/folder/file"}
 
 
-def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None:
+def test_new_files_have_the_permissions_of_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_json(tmp_path / "file", [1])
@@ -48,7 +48,7 @@ def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
 
 
-def test_a_file_takes_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_gets_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
 
     def watched[**P, R](name: str, step: Callable[P, R]) -> Callable[P, R]:
@@ -65,7 +65,7 @@ def test_a_file_takes_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
-def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseException], tmp_path: Path) -> None:
+def test_an_interrupted_write_keeps_the_earlier_file(failure: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("before")
 
@@ -82,7 +82,7 @@ def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseEx
 
 
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
-def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], tmp_path: Path) -> None:
+def test_an_interrupted_folder_does_not_appear(failure: type[BaseException], tmp_path: Path) -> None:
     def stop_half_way() -> None:
         with writing_folder(tmp_path / "out") as folder:
             (folder / "part").touch()
@@ -94,7 +94,7 @@ def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], t
     assert _everything_below(tmp_path) == set()
 
 
-def test_a_folder_that_is_built_takes_its_name_at_the_end(tmp_path: Path) -> None:
+def test_a_folder_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     with writing_folder(tmp_path / "out") as folder:
         (folder / "part").touch()
@@ -135,7 +135,7 @@ def _with_a_file(out: Path) -> None:
         (Path.touch, {"replace_if": "elemental.toml"}, "is a file"),
     ],
 )
-def test_what_others_put_there_is_left_alone(
+def test_files_of_others_are_left_alone(
     prepare: Callable[[Path], object], earlier: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     prepare(tmp_path / "out")
@@ -187,7 +187,7 @@ def test_the_working_folder_can_be_filled_when_it_is_empty(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: writing_folder(path).__enter__()])
-def test_a_place_that_cannot_be_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
+def test_an_impossible_place_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(CannotWrite, match=r"file.*; name a place that can be written") as refused:
         write(tmp_path / "file" / "out")
@@ -205,12 +205,12 @@ def test_every_failure_of_writing_is_an_input_error() -> None:
     assert issubclass(CannotWrite, InputError)
 
 
-def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
+def test_the_hash_is_that_of_the_standard(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
+def test_a_second_writer_of_a_folder_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "results"
     with exclusive(folder):
         with pytest.raises(OutputBusy, match="another faintfield command is writing there"), exclusive(folder):
