@@ -87,8 +87,8 @@ IMPORTS = (
     ),
 )
 EXPORTS = (
-    Command("colmap", "faintfield.pipelines.commands.imports.colmap:export_colmap", "colmap set sparse"),
-    Command("mrcal", "faintfield.pipelines.commands.imports.mrcal:export_mrcal", "mrcal set cameras"),
+    Command("colmap", "faintfield.pipelines.commands.exports.colmap:export_colmap", "colmap set sparse"),
+    Command("mrcal", "faintfield.pipelines.commands.exports.mrcal:export_mrcal", "mrcal set cameras"),
     Command("zarr", "faintfield.pipelines.commands.exports.zarr:export_zarr", "zarr sweep sweep.ome.zarr"),
 )
 

@@ -8,18 +8,19 @@ import msgspec
 
 from faintfield.pipelines.arguments import Positive, Seed
 from faintfield.pipelines.commands.capture import capture
-from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
-from faintfield.pipelines.commands.run import run_steps, session_steps
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json
-from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method, Metrics
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.demo_rig import DemoSize, demo_rig
 from faintfield.pipelines.paper.demo_truth import demo_metrics, true_set, write_truth
-from faintfield.pipelines.reconstruction.accuracy import METRICS_FILE
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+from faintfield.pipelines.reconstruction.steps import run_steps
 from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
 
 # The file that marks a folder as made by a demo; the next demo may replace such a folder.
@@ -68,10 +69,10 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     run_steps(session, session_steps(session, Request(depths, _METHODS)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
-    reconstruct_set(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
+    reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
     alone = Request(depths, [DEFAULT_METHOD])
-    reconstruct_set(nominal_session(session), out / "nominal", alone)
-    reconstruct_set(true_set(session, truth), out / "true", alone)
+    reconstruct_and_report(nominal_session(session), out / "nominal", alone)
+    reconstruct_and_report(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth, _METHODS, DEFAULT_METHOD)
     write_json(out / METRICS_FILE, metrics)
     return DemoResult(str(out), str(write_report(out)), metrics)

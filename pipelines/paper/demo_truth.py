@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.commands.reconstruct import folder_of_method
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE
+from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import read_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
+from faintfield.pipelines.reconstruction.request import folder_of_method
 from faintfield.pipelines.simulation.scene_truth import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.cameras.simulated import TRUE_POSE
@@ -58,7 +58,7 @@ def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
     return {node: relative(pose, reference) for node, pose in recorded.items()}
 
 
-def true_set(session: Path, truth: Path) -> LoadedSet:
+def true_set(session: Path, truth: Path) -> ElementalSet:
     """Return a session's dark-scene views with their true lens, poses, response and noise."""
     loaded, free = nominal_session(session), load_set(truth / NOISE_FREE)
     poses = {view.node: view.rt_cam_ref for view in free.settings.view}
@@ -93,23 +93,20 @@ def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method
     depths = read_plan(session).rig.scene.depth_mm
     results = session / RECONSTRUCTIONS
     measured = {
-        (method, depth): folder_of_method(results, method, list(methods)) / f"{plane_name(depth)}.tiff"
+        (method, depth): folder_of_method(results, method, methods) / f"{plane_name(depth)}.tiff"
         for method in methods
         for depth in depths
     }
-    metrics = _assessed(load_session(session), measured, truth)
+    metrics = assess(load_session(session), measured, truth)
+    assert metrics is not None
     errors = list(metrics.planes)
     for loaded in (nominal_session(session), true_set(session, truth)):
         planes = {(compared, depth): out / loaded.poses / f"{plane_name(depth)}.tiff" for depth in depths}
-        errors += _assessed(loaded, planes, truth).planes
-    return msgspec.structs.replace(
-        metrics, geometry=_geometry_errors(session), noise=_noise_errors(session), planes=errors
-    )
-
-
-def _assessed(loaded: LoadedSet, planes: dict[tuple[Method, float], Path], truth: Path) -> Metrics:
-    """Return the errors of planes whose truth is known."""
-    return msgspec.convert(assess(loaded, planes, truth), Metrics)
+        assessed = assess(loaded, planes, truth)
+        assert assessed is not None
+        errors += assessed.planes
+    geometry, noise = _geometry_errors(session), _noise_errors(session)
+    return msgspec.structs.replace(metrics, geometry=geometry, noise=noise, planes=errors)
 
 
 def _geometry_errors(session: Path) -> GeometryErrors:
@@ -128,27 +125,12 @@ def _geometry_errors(session: Path) -> GeometryErrors:
     )
 
 
-class _Measured(msgspec.Struct):
-    """A number of noise.json and its standard error."""
-
-    value: float | None
-    se: float | None = None
-
-
-class _MeasuredNoise(msgspec.Struct):
-    """The numbers of noise.json whose truth is known."""
-
-    read_noise_e: _Measured
-    dark_current_e_per_s: _Measured
-    gain_dn_per_e: _Measured
-    offset_dn: _Measured
-
-
 def _noise_errors(session: Path) -> dict[str, KnownValue]:
     """Return what was measured of the sensor, with the truth."""
     sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
-    noise = msgspec.json.decode((session / NOISE_FILE).read_bytes(), type=_MeasuredNoise)
-    measured: dict[str, _Measured] = msgspec.structs.asdict(noise)
+    noise = read_noise(session / NOISE_FILE)
+    names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
+    measured: dict[str, Measured] = {name: getattr(noise, name) for name in names}
     return {name: KnownValue(found.value, found.se, getattr(sensor, name)) for name, found in measured.items()}
 
 

@@ -9,14 +9,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.files import check_free, remove, write_json, write_whole
+from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.results.records import Method, Metrics, PlaneRecord
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
+from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.figure4 import is_monotone, mean_curves, measure_errors, over_best
 from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, tv_denoiser
@@ -32,13 +33,14 @@ from faintfield.pipelines.paper.figure_records import (
 )
 from faintfield.pipelines.paper.figures_page import CURVES_FILE, PAGE_FILE, provenance_file, write_page
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
+from faintfield.pipelines.reconstruction.request import Request
+from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
 from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
 from faintfield.recon.smoothing import blurred
 
 type FigureNumber = Literal[2, 3, 4]
 
-_DEPTHS_MM = (500.0, 700.0)
 _SCENE, _BRIGHT, _DARK = "dark-scene", "bright", "dark"
 
 # Detail is what this blur removes; its standard deviation is 2 samples.
@@ -79,8 +81,8 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
         started = time.monotonic()
         remove(out / provenance_file(number))
         made[f"figure{number}"] = makers[number](out, options)
-        record = provenance("figures", msgspec.structs.asdict(options), {})
-        write_json(out / provenance_file(number), record | {"wall_time_s": time.monotonic() - started})
+        origin = msgspec.structs.asdict(provenance("figures", options, {}))
+        write_json(out / provenance_file(number), origin | {"wall_time_s": time.monotonic() - started})
         inform(f"figure {number}: {time.monotonic() - started:.1f} s")
     write_page(out)
     return made
@@ -88,8 +90,8 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
 
 def _figure2(out: Path, _: FigureOptions) -> Figure2:
     """Back-project the bright set, and measure how much of each object's detail each plane shows."""
-    records, _metrics = _reconstructed(out / _SCENE / NOISE_FREE, out / _BRIGHT, "backprojection")
-    planes = _shown(out / _BRIGHT, records)
+    outcome = _reconstruct(out / _SCENE / NOISE_FREE, out / _BRIGHT, "backprojection")
+    planes = _shown(out / _BRIGHT, outcome.planes)
     integral = read_frame(out / _BRIGHT / INTEGRAL_IMAGE).pixels_dn
     rows = [row for plane in planes for row in _detail_rows(out / _SCENE, plane)]
     numbers = Figure2(rows)
@@ -121,7 +123,8 @@ def _detail(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _figure3(out: Path, _: FigureOptions) -> Figure3:
     """Reconstruct the dark set, and measure the errors of its planes."""
-    records, metrics = _reconstructed(out / _SCENE, out / _DARK, OURS)
+    outcome = _reconstruct(out / _SCENE, out / _DARK, OURS)
+    metrics = outcome.metrics
     assert metrics is not None
     assert metrics.snr.measured is not None
     rows = [
@@ -130,13 +133,13 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
             penalty_weight=record.penalty_weight,
             passes=record.passes,
         )
-        for errors, record in zip(metrics.planes, records, strict=True)
+        for errors, record in zip(metrics.planes, outcome.planes, strict=True)
     ]
     numbers = Figure3(metrics.snr, metrics.photons_per_px, rows)
     loaded = load_set(out / _SCENE)
     dark = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
     reference = read_frame(out / _SCENE / NOISE_REFERENCE).pixels_dn
-    planes = _shown(out / _DARK, records)
+    planes = _shown(out / _DARK, outcome.planes)
     picture = draw_figure3(dark, reference, grey_scale_dn(dark), metrics.snr.measured, planes)
     _write(out, 3, picture, rows, numbers)
     return numbers
@@ -154,13 +157,12 @@ def _figure4(out: Path, options: FigureOptions) -> Figure4:
     return numbers
 
 
-def _reconstructed(elemental_set: Path, out: Path, method: Method) -> tuple[list[PlaneRecord], Metrics | None]:
-    """Reconstruct both planes of a set by a method; return their records, and their errors where the truth is known."""
-    result = reconstruct(elemental_set, out=out, depth_mm=[*_DEPTHS_MM], method=[method])
-    return (
-        msgspec.convert(result["planes"], list[PlaneRecord]),
-        msgspec.convert(result["metrics"], Metrics | None),
-    )
+def _reconstruct(elemental_set: Path, out: Path, method: Method) -> Outcome:
+    """Reconstruct both planes of a set, and write the report of them."""
+    with exclusive(out):
+        outcome = reconstruct_set(load_set(elemental_set), out, Request([*DEFAULT_DEPTHS_MM], [method]))
+        write_report(out)
+    return outcome
 
 
 def _shown(folder: Path, records: Sequence[PlaneRecord]) -> list[ShownPlane]:

@@ -13,7 +13,8 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME, NOISE_REFERENCE, LoadedSet, load_set, write_set
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
 from faintfield.pipelines.reconstruction.brightness import brightness
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
@@ -67,7 +68,7 @@ class Darkened(msgspec.Struct, frozen=True):
     scale_e: float
 
 
-def darken_set(bright: LoadedSet, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
+def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
     """Expose every view of a bright set anew with few photons, and write the dark set.
 
     Raises
@@ -84,8 +85,9 @@ def darken_set(bright: LoadedSet, out: Path, options: DarkeningOptions, *, overw
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
         _write_dark_views(bright, layouts, folder, options, scale_e)
         write_png(folder / OBJECT_REGION, mask_picture(region))
-        record = provenance("darken", msgspec.structs.asdict(options), dict(bright.input_hashes()))
-        write_json(folder / "provenance.json", record | {"scale_e": scale_e, "photons_on_object": photons})
+        origin = provenance("darken", options, dict(bright.input_hashes()))
+        record = msgspec.structs.asdict(origin) | {"scale_e": scale_e, "photons_on_object": photons}
+        write_json(folder / "provenance.json", record)
     known = {"quantum_efficiency": options.quantum_efficiency, "read_noise_e": options.read_noise_e}
     return Darkened(
         out=str(out),
@@ -121,7 +123,7 @@ def _object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.asarray(levels > threshold)
 
 
-def _light(bright: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
+def _light(bright: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
     """Return the light of a bright view: its electrons above the dark level, never negative."""
     frame = checked_frame(bright, path, layouts[0])
     light = np.zeros(frame.pixels_dn.shape, np.float32)
@@ -134,7 +136,7 @@ def _light(bright: LoadedSet, path: Path, layouts: list[ChannelLayout]) -> NDArr
     return light
 
 
-def _view_names(bright: LoadedSet) -> list[str]:
+def _view_names(bright: ElementalSet) -> list[str]:
     """Return the file names of the dark views: those of the bright views where that keeps them apart."""
     stems = [Path(view.image).stem for view in bright.settings.view]
     if len({*stems, *_TAKEN_STEMS}) < len(stems) + len(_TAKEN_STEMS):
@@ -143,7 +145,7 @@ def _view_names(bright: LoadedSet) -> list[str]:
 
 
 def _write_dark_views(
-    bright: LoadedSet, layouts: list[ChannelLayout], folder: Path, options: DarkeningOptions, scale_e: float
+    bright: ElementalSet, layouts: list[ChannelLayout], folder: Path, options: DarkeningOptions, scale_e: float
 ) -> None:
     """Expose every view anew and write the set; a mosaic stays a mosaic."""
     names, sensor, generator = _view_names(bright), options.sensor, np.random.default_rng(options.seed)

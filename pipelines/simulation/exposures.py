@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
 from faintfield.rig.simulation.sensor import SimulatedSensor
 
 

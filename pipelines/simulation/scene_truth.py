@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.image_files import mask_picture, write_frame, write_plane, write_png
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, Noise, View, write_set
+from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
 from faintfield.recon.metrics import (
@@ -76,7 +77,7 @@ class RenderedScene:
         camera = Camera(optics.size_px, *lens, self.mosaic, _FLAT)
         entries = zip(self.view_names, poses_rt_cam_ref, self._nodes, strict=True)
         views = [View(name, tuple(pose.tolist()), node) for name, pose, node in entries]
-        settings = ElementalSet(1, self.experiment.exposure_s, self.experiment.reference_view, camera, noise, views)
+        settings = ElementalSetFile(1, self.experiment.exposure_s, self.experiment.reference_view, camera, noise, views)
         write_set(folder, settings)
 
 
@@ -110,7 +111,7 @@ def render_scene(
     return RenderedScene(experiment, mosaic, poses_rt_cam_ref, views, object_region)
 
 
-def write_ground_truth(folder: Path, scene: RenderedScene, white_e: float, snr: float, poses: str = "true") -> Truth:
+def write_ground_truth(folder: Path, scene: RenderedScene, white_e: float, snr: float, poses: Poses = "true") -> Truth:
     """Write the noise-free views, as a set of their own, and everything else that no capture shows.
 
     Parameters
@@ -123,7 +124,7 @@ def write_ground_truth(folder: Path, scene: RenderedScene, white_e: float, snr: 
         Expected electrons of a white object on the axis.
     snr : float
         The SNR that was asked for.
-    poses : str
+    poses : Poses
         The kind of poses that the captured set states: "true" or "nominal".
     """
     _write_noise_free_set(folder / NOISE_FREE, scene, white_e)

@@ -9,7 +9,7 @@ import numpy as np
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME
 from faintfield.pipelines.formats.sets.ground_truth import Truth
 from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
 from faintfield.pipelines.simulation.scene_truth import render_scene, write_ground_truth
@@ -59,7 +59,7 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         stated = true if options.poses == "true" else experiment.nominal_poses_rt_cam_ref()
         scene.write_settings(folder, stated, stated_noise(sensor))
         truth = write_ground_truth(folder, scene, white_e, options.snr, options.poses)
-        write_json(folder / "provenance.json", provenance("simulate", msgspec.structs.asdict(options), {}))
+        write_json(folder / "provenance.json", provenance("simulate", options, {}))
     return truth
 
 

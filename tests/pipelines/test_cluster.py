@@ -14,7 +14,7 @@ import pytest
 from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
 from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.plane_poses import Place
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.reconstruction.cluster import crew_of
 from faintfield.pipelines.reconstruction.sweep import PlaneTask
 
@@ -59,7 +59,7 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
     crew = crew_of(None, cluster.scheduler_address)
     done: list[Place] = []
 
-    def killing(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+    def killing(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         for task, words in crew(loaded, out, tasks):
             done.extend(task.grids)
             if len(done) == 1:

@@ -13,9 +13,11 @@ from faintfield.calib.board import Board
 from faintfield.calib.geometry import GeometrySettings, calibrate_geometry
 from faintfield.pipelines import cli
 from faintfield.pipelines.commands.board import board
+from faintfield.pipelines.commands.exports.colmap import export_colmap
+from faintfield.pipelines.commands.exports.mrcal import export_mrcal
 from faintfield.pipelines.commands.geometry import geometry
-from faintfield.pipelines.commands.imports.colmap import export_colmap, import_colmap
-from faintfield.pipelines.commands.imports.mrcal import export_mrcal, import_mrcal
+from faintfield.pipelines.commands.imports.colmap import import_colmap
+from faintfield.pipelines.commands.imports.mrcal import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model

@@ -17,7 +17,8 @@ from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import Frame, exif_exposure_s
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, View, load_set, write_set
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View, write_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.pages.noise_page import draw_page, page_panels
 from tests.calib.noise.darkroom import darks, specimen
 from tests.pipelines.noise_sets import take_set, write_frames
@@ -329,7 +330,7 @@ def test_the_response_that_flats_measured_is_the_flat_field_of_a_set(tmp_path: P
     write_json(folder / "noise.json", {name: {"value": value} for name, value in numbers.items()})
     write_frame(folder / "view.tiff", np.full((3, 4), 110, np.uint16))
     camera = Camera((4, 3), 4.0, 4.0, 1.5, 1.0)
-    write_set(folder, ElementalSet(1, 0.1, 0, camera, "noise.json", [View("view.tiff", (0, 0, 0, 0, 0, 0))]))
+    write_set(folder, ElementalSetFile(1, 0.1, 0, camera, "noise.json", [View("view.tiff", (0, 0, 0, 0, 0, 0))]))
     loaded = load_set(folder)
     assert loaded.flat is not None
     np.testing.assert_array_equal(loaded.flat[~hot], response[~hot])

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from faintfield.pipelines.commands.exports.colmap import export_colmap
+from faintfield.pipelines.commands.exports.mrcal import export_mrcal
 from faintfield.pipelines.commands.geometry import geometry
-from faintfield.pipelines.commands.imports.colmap import export_colmap
-from faintfield.pipelines.commands.imports.mrcal import export_mrcal
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.run import run

@@ -6,7 +6,7 @@ import msgspec
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.zarr import plane_stack, require_zarr, write_zarr
-from faintfield.pipelines.pages.report import results_below
+from faintfield.pipelines.formats.results.result_files import results_below
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -40,6 +40,6 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Za
         names = ", ".join(str(folder) for folder in results)
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
     ((folder, result),) = results.items()
-    stack = plane_stack(folder, result["planes"])
+    stack = plane_stack(folder, result.planes)
     write_zarr(out, stack, directory.resolve().name, overwrite=overwrite)
     return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit)

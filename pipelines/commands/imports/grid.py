@@ -9,7 +9,7 @@ from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positiv
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.image_grid import find_grid
 from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
-from faintfield.pipelines.formats.sets.elemental_set import Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
 
 # Without a pitch the unit of length is free: the plane on which the pictures are aligned gets this depth.
 _FREE_REFERENCE_DEPTH_MM = 1000.0

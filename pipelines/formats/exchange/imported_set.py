@@ -18,7 +18,7 @@ from faintfield.pipelines.formats.files import sha256, write_json, writing_folde
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME, Camera, ElementalSet, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def write_imported_set(
             for image in progress(images, "copying pictures")
         ]
         camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-        write_set(folder, ElementalSet(1, exposure_s, reference, camera, noise, views))
+        write_set(folder, ElementalSetFile(1, exposure_s, reference, camera, noise, views))
         hashes = {path.name: sha256(path) for path in inputs}
         write_json(folder / "provenance.json", provenance(command, options, hashes))
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +14,7 @@ from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, MissingPackage
 from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
 
 # Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
@@ -32,7 +34,7 @@ class PlaneStack:
     ----------
     folder : Path
         Where they lie.
-    planes : sequence of dict
+    planes : sequence of PlaneRecord
         Their entries in reconstruction.json, one per plane.
     shape : (int, int, int, int)
         Colours, planes, rows, columns.
@@ -41,7 +43,7 @@ class PlaneStack:
     """
 
     folder: Path
-    planes: Sequence[dict[str, Any]]
+    planes: Sequence[PlaneRecord]
     shape: tuple[int, int, int, int]
     scale: Scale
 
@@ -54,14 +56,14 @@ class PlaneStack:
         return levels
 
 
-def plane_stack(folder: Path, records: Sequence[dict[str, Any]]) -> PlaneStack:
+def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
     """Return the planes of a folder as one stack.
 
     Parameters
     ----------
     folder : Path
         Where they lie.
-    records : sequence of dict
+    records : sequence of PlaneRecord
         The `planes` of its reconstruction.json.
 
     Raises
@@ -72,7 +74,7 @@ def plane_stack(folder: Path, records: Sequence[dict[str, Any]]) -> PlaneStack:
     planes = planes_in_order(records)
     if not planes:
         raise BadValue(f"{folder}: holds planes given by a pose only; a stack is of depths: reconstruct some")
-    shapes = sorted({tuple(record["shape"]) for record in planes})
+    shapes = sorted({record.shape for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
     scale = stack_scale(planes)
@@ -112,9 +114,7 @@ def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = Fal
         group = zarr.open_group(building, mode="w", zarr_format=3)
         _write_metadata(group, stack, name)
         for index, record in enumerate(progress(stack.planes, "writing planes")):
-            plane = np.atleast_3d(
-                np.asarray(read_frame(stack.folder / Path(record["file"]).name).pixels_dn, np.float32)
-            )
+            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
                 plane = _halved(plane)
@@ -165,7 +165,7 @@ def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
     group.attrs["faintfield"] = {
         "value": "expected electrons per detector pixel of the reference view",
         "row_and_column": stack.scale.unit,
-        "planes": list(stack.planes),
+        "planes": msgspec.to_builtins(list(stack.planes)),
     }
 
 
@@ -182,7 +182,7 @@ def _dataset(group: Any, stack: PlaneStack, level: int) -> Any:
     return Dataset.build(
         path=str(level),
         scale=(1.0, scale.step_mm or 1.0, across, across),
-        translation=(0.0, stack.planes[0]["depth_mm"], y + shift, x + shift),
+        translation=(0.0, stack.planes[0].depth_mm, y + shift, x + shift),
     )
 
 

@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, LoadedSet, View, load_set
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
+from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
 from faintfield.rig.plan import CapturePlan, StepKind, Stop
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 from faintfield.rig.session.frames import planned_frames
@@ -24,7 +27,7 @@ type SceneKind = Literal["dark_scene", "bright"]
 _CALLED: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 
 
-def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
+def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
     """Return a session's views of the scene, in electrons by its noise.json, from where its geometry.json says.
 
     All frames of a node are one view: they are added up, whatever their exposures.
@@ -46,12 +49,12 @@ def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | 
     return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
 
 
-def load_set_or_session(folder: Path) -> LoadedSet:
+def load_set_or_session(folder: Path) -> ElementalSet:
     """Return an elemental set, or the dark scene of a session."""
     return load_session(folder) if has_session(folder) else load_set(folder)
 
 
-def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
+def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
     """Return the same with the measured lens, but the camera where the stage was told to take it."""
     plan = read_plan(folder).plan
     exposure_s, frames = _frames_of_views(folder, plan, kind)
@@ -66,9 +69,9 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
     views = [_view(stop, plan.centre, names) for stop, names in frames]
     reference = [view.node for view in views].index(plan.centre.node)
-    return LoadedSet(
+    return ElementalSet(
         folder,
-        ElementalSet(1, exposure_s, reference, camera, NOISE_FILE, views),
+        ElementalSetFile(1, exposure_s, reference, camera, NOISE_FILE, views),
         lens,
         noise.model,
         offset_from_files=False,
