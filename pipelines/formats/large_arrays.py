@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from faintfield.pipelines.formats.files import reported_as_cannot_write
+from faintfield.pipelines.formats.files import translated_write_errors
 
 # Makes an array of a shape and a kind, its contents yet to be written.
 type Allocate = Callable[[tuple[int, ...], DTypeLike], NDArray[Any]]
@@ -30,7 +30,7 @@ def memory_or_file(folder: Path) -> Allocate:
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         if _bytes(shape, dtype) <= SHARE_OF_MEMORY * available_bytes():
             return np.empty(shape, dtype)
-        with reported_as_cannot_write(folder):
+        with translated_write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder) as file:
                 return mapped(file, shape, dtype)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
-from faintfield.pipelines.formats.files import UNFINISHED, reported_as_cannot_write
+from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
 from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
@@ -88,7 +88,7 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
 @contextmanager
 def _shared_folder(out: Path) -> Iterator[Path]:
     """Make a folder in `out` for what the workers read, and remove it at the end."""
-    with reported_as_cannot_write(out):
+    with translated_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(
             prefix=".shared.", suffix=UNFINISHED, dir=out.resolve(), ignore_cleanup_errors=True
@@ -161,7 +161,7 @@ def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> Path:
         return shared / f"{layout.name}.{np.dtype(dtype).name}"
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        with reported_as_cannot_write(shared.parent), path_of(dtype).open("wb+") as file:
+        with translated_write_errors(shared.parent), path_of(dtype).open("wb+") as file:
             return mapped(file, shape, dtype)
 
     images = load_channel(loaded, layout, allocate)

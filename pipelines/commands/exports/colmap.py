@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from faintfield.pipelines.formats.exchange.colmap import MODEL_FILES, ColmapImage, ColmapModel, write_model
 from faintfield.pipelines.formats.exchange.posed_images import lens_of_each_view
-from faintfield.pipelines.formats.files import building_folder
+from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 
 
@@ -44,6 +44,6 @@ def export_colmap(
             for view, lens, pose in zip(loaded.settings.view, lenses, loaded.poses_rt_cam_ref, strict=True)
         ],
     )
-    with building_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
+    with writing_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
         write_model(folder, model, binary=binary)
     return {"out": str(out), "views": len(model.images)}

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
 from faintfield.pipelines.formats.exchange.posed_images import lens_of_each_view
-from faintfield.pipelines.formats.files import building_folder, write_whole
+from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 
 
@@ -33,7 +33,7 @@ def export_mrcal(
         if name in models:
             raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
         models[name] = camera_model_text(lens, lens_model_of(lens), pose)
-    with building_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
+    with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
         for name, text in models.items():
             write_whole(folder / name, text)
     return {"out": str(out), "views": len(models)}

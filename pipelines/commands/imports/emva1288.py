@@ -8,7 +8,7 @@ import msgspec
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.formats.exchange.emva1288 import image_path, read_descriptor
-from faintfield.pipelines.formats.files import building_folder, sha256, write_json
+from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, write_noise_set
 
@@ -28,7 +28,7 @@ def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, Any]:
     names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]
     frames = [msgspec.structs.replace(frame, file=name) for name, frame in zip(names, read.frames, strict=True)]
     saturation_dn = float(2**read.bits - 1)
-    with building_folder(out) as folder:
+    with writing_folder(out) as folder:
         (folder / "frames").mkdir()
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)
