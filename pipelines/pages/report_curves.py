@@ -63,7 +63,14 @@ def weight_curves(planes: Sequence[Plane]) -> str | None:
         if index == _MAX_LABELLED:
             label = f"and {len(known) - _MAX_LABELLED} more"
         weights = [score.weight for score in curve]
-        axes.plot(weights, held_out - held_out.min(), marker=marker, markersize=4, color=colour, label=label if index <= _MAX_LABELLED else None)
+        axes.plot(
+            weights,
+            held_out - held_out.min(),
+            marker=marker,
+            markersize=4,
+            color=colour,
+            label=label if index <= _MAX_LABELLED else None,
+        )
         if record.penalty_weight is not None:
             axes.axvline(record.penalty_weight, color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")

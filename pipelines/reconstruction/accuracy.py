@@ -91,6 +91,6 @@ def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[flo
         images = load_channel(noise_free, layout)
         factory = OperatorFactory(noise_free, layout, images)
         for depth in depths:
-            operator = factory.at_depth(depth, plane_grid(noise_free, depth))
+            operator = factory.at(depth, plane_grid(noise_free, depth))
             colours[depth].append(back_projection(operator, images))
     return {depth: parts[0] if len(parts) == 1 else np.dstack(parts) for depth, parts in colours.items()}

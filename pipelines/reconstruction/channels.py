@@ -1,4 +1,4 @@
-"""From the frames of an elemental set to what the solvers take: one set of elemental images per colour."""
+"""The images of an elemental set in electrons, one stack per colour: what the solvers take."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per
 
 @dataclass(frozen=True)
 class ChannelLayout:
-    """Where in the frames one colour is found.
+    """Position of one colour in the frames.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class ChannelLayout:
 
 
 def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
-    """Return the colours that a set's frames hold, judged by its first frame."""
+    """Return the colours of a set, as its first frame has them."""
     width, height = loaded.settings.camera.size_px
     frame = read_frame(loaded.image_paths[0])
     mosaic = loaded.settings.camera.mosaic or frame.mosaic
@@ -67,7 +67,7 @@ def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
 
 
 def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
-    """Read one colour of all views into electrons; frames are read one at a time, straight into the stack.
+    """Read one colour of all views in electrons, one frame at a time, directly into the stack.
 
     Parameters
     ----------
@@ -76,12 +76,12 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
     layout : ChannelLayout
         The colour.
     allocate : callable
-        Makes the arrays of the size of all views: in memory by default.
+        Makes the arrays as large as all views; in memory by default.
 
     Raises
     ------
     WrongSize, WrongBitDepth, UnreadableImage
-        A frame is not what the set says it is; the message names it.
+        A frame does not match the set; the message names it.
     """
     phases = len(layout.lattices)
     views = len(loaded.settings.view)
@@ -108,10 +108,10 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
 def view_electrons(
     loaded: ElementalSet, layout: ChannelLayout, paths: Sequence[Path]
 ) -> list[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-    """Return for each lattice the electrons (row, column) of all frames of a view, and where one of them is saturated.
+    """Return for each lattice the electrons (row, column) of all frames of a view, and where any frame is saturated.
 
-    The sum says of the light all that the frames say one by one, up to the shape of the read noise: Poisson counts add
-    up to Poisson counts, and variances add.
+    The sum has all the information that the single frames have, except for the shape of the read noise: the sum of
+    Poisson counts is a Poisson count, and variances add.
     """
     sums: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
     for path in paths:
@@ -130,7 +130,7 @@ def view_electrons(
 
 
 def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
-    """Read a frame and refuse one that does not fit the set's camera and noise model."""
+    """Read a frame, and check that it fits the camera and the noise model of the set."""
     frame = read_frame(path)
     width, height = loaded.settings.camera.size_px
     found = frame.pixels_dn
@@ -160,7 +160,7 @@ def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Fr
 
 
 def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
-    """Return the noise model of a lattice; a raw frame brings its own black level and saturation if none is stated."""
+    """Return the noise model of a lattice; a raw frame has its own black level and saturation if none is stated."""
     values = {name: getattr(loaded.noise, name) for name in _NOISE_MAPS}
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
     noise = replace(loaded.noise, **maps)
@@ -175,7 +175,7 @@ def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:
-    """Return one number when all lattices share it, else the maps (lattice, row, column)."""
+    """Return one number if all lattices share it, else the maps (lattice, row, column)."""
     if all(np.ndim(part) == 0 and part == parts[0] for part in parts):
         return float(parts[0])
     return np.stack([np.broadcast_to(part, shape) for part in parts]).astype(np.float32)

@@ -90,13 +90,13 @@ def compared_depths(
         elif not bins:
             middle_mm = sorted(depths_mm)[len(depths_mm) // 2]
             needed = bins_for(
-                OperatorFactory(loaded, layout, images).at_depth(middle_mm, plane_grid(loaded, middle_mm)), images
+                OperatorFactory(loaded, layout, images).at(middle_mm, plane_grid(loaded, middle_mm)), images
             )
             bins = min(max(needed, -(-min_bins_px // step)), min(layout.lattices[0].shape) // _MIN_BINS_ACROSS)
         images = images.binned(bins)
         factory = OperatorFactory(loaded, layout, images, bins=bins)
         found = [
-            agreement(factory.at_depth(depth, plane_grid(loaded, depth).binned(bins * step)), images)
+            agreement(factory.at(depth, plane_grid(loaded, depth).binned(bins * step)), images)
             for depth in progress(depths_mm, f"comparing views, {layout.name}")
         ]
         planes = [_sum(*pair) for pair in zip(planes, found, strict=True)] if planes else found
@@ -222,7 +222,10 @@ def _picture(values: NDArray[np.floating], label: str, low: float, high: float) 
 
     rows, columns = np.indices(values.shape)
     hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
-    figure = Figure(figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]), layout="constrained")
+    figure = Figure(
+        figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]),
+        layout="constrained",
+    )
     axes = figure.subplots()
     axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")

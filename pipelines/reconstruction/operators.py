@@ -19,9 +19,9 @@ from faintfield.recon.operator.scene import SceneOperator
 
 
 class OperatorFactory:
-    """Makes the operators of one channel; what they share (rays, response, mask) is computed once.
+    """Makes the operators of one channel; rays, response and mask, which they share, are computed once.
 
-    For images whose pixels were added up in bins (`ElementalImages.binned`) give as many `bins`.
+    `bins` is the width of the bins of images from `ElementalImages.binned`.
     """
 
     def __init__(self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages, *, bins: int = 1) -> None:
@@ -32,13 +32,9 @@ class OperatorFactory:
         rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
         response = np.stack([_response(loaded, lattice) for lattice in lattices])
-        whole = binned(response > 0, bins) == 1  # a bin with a pixel that never counts has its electrons, too
+        whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._response = np.where(whole, binned(response, bins), 0)
         self._principal_shift = _principal_shift(loaded)
-
-    def at_depth(self, depth_mm: float, grid: PlaneGrid) -> PlaneOperator:
-        """Return H of the plane across the reference camera's axis at a depth."""
-        return self.at(depth_mm, grid)
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
@@ -54,7 +50,7 @@ class OperatorFactory:
         grids : mapping of Place to PlaneGrid
             The samples of each plane.
         transmission : float array (plane, view, row, column), optional
-            How much of each plane's light reaches each pixel; all by default.
+            Share of each plane's light that reaches each pixel; 1 by default.
         """
         homographies = np.stack([self._homographies(place) for place in grids])
         return SceneOperator(
@@ -62,7 +58,7 @@ class OperatorFactory:
         )
 
     def _homographies(self, place: Place) -> NDArray[np.float64]:
-        """Return the way from the rays of each view, and each phase of its mosaic, to a plane."""
+        """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""
         rt_ref_plane = (
             np.array(place.rt_ref_plane) if isinstance(place, TiltedPlane) else fronto_parallel_rt_ref_plane(place)
         )
@@ -70,7 +66,7 @@ class OperatorFactory:
         return np.repeat(homographies, self._phases, axis=0)
 
     def _shared(self) -> dict[str, Any]:
-        """Return what the operators of all planes have in common."""
+        """Return the arguments that the operators of all planes share."""
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
         return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
@@ -90,7 +86,7 @@ def _response(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
 
 
 def _principal_shift(loaded: ElementalSet) -> NDArray[np.float64] | None:
-    """Return what is added to the rays of views whose principal point differs from the camera's."""
+    """Return the shift (view, 2) of the rays of views with a principal point of their own, None without such views."""
     camera = loaded.settings.camera
     shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()
     if not shift_px.any():

@@ -120,7 +120,7 @@ def test_the_objective_is_the_likelihood_with_the_penalty(method: str, results: 
     factory = OperatorFactory(loaded, layout, images)
     for plane in _record(results / method)["planes"]:
         pixels = tifffile.imread(results / method / plane["file"])
-        operator = factory.at_depth(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
+        operator = factory.at(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
         likelihood = negative_log_likelihood(operator, pixels, images)
         penalty = plane["penalty_weight"] * total_variation(pixels, plane["epsilon_e2"])
         assert plane["objective"] == pytest.approx(likelihood + penalty, rel=1e-9)

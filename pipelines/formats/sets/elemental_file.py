@@ -79,7 +79,7 @@ def read_set_file(path: Path) -> ElementalSetFile:
 
 
 def write_set(folder: Path, settings: ElementalSetFile) -> None:
-    """Write `elemental.toml`; the images come first, so that a folder with this file is whole."""
+    """Write `elemental.toml`. Write the images first, so that a folder with this file is complete."""
     write_toml(folder / FILE_NAME, settings)
 
 
@@ -91,7 +91,7 @@ def named_files(settings: ElementalSetFile) -> list[str]:
 
 
 def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
-    """Refuse exposures that cannot be, and mosaics that are no mosaics."""
+    """Refuse an impossible exposure or mosaic."""
     if settings.exposure_s <= 0:
         raise BadValue(f"{path}: exposure_s = {settings.exposure_s}; it must be positive: give the exposure in seconds")
     mosaic = settings.camera.mosaic
@@ -105,7 +105,7 @@ def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
 
 
 def _check_views(path: Path, settings: ElementalSetFile) -> None:
-    """Refuse a set without views, without its reference, or with a view named twice."""
+    """Refuse a set without views, without its reference, or with a repeated view."""
     count = len(settings.view)
     if not 0 <= settings.reference_view < count:
         raise BadValue(
@@ -125,7 +125,7 @@ def _check_views(path: Path, settings: ElementalSetFile) -> None:
 
 
 def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
-    """Refuse a name that more than one view has."""
+    """Refuse a name that several views share."""
     for index, name in enumerate(names):
         if name in names[:index]:
             raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")

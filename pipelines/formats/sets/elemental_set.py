@@ -1,4 +1,4 @@
-"""The elemental set: images and poses that were checked, whatever files they come from."""
+"""The elemental set: checked images and poses, whatever files they come from."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,7 +25,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     read_set_file,
 )
 
-# Exposure of nothing, beside a set's images if there is one.
+# Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
 
 
@@ -36,29 +36,29 @@ class ElementalSet:
     Attributes
     ----------
     folder : Path
-        Where it lies; every path in it is relative to this.
+        Its folder; paths in the set are relative to it.
     settings : ElementalSetFile
         What `elemental.toml` says.
     lens : Lens
-        Of the camera.
+        Lens of the camera.
     noise : NoiseModel
-        Offset NaN-free; zero where each raw file brings its own (`offset_from_files`).
+        Noise model of the camera; its offset is zero if each raw file brings its own (`offset_from_files`).
     offset_from_files : bool
-        The offset is each raw file's masked black level.
+        The offset of each raw file is the black level of its masked pixels.
     flat : float array (row, column), optional
         Relative response.
     unusable : bool array (row, column)
-        Pixels that never count (hot, dead).
+        Pixels that are left out (hot, dead).
     measured_in : Path, optional
-        The geometry.json that the lens was taken from; None where it is the set's own.
+        The geometry.json of the lens; None if the lens is the set's own.
     poses : str
         Where the poses come from: "stated" in the set, "measured", "nominal" or "true".
     described_in : str
         The file that says what the images are.
     noise_reference : tuple of Path
-        Exposures of nothing, where there are any.
+        Exposures without light, if there are any.
     bright_view : (Path, float), optional
-        The reference view in plenty of light and its exposure in s, where there is one.
+        The reference view in plenty of light and its exposure in s, if there is one.
     """
 
     folder: Path
@@ -86,25 +86,25 @@ class ElementalSet:
 
     @property
     def image_paths(self) -> list[Path]:
-        """Where the images lie: of each view the first frame."""
+        """Path of the first frame of each view."""
         return [self.folder / view.image for view in self.settings.view]
 
     @property
     def frames_per_view(self) -> int:
-        """How many frames are added up to a view."""
+        """Number of frames that are added up to a view."""
         return 1 + len(self.settings.view[0].repeats)
 
     def frame_paths(self, view: int) -> list[Path]:
-        """Return where all frames of a view lie."""
+        """Return the paths of all frames of a view."""
         entry = self.settings.view[view]
         return [self.folder / name for name in (entry.image, *entry.repeats)]
 
     def background_e(self, noise: NoiseModel) -> Map:
-        """Return the dark electrons expected in all frames of a view, by the noise model of the set or a part of it."""
+        """Return the dark electrons expected in all frames of a view, given the noise model of the set or a part of it."""
         return noise.background_e(self.settings.exposure_s)
 
     def read_variance_e2(self, noise: NoiseModel) -> Map:
-        """Return the variance that reading adds to a view: once per frame."""
+        """Return the variance in e⁻² that reading adds to a view, once per frame."""
         return self.frames_per_view * noise.read_variance_e2()
 
     def principal_points_px(self) -> NDArray[np.float64]:
@@ -120,8 +120,9 @@ class ElementalSet:
     def depth_of_disparity(self, disparity_px: float) -> float:
         """Return the depth at which a point moves by `disparity_px` from one node to the next, right or down.
 
-        A camera moved by B along its row images a point at depth z moved by −fx B / z, plus what rectification moved
-        the principal point; with nodes and poses known this is one equation for 1/z, solved over all views.
+        If the camera moves by B along its rows, the image of a point at depth z moves by −fx B / z, plus the shift of
+        the principal point by rectification. With known nodes and poses this is an equation for 1/z, solved by least
+        squares over all views.
 
         Raises
         ------
@@ -149,7 +150,7 @@ class ElementalSet:
 
     @staticmethod
     def _disparity_at_infinity_px(steps: NDArray[np.float64], shift_px: NDArray[np.float64]) -> float:
-        """Return by how much infinitely far points move between neighbouring nodes."""
+        """Return the movement of infinitely far points between neighbouring nodes."""
         return float(np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30))
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
@@ -170,15 +171,15 @@ def load_set(folder: Path) -> ElementalSet:
     Raises
     ------
     InputError
-        A file is missing, a key unknown, or a value cannot be; the message names it.
+        A file is missing, a key is unknown, or a value is impossible; the message names it.
     """
     path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
     folder = path.parent
     settings = read_set_file(path)
     camera = settings.camera
-    with _complaints_about(path, "camera"):
+    with _naming(path, "camera"):
         lens = Lens(camera.size_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
-    with _complaints_about(path, "noise"):
+    with _naming(path, "noise"):
         noise = _noise(folder, settings)
     return ElementalSet(
         folder,
@@ -193,8 +194,8 @@ def load_set(folder: Path) -> ElementalSet:
 
 
 @contextmanager
-def _complaints_about(path: Path, table: str) -> Iterator[None]:
-    """Say of a value that cannot be in which file and table it stands."""
+def _naming(path: Path, table: str) -> Iterator[None]:
+    """Name the file and the table of a value that is refused."""
     try:
         yield
     except ValueError as failure:
