@@ -48,7 +48,7 @@ def mapped(file: IO[bytes], shape: tuple[int, ...], dtype: DTypeLike) -> NDArray
 
 
 def available_bytes() -> int:
-    """Return the memory that this process can take: what the system has free, within the limits of its control groups."""
+    """Return the memory that this process can take: the free memory, within the limits of its control groups."""
     free = re.search(r"^MemAvailable:\s+(\d+) kB", (_PROC / "meminfo").read_text(), re.MULTILINE)
     assert free is not None
     group = re.search(r"^0::/(.*)$", _read(_PROC / "self" / "cgroup"), re.MULTILINE)

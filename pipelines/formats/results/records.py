@@ -259,17 +259,12 @@ class Brightness(Struct, frozen=True):
 
     Attributes
     ----------
-    region : str
-        "object region" if the set brings one, "object region of the bright view" if it brings that, else
-        "whole view".
-    noise_from : str
-        "noise reference" image if the set brings one, else "noise model".
+    region, noise_from : str
+        What was measured, and what it was compared with.
     snr : float, optional
         Eq. (4), a ratio of powers; None if the noise model states no read noise to compare with.
-    electrons_linear : float, optional
-        Electrons per pixel by eq. (7), as in the paper; None if the SNR is not positive.
-    electrons_from_moments : float, optional
-        Electrons per pixel of a uniform object with this SNR.
+    electrons_linear, electrons_from_moments : float, optional
+        Electrons per pixel by eq. (7), and of a uniform object with this SNR; None if the SNR is not positive.
     mean_signal_e : float
         Mean electrons per pixel above the dark level.
     photons_linear, photons_from_moments : float, optional

@@ -100,7 +100,7 @@ class ElementalSet:
         return [self.folder / name for name in (entry.image, *entry.repeats)]
 
     def background_e(self, noise: NoiseModel) -> Map:
-        """Return the dark electrons expected in all frames of a view, given the noise model of the set or a part of it."""
+        """Return the dark electrons expected in all frames of a view, by the noise model of all pixels or a part."""
         return noise.background_e(self.settings.exposure_s)
 
     def read_variance_e2(self, noise: NoiseModel) -> Map:
