@@ -126,7 +126,7 @@ def one_seed(seed: int, miss_mm: float) -> dict[str, float]:
     experiment = paper_experiment(1600, 1200)
     truth = experiment.poses_rt_cam_ref(0.3, float(np.radians(0.2)), generator)
     seen = observe(experiment, truth, generator, miss_mm)
-    settings = GeometrySettings(most_transfer_sigma_px=5.0)
+    settings = GeometrySettings(max_transfer_sigma_px=5.0)
     started = time.perf_counter()
     geometry = calibrate_geometry(boards(), seen, experiment.optics.size_px, _REFERENCE, settings)
     result = {"seconds": time.perf_counter() - started, **errors_of(geometry, truth, experiment)}

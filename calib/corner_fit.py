@@ -34,13 +34,13 @@ _FIRST_BLUR_PX = 1.2  # wider than most, so that edges which are still apart att
 _PIXEL_VARIANCE = 1 / 12  # px²: a pixel is the mean over its area
 
 # First in windows about the guesses, then about what was found there.
-_MOST_STEPS = (8, 4)
+_MAX_STEPS = (8, 4)
 _SETTLED_PX = 1e-4
 _LARGEST_STEP = np.array([0.7, 0.7, 0.1, 0.1, 0.01, 0.01, 0.25, np.inf, np.inf])
 
 # A corner that is farther than this from its guess, or whose contrast is less than this over its own σ, is none.
 _FARTHEST_PX, _FAINTEST = 4.0, 4.0
-_FEWEST_PIXELS = 24
+_MIN_PIXELS = 24
 
 _FLAT = 0.9  # from where on |f₁ f₂| is one of the two levels
 _LEAST_NOISE = 1e-3  # of the contrast, for pictures without any
@@ -82,7 +82,7 @@ def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array
     if not len(guesses):
         return np.empty((0, 2)), np.empty(0)
     state = _start(guesses, squares_px)
-    for index, most_steps in enumerate(_MOST_STEPS):
+    for index, most_steps in enumerate(_MAX_STEPS):
         windows = _windows(image, guesses, state[:, _PLACE], squares_px, clear)
         if index == 0:
             _set_levels(state, windows)
@@ -96,7 +96,7 @@ def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array
     found = (
         (np.abs(state[:, _PLACE]).max(axis=1) <= _FARTHEST_PX)
         & (np.abs(state[:, _CONTRAST]) >= _FAINTEST * np.sqrt(variances[:, _CONTRAST]))
-        & (windows.counts.sum(axis=1) >= _FEWEST_PIXELS)
+        & (windows.counts.sum(axis=1) >= _MIN_PIXELS)
         & ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
     )
     sigma_px = np.hypot(np.sqrt(variances[:, _PLACE].mean(axis=1)), _FLOOR_PX)

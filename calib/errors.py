@@ -1,7 +1,8 @@
-"""The failures of calibration, one tree: catch `CalibrationError` to catch them all.
+"""The failures of calibration form one tree: catch `CalibrationError` to catch them all.
 
 CalibrationError
 ├── LensNotInvertible
+├── MissingMrcal
 ├── NotIdentifiable
 │   └── TooFewFrames
 ├── BadFrame
@@ -14,27 +15,31 @@ CalibrationError
 
 
 class CalibrationError(Exception):
-    """The measurements given cannot support the calibration asked for."""
+    """The measurements do not support the requested calibration."""
 
 
 class LensNotInvertible(CalibrationError):
-    """The distortion folds the image over itself within the detector."""
+    """The distortion folds the image onto itself within the detector."""
+
+
+class MissingMrcal(CalibrationError):
+    """mrcal, which solves for the geometry and reads camera models, is not installed."""
 
 
 class NotIdentifiable(CalibrationError):
-    """The measurements cannot tell the quantity asked for, however many of the same kind are taken."""
+    """The measurements do not determine a quantity, and more of the same kind would not either."""
 
 
 class TooFewFrames(NotIdentifiable):
-    """Too few frames were taken under the same conditions to tell noise from a fixed pattern."""
+    """Too few frames share the same conditions to separate noise from fixed pattern."""
 
 
 class BadFrame(CalibrationError):
-    """One frame does not belong with the others; the message names it."""
+    """One frame differs from the others; the message names it."""
 
 
 class CopiedFrame(BadFrame):
-    """Two frames are identical, pixel for pixel, which noise never allows."""
+    """Two frames are identical in every pixel, which noise rules out."""
 
 
 class LightLeak(BadFrame):
@@ -42,12 +47,12 @@ class LightLeak(BadFrame):
 
 
 class SaturatedFlat(BadFrame):
-    """A flat frame reaches the end of the sensor's range, where its noise is cut off."""
+    """A flat frame reaches the end of the sensor's range, which clips its noise."""
 
 
 class PoorFit(CalibrationError):
-    """A model was fitted, and the measurements contradict it."""
+    """The measurements contradict the fitted model."""
 
 
 class TooFewViews(CalibrationError):
-    """Too few images of a target were found to determine the camera."""
+    """Too few images show a target to determine the camera."""

@@ -1,4 +1,4 @@
-"""The homographies of a plane: from what a camera sees to where on the plane it lies, and how well that is known."""
+"""Homographies from camera rays to points of a plane, and the transfer between two views by a plane."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,18 @@ from faintfield.calib.lens import Lens
 
 # Step of the central differences over 1 + |value|: rounding and curvature both stay below 1e-6 of a derivative.
 _STEP = 1e-6
+
+# Points along each side of the default lattice of an image.
 _POINTS_ACROSS = 5
 
 
+def rotation_matrix(rt: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return the rotation matrix (3, 3) of a pose (6,), Rodrigues rad and mm."""
+    return np.asarray(cv2.Rodrigues(np.asarray(rt[:3], np.float64))[0], np.float64)
+
+
 def fronto_parallel_rt_ref_plane(depth_mm: float) -> NDArray[np.float64]:
-    """Return the pose (6,) of the plane across the reference camera's axis at a depth, its origin on the axis."""
+    """Return the pose (6,) of the plane at a depth normal to the reference camera's axis, its origin on the axis."""
     return np.array([0.0, 0.0, 0.0, 0.0, 0.0, depth_mm])
 
 
@@ -27,7 +34,7 @@ def plane_from_ray(
 
     A point (X, Y) of the plane lies at `R (X r₁ + Y r₂ + o) + t` in a camera of pose (R, t), where r₁, r₂ and o are the
     axes and origin of the plane in the reference frame; so `ray ∝ [R r₁, R r₂, R o + t] (X, Y, 1)`, and the homography
-    is the inverse of that 3 x 3 matrix. For a plane across the axis at depth d this is `[r₁ r₂ d·r₃ + t]⁻¹`.
+    is the inverse of that 3 x 3 matrix. For a plane normal to the axis at depth d it is `[r₁ r₂ d·r₃ + t]⁻¹`.
 
     Parameters
     ----------
@@ -41,14 +48,13 @@ def plane_from_ray(
     Returns
     -------
     array (view, 3, 3)
-        Scaled so that the third coordinate of a result is positive where the plane is in front of the camera; a
-        camera that lies in the plane sees nothing of it and has all zeros.
+        Scaled so that the third coordinate of a result is positive where the plane is in front of the camera; all zeros
+        for a camera that lies in the plane and sees nothing of it.
     """
-    r_ref_plane, _ = cv2.Rodrigues(np.asarray(rt_ref_plane[:3], np.float64))
+    r_ref_plane = rotation_matrix(rt_ref_plane)
     homographies = np.zeros((len(rt_cam_ref), 3, 3))
     for view, rt in enumerate(np.asarray(rt_cam_ref, np.float64)):
-        r_cam_ref, _ = cv2.Rodrigues(rt[:3])
-        ray_from_plane = r_cam_ref @ np.column_stack([r_ref_plane[:, 0], r_ref_plane[:, 1], rt_ref_plane[3:]])
+        ray_from_plane = rotation_matrix(rt) @ np.column_stack([r_ref_plane[:, 0], r_ref_plane[:, 1], rt_ref_plane[3:]])
         ray_from_plane[:, 2] += rt[3:]
         shift = np.eye(3)
         if principal_shift is not None:
@@ -59,7 +65,7 @@ def plane_from_ray(
 
 
 def image_lattice(size_px: tuple[int, int], across: int = _POINTS_ACROSS) -> NDArray[np.float64]:
-    """Return pixels (point, 2) spread evenly over an image, `across` by `across`, each in the middle of its share."""
+    """Return `across` by `across` pixels (point, 2) spread evenly over an image, as column, row."""
     shares = (np.arange(across) + 0.5) / across
     columns, rows = np.meshgrid(shares * size_px[0] - 0.5, shares * size_px[1] - 0.5)
     return np.column_stack([columns.ravel(), rows.ravel()])
@@ -68,12 +74,12 @@ def image_lattice(size_px: tuple[int, int], across: int = _POINTS_ACROSS) -> NDA
 def transfer(
     lens: Lens, rt_cam_ref: NDArray[np.floating], rt_ref_plane: NDArray[np.floating], pixels: NDArray[np.floating]
 ) -> NDArray[np.float64]:
-    """Return where one view sees what the reference view sees on a plane.
+    """Return where a view sees the points of a plane that the reference view sees at given pixels.
 
     Parameters
     ----------
     lens : Lens
-        Of both.
+        Lens of both views.
     rt_cam_ref, rt_ref_plane : array (6,)
         Poses of the view and of the plane, Rodrigues rad and mm.
     pixels : array (point, 2)
@@ -85,12 +91,11 @@ def transfer(
         NaN where the plane is not in front of both cameras.
     """
     rays = np.column_stack([lens.rays_at(pixels), np.ones(len(pixels))])
-    normal = np.asarray(cv2.Rodrigues(np.asarray(rt_ref_plane[:3], np.float64))[0])[:, 2]
+    normal = rotation_matrix(rt_ref_plane)[:, 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         depth_mm = normal @ np.asarray(rt_ref_plane[3:]) / (rays @ normal)
         points = rays * np.where(depth_mm > 0, depth_mm, np.nan)[:, np.newaxis]
-    rotation = np.asarray(cv2.Rodrigues(np.asarray(rt_cam_ref[:3], np.float64))[0])
-    return lens.project(points @ rotation.T + rt_cam_ref[3:])
+    return lens.project(points @ rotation_matrix(rt_cam_ref).T + rt_cam_ref[3:])
 
 
 def transfer_sigma_px(
@@ -100,34 +105,34 @@ def transfer_sigma_px(
     rt_ref_plane: NDArray[np.floating],
     pixels: NDArray[np.floating] | None = None,
 ) -> NDArray[np.float64]:
-    """Return how well the transfer by a plane is known: the covariance of lens and pose carried to pixels.
+    """Return the standard deviation of the transfer by a plane that the covariance of lens and pose implies.
 
-    With D the derivative of `transfer` by lens and pose, σ² = trace(D Σ Dᵀ): the mean square distance, both axes
-    together, by which a pixel of the view is missed.
+    With D the derivative of `transfer` by lens and pose, σ² = trace(D Σ Dᵀ) is the mean square distance in the view
+    between computed and true pixel, both axes together.
 
     Parameters
     ----------
     lens : Lens
-        Of all views.
+        Lens of all views.
     rt_cam_ref : array (view, 6)
-        Poses.
+        Poses of the views.
     covariances : sequence of array (4 + distortion + 6, square)
-        Per view, of fx, fy, cx, cy, the distortion, and its pose.
+        Covariance of `lens.parameters` and the view's pose, for each view.
     rt_ref_plane : array (6,)
-        Of the plane, in any direction.
+        Pose of the plane, which may be tilted.
     pixels : array (point, 2), optional
-        In the reference view; a lattice over its image by default.
+        Pixels of the reference view; by default a lattice over its image.
 
     Returns
     -------
     array (view, point)
-        NaN where the view does not see the point within its image.
+        In pixels; NaN where the point lies outside of the view's image.
     """
     points = image_lattice(lens.size_px) if pixels is None else np.asarray(pixels, np.float64)
     sigma_px = np.full((len(rt_cam_ref), len(points)), np.nan)
     for view, (rt, covariance) in enumerate(zip(np.asarray(rt_cam_ref, float), covariances, strict=True)):
-        derivative = _transfer_derivative(lens, rt, rt_ref_plane, points)
-        variances = np.einsum("pai,ij,paj->p", derivative, covariance, derivative)
+        slope = _transfer_derivative(lens, rt, rt_ref_plane, points)
+        variances = np.einsum("pai,ij,paj->p", slope, covariance, slope)
         seen_at = transfer(lens, rt, rt_ref_plane, points)
         seen = ((seen_at >= -0.5) & (seen_at <= np.array(lens.size_px) - 0.5)).all(axis=1)
         sigma_px[view, seen] = np.sqrt(np.maximum(variances[seen], 0))
@@ -138,7 +143,7 @@ def _transfer_derivative(
     lens: Lens, rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.floating], pixels: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the derivative (point, 2, parameter) of `transfer` by lens and pose, from central differences."""
-    values = np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion, *rt_cam_ref])
+    values = np.array([*lens.parameters, *rt_cam_ref])
     derivative = np.empty((len(pixels), 2, len(values)))
     for index, value in enumerate(values):
         step = _STEP * (1 + abs(value))
@@ -146,8 +151,7 @@ def _transfer_derivative(
         for end in (value + step, value - step):
             moved = values.copy()
             moved[index] = end
-            fx_px, fy_px, cx_px, cy_px, *distortion = moved[:-6].tolist()
-            moved_lens = Lens(lens.size_px, fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+            moved_lens = Lens.from_parameters(lens.size_px, moved[:-6])
             ends.append(transfer(moved_lens, moved[-6:], rt_ref_plane, pixels))
         derivative[:, :, index] = (ends[0] - ends[1]) / (2 * step)
     return derivative

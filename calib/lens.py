@@ -1,6 +1,7 @@
 """The lens: where each detector pixel looks."""
 
 from dataclasses import dataclass
+from typing import Self
 
 import cv2
 import numpy as np
@@ -8,19 +9,19 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import LensNotInvertible
 
-# Undistorting and distorting again must return to the pixel within this.
+# Largest distance in pixels between a pixel and the image of its undistorted ray.
 _ROUND_TRIP_PX = 1e-3
 
-# Distortion is undone until the pixel is met within this; rounding would keep a smaller miss from ever being reached.
-_UNDISTORTED_PX = 1e-11
+# Stopping tolerance of the undistortion in pixels, a little above rounding.
+_UNDISTORTION_TOLERANCE_PX = 1e-11
 
-# OpenCV returns a wide Jacobian with every projected point: a strip at a time keeps it small.
+# Rows that are undistorted at a time: OpenCV returns a Jacobian with every point, and strips keep it small.
 _STRIP_ROWS = 32
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole with OpenCV's rational distortion; pixel centres are integers, the first pixel's centre is (0, 0).
+    """A pinhole with OpenCV's rational distortion; pixel centres are integers, starting at (0, 0).
 
     Parameters
     ----------
@@ -53,23 +54,34 @@ class Lens:
         if min(self.size_px) < 1:
             raise ValueError(f"size_px must be positive, got {self.size_px}")
 
+    @classmethod
+    def from_parameters(cls, size_px: tuple[int, int], parameters: NDArray[np.float64]) -> Self:
+        """Return the lens with the given `parameters`."""
+        fx_px, fy_px, cx_px, cy_px, *distortion = parameters.tolist()
+        return cls(size_px, fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """fx, fy, cx, cy in pixels, then the distortion coefficients."""
+        return np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion])
+
     def camera_matrix(self) -> NDArray[np.float64]:
         """Return the 3 x 3 matrix from undistorted rays (x, y, 1) to pixels (column, row, 1)."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]])
 
     def rays(self, first: tuple[int, int] = (0, 0), step: tuple[int, int] = (1, 1)) -> NDArray[np.float64]:
-        """Return x, y at unit depth of each pixel of a lattice, distortion undone: (row, column, 2).
+        """Return the undistorted rays (row, column, 2) of a lattice of pixels: x, y at unit depth.
 
         Parameters
         ----------
         first, step : (int, int)
-            Row and column of the lattice's first pixel, and the distance to its next; all pixels by default, one
-            phase of a Bayer mosaic with step (2, 2).
+            Row and column of the first pixel, and the distance to the next. The default takes all pixels; a step of
+            (2, 2) takes one phase of a Bayer mosaic.
 
         Raises
         ------
         LensNotInvertible
-            Some pixel is the image of no ray, or of several.
+            Some pixel is the image of no ray or of several rays.
         """
         width, height = self.size_px
         columns = np.arange(first[1], width, step[1], dtype=float)
@@ -81,17 +93,17 @@ class Lens:
         return rays
 
     def rays_at(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return x, y at unit depth of any pixels (point, 2) given as column, row.
+        """Return the undistorted rays (point, 2) of pixels (point, 2) given as column, row: x, y at unit depth.
 
         Raises
         ------
         LensNotInvertible
-            Some pixel is the image of no ray, or of several.
+            Some pixel is the image of no ray or of several rays.
         """
         return np.asarray(self._undistorted(np.asarray(pixels, np.float64)[np.newaxis])[0])
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the pixels (point, 2) of points (point, 3) in the camera's coordinates; NaN behind the camera."""
+        """Return the pixels (point, 2) of points (point, 3) in camera coordinates; NaN behind the camera."""
         points = np.asarray(points, np.float64)
         in_front = points[:, 2] > 0
         pixels = np.full((len(points), 2), np.nan)
@@ -101,10 +113,10 @@ class Lens:
         return pixels
 
     def _undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the rays of pixels (row, column, 2), checked by imaging them again."""
+        """Return the rays of pixels (row, column, 2), and check that they project back onto the pixels."""
         if not any(self.distortion):
             return (pixels - [self.cx_px, self.cy_px]) / [self.fx_px, self.fy_px]
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, _UNDISTORTED_PX)
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, _UNDISTORTION_TOLERANCE_PX)
         matrix, distortion = self.camera_matrix(), self._coefficients()
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, criteria=criteria)
         homogeneous = cv2.convertPointsToHomogeneous(rays)
@@ -119,6 +131,6 @@ class Lens:
         return np.asarray(rays.reshape(pixels.shape), np.float64)
 
     def _coefficients(self) -> NDArray[np.float64]:
-        """Return the distortion in one of the lengths that OpenCV takes: 4, 5 or 8."""
+        """Return the distortion, padded with zeros to a length that OpenCV accepts: 4, 5 or 8."""
         length = next(length for length in (4, 5, 8) if length >= len(self.distortion))
         return np.array([*self.distortion, *[0.0] * (length - len(self.distortion))])

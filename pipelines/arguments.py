@@ -1,20 +1,20 @@
-"""Types of command-line arguments whose limits are checked before a command runs."""
+"""Types of command-line arguments, with limits that are checked before a command runs."""
 
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-# Nothing that is measured here is larger, and numbers up to it overflow nowhere.
-_MOST = 1e9
+# No quantity is larger, and computing with numbers up to it does not overflow.
+_MAX_NUMBER = 1e9
 
 
-def _within(least: float, most: float = _MOST) -> Parameter:
-    """Return the check that a number, or each of a tuple, lies within limits."""
+def _within(minimum: float, maximum: float = _MAX_NUMBER) -> Parameter:
+    """Return a parameter whose number, or each number of a tuple, must lie within limits."""
 
     def check(_: Any, value: float | str | tuple[float, ...] | None) -> None:
         for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, int | float) and not least <= number <= most:
-                limits = f"at least {least:g}" if number < least else f"a number of at most {most:g}"
+            if isinstance(number, int | float) and not minimum <= number <= maximum:
+                limits = f"at least {minimum:g}" if number < minimum else f"a number of at most {maximum:g}"
                 raise ValueError(f"Must be {limits}, got {number:g}.")
 
     return Parameter(validator=check)

@@ -1,14 +1,14 @@
-"""The command line: which commands there are, and how their ends become exit codes.
+"""The command line: runs a command, prints its result, and turns its end into an exit code.
 
-A command is a function that takes its arguments and returns its result, a JSON-able object. `pipelines.registry` lists
-them by name, so that a module is imported only when its command runs.
+A command is a function of its arguments that returns its result, a JSON-able object. `pipelines.registry` lists the
+commands by name, so that a module is imported only when its command runs.
 """
 
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 from cyclopts import App, CycloptsError, Group, Parameter
@@ -20,12 +20,12 @@ from faintfield.pipelines.registry import register_commands
 
 DONE, FAILED, WRONG_USAGE = 0, 1, 2
 
-# What every command takes; listed last.
+# Options of every command; listed last.
 EVERY_COMMAND = Group("Every command", sort_key=9)
 
 _START = """Start with: faintfield demo first-demo
 
-Every command ends its own --help with an example; docs/guide.md leads from the parts list to the first plane."""
+The --help of every command ends with an example; docs/guide.md leads from the parts list to the first plane."""
 
 app = App(
     name="faintfield",
@@ -36,7 +36,7 @@ app = App(
     default_parameter=Parameter(negative=()),
     result_action="return_value",
 )
-# `run` says in one line what an interrupt leaves behind.
+# `run` reports an interrupt in one line.
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 register_commands(app)
 app.register_install_completion_command(help="Complete commands and options with the tab key of your shell.")
@@ -57,14 +57,14 @@ def _launch(
     json
         Print the result as one JSON object on standard output.
     log
-        Add a record to this file: the command, versions, all that is said, with times, and how it ended.
+        Append to this file: the command, versions, all messages with their times, and how the command ended.
     """
     with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)):
-        result: Any = app(tokens, exit_on_error=False, print_error=True)
+        result: object = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
         sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
-    elif isinstance(result, dict) and "report" in result:
-        sys.stdout.write(f"{result['report']}\n")
+    elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
+        sys.stdout.write(f"{report}\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -73,8 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command and return its exit code; any other exception than a named failure is a bug."""
-    _load_what_help_lists(arguments)
+    """Run one command and return its exit code; an exception that is not a named failure is a bug, and is raised."""
     try:
         app.meta(arguments, exit_on_error=False, print_error=True)
     except CycloptsError:
@@ -86,19 +85,6 @@ def run(arguments: Sequence[str]) -> int:
         inform(f"faintfield: {type(failure).__name__}: {failure}")
         return FAILED
     except KeyboardInterrupt:
-        inform("faintfield: Interrupted: stopped by Ctrl-C; what was finished is kept, no file is half-written")
+        inform("faintfield: Interrupted: stopped by Ctrl-C; finished results are kept, and no file is half-written")
         return FAILED
     return DONE
-
-
-def _load_what_help_lists(arguments: Sequence[str]) -> None:
-    """Import the commands of a list that is about to be shown: what they do stands in their modules."""
-    level = app
-    for word in arguments:
-        if word.startswith("-"):
-            break
-        if word not in level:
-            return
-        level = level[word]
-    for name in level:
-        level[name]

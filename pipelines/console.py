@@ -1,4 +1,4 @@
-"""Words and progress for people, always on standard error; standard output is for results alone."""
+"""Messages and progress bars, always on standard error; standard output is for results only."""
 
 import logging
 from collections.abc import Generator, Iterable
@@ -17,27 +17,27 @@ console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
 logger = logging.getLogger("faintfield")
 
-# A message in a frame needs its lines broken, or the frame cuts them off.
+# Wraps lines: messages in a frame would be cut off otherwise.
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
 
 def inform(text: str) -> None:
-    """Print one line of human words, and record it where a log is kept."""
+    """Print one line for people, and record it in the log if there is one."""
     console.print(text, markup=False)
     logger.info(text)
 
 
 def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Generator[T]:
-    """Yield `items`, drawing a bar with a time to go on a terminal and nothing elsewhere.
+    """Yield `items`; on a terminal, draw a bar with the time left.
 
     Parameters
     ----------
     items : iterable
-        What to go through; the bar advances as each is taken.
+        The bar advances as each item is taken.
     label : str
-        What is being done, in a few words.
+        The work in a few words.
     total : int, optional
-        How many items there are, when `items` has no length.
+        The number of items, if `items` has no length.
     """
     columns = (
         TextColumn("{task.description}"),
@@ -47,7 +47,7 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
-    # Only a terminal gets the thread that redraws: one that a caller leaves behind could not be joined at exit
+    # Without a terminal there is no thread that redraws: left behind by a caller, it could not be joined at exit
     drawn = console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
         yield from bar.track(items, description=label, total=total)

@@ -1,4 +1,4 @@
-"""The failures of files and folders given to a command, one tree: catch `InputError` to catch them all.
+"""The failures of files and folders that a command is given: one tree, `InputError` at its root.
 
 InputError
 ├── MissingFile
@@ -17,7 +17,7 @@ InputError
 
 WrongUsage
 
-Every message says what is wrong, the value found, the limit it broke, and what to do.
+Every message states what is wrong, the value found, its limit, and what to do.
 """
 
 from faintfield.calib.errors import CalibrationError
@@ -30,11 +30,11 @@ class InputError(Exception):
 
 
 class MissingFile(InputError):
-    """A file or folder that is named does not exist."""
+    """A file or folder does not exist, or cannot be read."""
 
 
 class UnreadableImage(InputError):
-    """An image file cannot be decoded, or holds something else than was promised."""
+    """An image file cannot be decoded, or does not hold one picture."""
 
 
 class WrongSize(InputError):
@@ -46,15 +46,15 @@ class WrongBitDepth(InputError):
 
 
 class BadValue(InputError):
-    """A setting in a file has a value that cannot be."""
+    """A setting in a file has an impossible value."""
 
 
 class UnknownKey(BadValue):
-    """A file has a key that nothing reads: most often a misspelt one."""
+    """A file has a key that is not read, most often a misspelt one."""
 
 
 class OutputExists(InputError):
-    """The place to write to holds something already."""
+    """The folder to write already holds something."""
 
 
 class OutputBusy(InputError):
@@ -62,28 +62,28 @@ class OutputBusy(InputError):
 
 
 class MissingPackage(InputError):
-    """A command needs a package that is not installed with the rest."""
+    """A command needs a package that is an extra, and not installed."""
 
 
 class ClusterFailed(InputError):
-    """The workers that were to do the tasks cannot be reached, or died; what they finished is kept."""
+    """The workers of a cluster cannot be reached, or died; the planes they finished are kept."""
 
 
 class MemoryShort(InputError):
-    """What was asked for needs more memory than is free."""
+    """A task needs more memory than is free."""
 
 
 class CannotWrite(InputError):
-    """A result could not be written; nothing half-written is left behind."""
+    """A result cannot be written; no half-written file is left behind."""
 
 
 class DiskFull(CannotWrite):
-    """The disk has no room for the result; nothing half-written is left behind."""
+    """The disk has no room for a result; no half-written file is left behind."""
 
 
 class WrongUsage(Exception):
-    """The options of a command do not make sense together; exit code 2, unlike an InputError."""
+    """The options of a command contradict one another; exit code 2, unlike an InputError."""
 
 
-# What a user can mend: the launcher says it in one line and ends with exit code 1.
+# Failures that a user can mend: the launcher prints one line and exits with code 1.
 NAMED_FAILURES = (RigError, CalibrationError, ReconstructionError, InputError)

@@ -1,7 +1,7 @@
-"""The log that `--log FILE` asks for: who ran what when, all that was said, and the traceback of a bug.
+"""The log of `--log FILE`: the command and its time, every message, and the traceback of a bug.
 
-Everything goes through Python's `logging`, so that what libraries have to say is recorded too. The file is added to,
-line by line, unlike results: what happened before a crash is what a log is for.
+Everything goes through Python's `logging`, so that the messages of libraries are recorded too. Unlike results, the file
+is appended to line by line: a log must hold what happened before a crash.
 """
 
 import logging
@@ -16,21 +16,21 @@ from faintfield.pipelines.formats.provenance import versions
 
 logger = logging.getLogger("faintfield")
 logger.setLevel(logging.INFO)
-logger.addHandler(logging.NullHandler())  # without a file nothing is printed either
+logger.addHandler(logging.NullHandler())  # without --log, nothing is printed
 
 
 @contextmanager
 def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseException], ...]) -> Iterator[None]:
-    """Record in the file at `path` what happens while the block runs; without a path, do nothing.
+    """Record in a file what happens while the block runs; do nothing if `path` is None.
 
     Parameters
     ----------
     path : Path, optional
-        The file to add to; its folder must exist.
+        The file to append to; its folder must exist.
     words : sequence of str
         The command and its arguments.
     one_line : tuple of exception types
-        Failures whose message says all; any other is recorded with its traceback.
+        Failures that are recorded by their message; any other is recorded with its traceback.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseExc
 
 
 def _opened(path: Path) -> logging.Handler:
-    """Return the handler that adds to the file, in universal time."""
+    """Return a handler that appends to the file, with times in UTC."""
     try:
         handler = logging.FileHandler(path, encoding="utf-8")
     except OSError as failure:

@@ -1,5 +1,6 @@
-"""Which commands there are, in the order in which an experiment needs them, each with an example."""
+"""The list of commands, in the order in which an experiment needs them, each with an example."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 from cyclopts import App, Group
@@ -10,18 +11,23 @@ CALIBRATE = Group("Calibrate", sort_key=3)
 RECONSTRUCT = Group("Reconstruct", sort_key=4)
 FILES = Group("Other people's files", sort_key=5)
 
+_PACKAGE = Path(__file__).parent
+
+# What `commands.stage` says of itself.
+_STAGE_HELP = "Bring up a stage: ask it, home it, move it, try it."
+
 
 class Command(NamedTuple):
-    """One command: where its function is, and how it is called.
+    """One command.
 
     Parameters
     ----------
     name : str
-        As it is typed.
+        The word that is typed.
     target : str
-        Module and function, imported only when the command runs or its help is shown.
+        Module and function, imported only when the command runs or its own help is shown.
     example : str
-        Arguments of a call that makes sense; a test parses each.
+        Arguments of a sensible call; a test parses each.
     """
 
     name: str
@@ -81,17 +87,18 @@ IMPORTS = (
     ),
 )
 EXPORTS = (
-    Command("colmap", "faintfield.pipelines.commands.imports.colmap:export_colmap", "colmap set sparse"),
-    Command("mrcal", "faintfield.pipelines.commands.imports.mrcal:export_mrcal", "mrcal set cameras"),
+    Command("colmap", "faintfield.pipelines.commands.exports.colmap:export_colmap", "colmap set sparse"),
+    Command("mrcal", "faintfield.pipelines.commands.exports.mrcal:export_mrcal", "mrcal set cameras"),
     Command("zarr", "faintfield.pipelines.commands.exports.zarr:export_zarr", "zarr sweep sweep.ome.zarr"),
 )
 
 
 def register_commands(app: App) -> None:
-    """Make all commands known to `app`, grouped as its help shows them; no module of theirs is imported."""
+    """Register all commands with `app`, grouped as its help shows them, without importing their modules."""
     for group, commands in COMMANDS.items():
         _register(app, commands, "faintfield", group)
-    app.command("faintfield.pipelines.commands.stage:app", name="stage", group=AT_THE_RIG, sort_key=2.5)
+    stage = "faintfield.pipelines.commands.stage:app"
+    app.command(stage, name="stage", help=_STAGE_HELP, group=AT_THE_RIG, sort_key=2.5)
     for name, commands, words in (
         ("import", IMPORTS, "Make a set of images and poses, or of frames, from other people's files."),
         ("export", EXPORTS, "Write lens and poses of a set, or planes, for other people's programs."),
@@ -101,15 +108,23 @@ def register_commands(app: App) -> None:
 
 
 def _register(app: App, commands: tuple[Command, ...], prefix: str, group: Group | None = None) -> None:
-    """Make commands known to one level, in their order."""
+    """Register the commands of one level, in their order."""
     for place, command in enumerate(commands, start=1):
         app.command(
             command.target,
             name=command.name,
+            help=_docstring(command.target),
             group=group,
             sort_key=place,
             help_epilogue=_example(prefix, command),
         )
+
+
+def _docstring(target: str) -> str:
+    """Return the docstring of a command from its source: importing all modules would take seconds."""
+    module, _, function = target.partition(":")
+    source = _PACKAGE.joinpath(*module.split(".")[2:]).with_suffix(".py").read_text()
+    return source.partition(f"\ndef {function}(")[2].split('"""')[1]
 
 
 def _example(prefix: str, command: Command) -> str:

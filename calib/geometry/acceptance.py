@@ -1,27 +1,28 @@
-"""What the corners cannot carry is refused, by the transfer that they predict, with the reason and what to add."""
+"""Acceptance of a geometry by the transfer uncertainty that its own covariance predicts."""
 
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import LensNotInvertible, NotIdentifiable
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.geometry.rig_geometry import RigGeometry
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, transfer_sigma_px
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, rotation_matrix, transfer_sigma_px
 
-_FEWEST_BOARDS = 3
-_FEWEST_NODES = 9
-_LEAST_TILT_RAD = np.radians(15)
-_LEAST_COVERAGE = 0.5
-_FARTHEST_OVER_DEPTH = 2.0
-_COVERAGE_CELLS = 6
+# Limits that a set has to keep in order to lack nothing. A refusal names what it lacks; the predicted transfer decides.
+_MIN_BOARDS = 3
+_MIN_NODES = 9  # 3 x 3
+_MIN_TILT_RAD = np.radians(15)
+_MIN_COVERAGE = 0.5  # share of the image's cells that hold corners
+_COVERAGE_CELLS = 6  # along each side of the image
+_MAX_DISTANCE_OVER_DEPTH = 2.0  # of the nearest board, over the depth of the plane
+
 _MORE = "show more boards, nearer and tilted about both axes, or raise --limit-px"
 
 
 def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.float64]:
-    """Return σ in pixels (node, point) of the transfer by the plane across the axis at a depth.
+    """Return σ in pixels (node, point) of the transfer by the plane normal to the axis at a depth.
 
     It is NaN where a view does not see the point, and for the reference view, whose transfer to itself is exact.
     """
@@ -33,7 +34,7 @@ def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.floa
 
 
 def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
-    """Return the rms of σ over all nodes and points that are seen; infinite where it is no number."""
+    """Return the rms of σ over all nodes and points that are seen; infinite if there is none."""
     with np.errstate(over="ignore", invalid="ignore"):
         mean = float(np.nanmean(np.square(sigma_px))) if np.isfinite(sigma_px).any() else np.inf
     return float(np.sqrt(mean))
@@ -42,17 +43,17 @@ def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
 def require_determined(
     geometry: RigGeometry, observations: Observations, depths_mm: Sequence[float], limit_px: float
 ) -> None:
-    """Refuse a geometry whose plane homographies are not known to the limit at some depth.
+    """Check that the transfer by the plane at each depth is known to within a limit.
 
     Raises
     ------
     NotIdentifiable
-        With the σ found, the limit, and what the boards lack.
+        It is not; the message gives σ, the limit, and what the boards lack.
     """
     for depth_mm in depths_mm:
         try:
             of_views_px = transfer_sigma_at(geometry, depth_mm)
-        except LensNotInvertible:  # a lens that nothing determines folds over itself
+        except LensNotInvertible:  # an undetermined lens may fold the image
             of_views_px = np.full((len(geometry.nodes), 1), np.inf)
         _require_seen(of_views_px, depth_mm)
         sigma_px = rms_over_views(of_views_px)
@@ -60,12 +61,12 @@ def require_determined(
             raise NotIdentifiable(
                 f"plane at {depth_mm:g} mm: its transfer between views is known to {sigma_px:.3g} px only, "
                 f"limit {limit_px:g} px (the corners fit to {geometry.rms_inlier_px:.2g} px, which says little): "
-                f"{'; '.join(lacks(geometry, observations, depth_mm) or [_MORE])}"
+                f"{'; '.join(find_shortcomings(geometry, observations, depth_mm) or [_MORE])}"
             )
 
 
 def _require_seen(sigma_px: NDArray[np.float64], depth_mm: float) -> None:
-    """Refuse a plane that less than half of the views see anything of."""
+    """Check that at least half of the views see some of a plane."""
     seen, others = int((~np.isnan(sigma_px)).any(axis=1).sum()), len(sigma_px) - 1
     if 2 * seen < others:
         raise NotIdentifiable(
@@ -74,39 +75,38 @@ def _require_seen(sigma_px: NDArray[np.float64], depth_mm: float) -> None:
         )
 
 
-def lacks(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
-    """Return what the set lacks, each with what to add."""
+def find_shortcomings(geometry: RigGeometry, observations: Observations, depth_mm: float) -> list[str]:
+    """Return what the set lacks, and for each what to add."""
     found = []
     boards = geometry.boards
-    if len(boards) < _FEWEST_BOARDS:
+    if len(boards) < _MIN_BOARDS:
         found.append(
-            f"{len(boards)} board pose(s) only: show at least {_FEWEST_BOARDS}, better 6, tilted by 20 to 40 degrees"
+            f"{len(boards)} board pose(s) only: show at least {_MIN_BOARDS}, better 6, tilted by 20 to 40 degrees"
         )
     tilt_rad = max(_tilt_rad(board.rt_ref_board) for board in boards)
-    if tilt_rad < _LEAST_TILT_RAD:
+    if tilt_rad < _MIN_TILT_RAD:
         found.append(
             f"no board is tilted by more than {np.degrees(tilt_rad):.0f} degrees: "
             "tilt some by 20 to 40 degrees, about both axes"
         )
     nearest_mm = min(float(board.rt_ref_board[5]) for board in boards)
-    if nearest_mm > _FARTHEST_OVER_DEPTH * depth_mm:
+    if nearest_mm > _MAX_DISTANCE_OVER_DEPTH * depth_mm:
         found.append(f"the nearest board stands at {nearest_mm:.0f} mm: bring some to about {depth_mm:g} mm")
-    if len(geometry.nodes) < _FEWEST_NODES:
-        found.append(f"{len(geometry.nodes)} node(s) only: take at least {_FEWEST_NODES}")
+    if len(geometry.nodes) < _MIN_NODES:
+        found.append(f"{len(geometry.nodes)} node(s) only: take at least {_MIN_NODES}")
     coverage = _coverage(observations, geometry.lens.size_px)
-    if coverage < _LEAST_COVERAGE:
+    if coverage < _MIN_COVERAGE:
         found.append(f"corners cover {coverage:.0%} of the image: move boards into its edges, or take larger ones")
     return found
 
 
 def _tilt_rad(rt_ref_board: NDArray[np.float64]) -> float:
     """Return the angle between a board and the detector."""
-    rotation = np.asarray(cv2.Rodrigues(np.ascontiguousarray(rt_ref_board[:3]))[0])
-    return float(np.arccos(min(abs(rotation[2, 2]), 1.0)))
+    return float(np.arccos(min(abs(rotation_matrix(rt_ref_board)[2, 2]), 1.0)))
 
 
 def _coverage(observations: Observations, size_px: tuple[int, int]) -> float:
-    """Return the share of the image's cells, 6 x 6, in which some corner was seen."""
+    """Return the share of the image's cells that hold a corner."""
     pixels = observations.pixels[observations.weights > 0]
     cells = np.clip((pixels / np.array(size_px) * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
     return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2

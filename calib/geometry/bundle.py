@@ -1,4 +1,4 @@
-"""The bundle adjustment: one lens, the pose of every node, the pose of every board as it stood (mrcal)."""
+"""Bundle adjustment with mrcal: one lens, the pose of every node, and the pose of every board in every sweep."""
 
 import os
 from collections.abc import Iterator
@@ -6,36 +6,37 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import mrcal
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.geometry.initialization import Seed, seed_from
+from faintfield.calib.geometry.initialization import Initialization, initialize
 from faintfield.calib.geometry.observations import Observations
+from faintfield.calib.mrcal_loader import load_mrcal
 
 LENS_MODELS = {"pinhole": "LENSMODEL_PINHOLE", **{f"opencv{n}": f"LENSMODEL_OPENCV{n}" for n in (4, 5, 8)}}
 
-# Newton steps after mrcal's own stopping, which halts about 1e-6 px short of the optimum.
-_POLISHING_STEPS = 5
-_POLISHED_STEP = 1e-11
+# Limits of the Gauss-Newton steps that follow mrcal, which stops about 1e-6 px short of the optimum: their number, and
+# the largest entry of a step, in mrcal's scaled state, that ends them.
+_MAX_POLISHING_STEPS = 5
+_POLISHING_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True)
-class Problem:
-    """What is asked of the solver.
+class BundleProblem:
+    """Input of the bundle adjustment.
 
     Parameters
     ----------
     observations : Observations
-        The corners.
+        Corners of the boards.
     size_px : (int, int)
         Width and height of the detector.
     square_mm : float
-        Of all boards.
+        Edge length of the squares of all boards.
     lens_model : str
         One of `LENS_MODELS`.
     with_warp : bool
-        The boards may be bent, all alike; only where they are all of one shape.
+        Fit one bend that all boards share, which requires boards of one shape.
     """
 
     observations: Observations
@@ -47,19 +48,19 @@ class Problem:
 
 @dataclass(frozen=True)
 class Bundle:
-    """A solved problem.
+    """Solution of a bundle adjustment.
 
     Attributes
     ----------
     inputs : dict
-        mrcal's optimisation inputs at the optimum: `mrcal.optimize(**inputs)` stays there.
+        mrcal's optimization inputs at the optimum: `mrcal.optimize(**inputs)` stays there.
     """
 
     inputs: dict[str, Any]
 
     @property
     def intrinsics(self) -> NDArray[np.float64]:
-        """Fx, fy, cx, cy, and the distortion."""
+        """Parameters of the lens: fx, fy, cx, cy, and the distortion."""
         return np.asarray(self.inputs["intrinsics"][0])
 
     @property
@@ -74,23 +75,24 @@ class Bundle:
 
     @property
     def warp_mm(self) -> NDArray[np.float64]:
-        """How far the boards bulge at their middle along x and y, (2,)."""
+        """Height in mm of the boards' bulge at their middle along x and y, (2,)."""
         warp = self.inputs["calobject_warp"]
         return np.zeros(2) if warp is None else np.asarray(warp)
 
     @property
     def inlier(self) -> NDArray[np.bool_]:
-        """Which corners were seen and believed, (view, row, column)."""
+        """Corners that were seen and are no outliers, (view, row, column)."""
         return np.asarray(self.inputs["observations_board"][..., 2] > 0)
 
     def residuals(self) -> NDArray[np.float64]:
         """Return the weighted residuals in pixels (view, row, column, 2): model minus corner; zero where masked."""
-        x = mrcal.optimizer_callback(**self.inputs, no_jacobian=True, no_factorization=True)[1]
+        x = load_mrcal().optimizer_callback(**self.inputs, no_jacobian=True, no_factorization=True)[1]
         shape = (*self.inputs["observations_board"].shape[:3], 2)
         return np.asarray(x[: np.prod(shape)]).reshape(shape)
 
     def state_slices(self) -> dict[str, slice]:
-        """Return where in mrcal's state the intrinsics, the cameras and the boards are."""
+        """Return the slices of mrcal's state that hold the intrinsics, the cameras and the boards."""
+        mrcal = load_mrcal()
         counts = {
             "intrinsics": (mrcal.state_index_intrinsics(0, **self.inputs), len(self.intrinsics)),
             "cameras": (mrcal.state_index_extrinsics(0, **self.inputs), 6 * len(self.inputs["rt_cam_ref"])),
@@ -99,10 +101,9 @@ class Bundle:
         return {name: slice(first, first + count) for name, (first, count) in counts.items()}
 
 
-def solve(problem: Problem, seed: Seed | None = None) -> Bundle:
-    """Adjust poses, then lens, then everything with outliers marked, each stage from where the last ended."""
-    seed = seed or seed_from(problem.observations, problem.size_px, problem.square_mm)
-    inputs = _inputs(problem, seed)
+def solve(problem: BundleProblem) -> Bundle:
+    """Return the solution, found in stages: poses, then the lens, then everything with outliers marked."""
+    inputs = _inputs(problem, initialize(problem.observations, problem.size_px, problem.square_mm))
     stages: list[dict[str, bool]] = [
         {"do_optimize_intrinsics_core": False, "do_optimize_intrinsics_distortions": False},
         {"do_optimize_intrinsics_distortions": False},
@@ -117,40 +118,44 @@ def solve(problem: Problem, seed: Seed | None = None) -> Bundle:
             "do_apply_outlier_rejection": False,
             **stage,
         }
-        _optimised(inputs)
+        _optimize(inputs)
     inputs["do_apply_outlier_rejection"] = False
-    return Bundle(_polished(inputs))
+    _polish(inputs)
+    return Bundle(inputs)
 
 
 def solve_again(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
-    """Solve with only some of the views (view,) from where another solution ended; outliers stay marked."""
-    return Bundle(_optimised(_restricted(bundle, observations, chosen)))
+    """Return the solution from the chosen views (view,) alone, starting from `bundle`; outliers stay marked."""
+    inputs = _restricted(bundle, observations, chosen)
+    _optimize(inputs)
+    return Bundle(inputs)
 
 
 def fit_boards(bundle: Bundle, other: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
-    """Fit only the boards of some views (view,), with the corners of `bundle` and the cameras of `other`."""
+    """Return the poses of the boards in the chosen views (view,), with lens and cameras fixed to those of `other`."""
     inputs = _restricted(bundle, observations, chosen)
     inputs["intrinsics"] = other.inputs["intrinsics"].copy()
     inputs["rt_cam_ref"] = other.inputs["rt_cam_ref"].copy()
     inputs["calobject_warp"] = None if other.inputs["calobject_warp"] is None else other.inputs["calobject_warp"].copy()
     locked = ("intrinsics_core", "intrinsics_distortions", "extrinsics", "calobject_warp")
     inputs |= {f"do_optimize_{name}": False for name in locked}
-    return Bundle(_optimised(inputs))
+    _optimize(inputs)
+    return Bundle(inputs)
 
 
-def _inputs(problem: Problem, seed: Seed) -> dict[str, Any]:
-    """Return mrcal's optimisation inputs at the seed."""
+def _inputs(problem: BundleProblem, initial: Initialization) -> dict[str, Any]:
+    """Return mrcal's optimization inputs at the initial values."""
     observations = problem.observations
     model = LENS_MODELS[problem.lens_model]
     width, height = problem.size_px
-    intrinsics = np.zeros((1, mrcal.lensmodel_num_params(model)))
-    intrinsics[0, :4] = seed.focal_px, seed.focal_px, (width - 1) / 2, (height - 1) / 2
+    intrinsics = np.zeros((1, load_mrcal().lensmodel_num_params(model)))
+    intrinsics[0, :4] = initial.focal_px, initial.focal_px, (width - 1) / 2, (height - 1) / 2
     return {
         "lensmodel": model,
         "intrinsics": intrinsics,
         "imagersizes": np.array([problem.size_px], np.int32),
-        "rt_cam_ref": seed.rt_cam_ref[1:].copy(),
-        "rt_ref_frame": seed.rt_ref_board.copy(),
+        "rt_cam_ref": initial.rt_cam_ref[1:].copy(),
+        "rt_ref_frame": initial.rt_ref_board.copy(),
         "points": None,
         "observations_point": None,
         "indices_point_camintrinsics_camextrinsics": None,
@@ -166,12 +171,12 @@ def _inputs(problem: Problem, seed: Seed) -> dict[str, Any]:
 
 
 def _indices(target_of: NDArray[np.int32], node_of: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Return mrcal's (frame, intrinsics, extrinsics) per view; the reference camera has no extrinsics: −1."""
+    """Return mrcal's (frame, intrinsics, extrinsics) per view; the extrinsics of the reference camera are −1."""
     return np.ascontiguousarray(np.column_stack([target_of, np.zeros_like(target_of), node_of - 1]), np.int32)
 
 
 def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> dict[str, Any]:
-    """Return copies of a solution's inputs with some of its views, and only the boards that those see."""
+    """Return a copy of a solution's inputs with the chosen views and the boards that they see."""
     targets, frame_of = np.unique(observations.target_of[chosen], return_inverse=True)
     inputs = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in bundle.inputs.items()}
     inputs["rt_ref_frame"] = np.ascontiguousarray(inputs["rt_ref_frame"][targets])
@@ -181,15 +186,16 @@ def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.b
     return inputs
 
 
-def _optimised(inputs: dict[str, Any]) -> dict[str, Any]:
+def _optimize(inputs: dict[str, Any]) -> None:
+    """Move the inputs to the optimum, in place."""
+    mrcal = load_mrcal()
     with _c_library_silenced():
         mrcal.optimize(**inputs)
-    return inputs
 
 
 @contextmanager
 def _c_library_silenced() -> Iterator[None]:
-    """Keep off standard error what mrcal's C code writes there: it counts corners never seen as thrown out."""
+    """Drop what mrcal's C code writes to standard error: it counts corners never seen as outliers."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(nowhere, 2)
@@ -200,14 +206,14 @@ def _c_library_silenced() -> Iterator[None]:
         os.close(nowhere)
 
 
-def _polished(inputs: dict[str, Any]) -> dict[str, Any]:
-    """Take Gauss-Newton steps until they no longer move, so that a solution does not depend on where it began."""
-    for _ in range(_POLISHING_STEPS):
+def _polish(inputs: dict[str, Any]) -> None:
+    """Take Gauss-Newton steps, in place, until they vanish, so that the solution does not depend on its start."""
+    mrcal = load_mrcal()
+    for _ in range(_MAX_POLISHING_STEPS):
         state, x, jacobian, factor = mrcal.optimizer_callback(**inputs)
         if factor is None:
             break
         step = factor.solve_xt_JtJ_bt((jacobian.T @ x)[np.newaxis])[0]
         mrcal.ingest_packed_state(state - step, **inputs)
-        if np.abs(step).max() < _POLISHED_STEP:
+        if np.abs(step).max() < _POLISHING_TOLERANCE:
             break
-    return inputs

@@ -1,4 +1,4 @@
-"""Geometry of the rig from corners: solve, state the uncertainty, and refuse what the corners cannot carry."""
+"""Calibrate the geometry of the rig from corners: solve, find the uncertainty, and accept or refuse the result."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,39 +8,41 @@ from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
 from faintfield.calib.errors import PoorFit, TooFewViews
-from faintfield.calib.geometry.acceptance import lacks, require_determined
-from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, Problem, solve
+from faintfield.calib.geometry.acceptance import find_shortcomings, require_determined
+from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, BundleProblem, solve
 from faintfield.calib.geometry.covariance import Uncertainty, uncertainty
-from faintfield.calib.geometry.diagnostics import doubtful_views
+from faintfield.calib.geometry.diagnostics import inconsistent_views
 from faintfield.calib.geometry.holdout import holdout_ratio
 from faintfield.calib.geometry.observations import BoardObservation, Node, Observations, gather
 from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
 from faintfield.calib.lens import Lens
 
-# Larger residuals are of no board.
-_MOST_RESIDUAL_PX = 5.0
-# What a grid of 2 x 2 has; less says nothing of a stage, and a plane seen from fewer places is no better than one view.
-_FEWEST_NODES = 4
+# Largest rms residual in pixels; beyond, boards and images do not belong together.
+_MAX_RESIDUAL_PX = 5.0
+
+# A grid of 2 x 2: fewer nodes say nothing of a stage, and hardly improve on a single view of a plane.
+_MIN_NODES = 4
+
 _REMEDY = "check columns, rows and first_marker_id of every [[board]] against the print, and the node of every image"
 
 
 @dataclass(frozen=True)
 class GeometrySettings:
-    """What is asked of the calibration.
+    """Lens model and limits of a calibration.
 
     Parameters
     ----------
     lens_model : str
         "pinhole", "opencv4", "opencv5" or "opencv8".
     depths_mm : tuple of float
-        Depths of the planes that will be reconstructed, for which the transfer must be known.
-    most_transfer_sigma_px : float
-        Largest standard deviation allowed there, rms over views and image.
-    most_holdout_ratio : float
-        Largest residual of boards left out, relative to the fit's; where corners fit to a few thousandths of a pixel,
-        what leaving boards out adds may be many times that and yet too little to matter.
+        Depths of the planes to be reconstructed, at which the transfer between views must be known.
+    max_transfer_sigma_px : float
+        Largest standard deviation of the transfer at these depths, rms over views and image.
+    max_holdout_ratio : float
+        Largest ratio of the residual of boards left out to that of the fit.
     negligible_holdout_px : float
-        So much, rms, is never refused.
+        Rms residual that leaving boards out may always add. Where corners fit to a few thousandths of a pixel, the
+        ratio can be large although the added residual does not matter.
 
     Raises
     ------
@@ -50,19 +52,15 @@ class GeometrySettings:
 
     lens_model: str = "opencv5"
     depths_mm: tuple[float, ...] = (500.0, 700.0)
-    most_transfer_sigma_px: float = 0.5
-    most_holdout_ratio: float = 1.3
+    max_transfer_sigma_px: float = 0.5
+    max_holdout_ratio: float = 1.3
     negligible_holdout_px: float = 0.1
 
     def __post_init__(self) -> None:
         if self.lens_model not in LENS_MODELS:
             raise ValueError(f"lens model '{self.lens_model}' is not known; take one of {', '.join(LENS_MODELS)}")
-        numbers = (
-            *self.depths_mm,
-            self.most_transfer_sigma_px,
-            self.most_holdout_ratio,
-            self.negligible_holdout_px,
-        )
+        limits = (self.max_transfer_sigma_px, self.max_holdout_ratio, self.negligible_holdout_px)
+        numbers = (*self.depths_mm, *limits)
         if not self.depths_mm or not all(np.isfinite(number) and number > 0 for number in numbers):
             raise ValueError(f"depths and limits must be positive, and at least one depth given; got {numbers}")
 
@@ -74,58 +72,66 @@ def calibrate_geometry(
     reference: Node,
     settings: GeometrySettings | None = None,
 ) -> RigGeometry:
-    """Return lens, poses and their covariance from the corners of boards seen at the nodes.
+    """Return lens, poses and their covariance from the corners of boards seen from the nodes.
 
     Parameters
     ----------
     boards : mapping of name to Board
-        All that are named by the observations; their squares are of one size.
+        All boards that the observations name; their squares have one size.
     observations : sequence of BoardObservation
-        Per node and board as it stood.
+        Corners by node and target.
     size_px : (int, int)
         Width and height of the detector.
     reference : (int, int)
-        The centre node.
+        The centre node, whose camera is the reference frame.
     settings : GeometrySettings, optional
-        The defaults otherwise.
+        Lens model and limits.
 
     Raises
     ------
     TooFewViews, NotIdentifiable, PoorFit
         The corners do not determine the geometry to the limits of `settings`; the message says why and what to add.
+    MissingMrcal
+        mrcal is not installed.
     """
     settings = settings or GeometrySettings()
-    named = [boards[name] for name in dict.fromkeys(seen.target.board for seen in observations)]
-    if not named:
-        raise TooFewViews("no board was found in any image; check [[board]] against the print, and the exposure")
-    gathered = gather(observations, {board.name: board.corner_shape for board in named}, reference)
-    if len(gathered.nodes) < _FEWEST_NODES:
-        raise TooFewViews(
-            f"{len(gathered.nodes)} node(s) show the boards that the reference node {reference} shows, limit "
-            f"{_FEWEST_NODES}; take more nodes, better 9 and more, and leave the boards where they are meanwhile"
-        )
-    one_shape = len({board.corner_shape for board in named}) == 1
-    problem = Problem(gathered, size_px, _square_mm(named), settings.lens_model, with_warp=one_shape)
-    bundle = _solved(problem)
-    doubts = doubtful_views(bundle, gathered)
-    known = uncertainty(bundle, gathered)
-    geometry = replace(_geometry(problem, bundle, known), doubts=doubts)
-    if not lacks(geometry, gathered, max(settings.depths_mm)):  # a set that lacks something may end anywhere
+    problem = _problem(boards, observations, size_px, reference, settings.lens_model)
+    gathered, bundle = problem.observations, _solve(problem)
+    geometry = _geometry(problem, bundle, inconsistent_views(bundle, gathered), uncertainty(bundle, gathered))
+    if not find_shortcomings(geometry, gathered, max(settings.depths_mm)):  # else the solution may be any
         _require_residuals(bundle, gathered)
-    require_determined(geometry, gathered, settings.depths_mm, settings.most_transfer_sigma_px)
+    require_determined(geometry, gathered, settings.depths_mm, settings.max_transfer_sigma_px)
     geometry = replace(geometry, holdout_ratio=holdout_ratio(bundle, gathered))
     _require_fit(geometry, settings)
     return geometry
 
 
-def _square_mm(boards: Sequence[Board]) -> float:
-    sizes = sorted({board.square_mm for board in boards})
-    if len(sizes) > 1:
-        raise ValueError(f"boards have squares of {sizes} mm; all boards of one calibration must have the same")
-    return sizes[0]
+def _problem(
+    boards: Mapping[str, Board],
+    observations: Sequence[BoardObservation],
+    size_px: tuple[int, int],
+    reference: Node,
+    lens_model: str,
+) -> BundleProblem:
+    """Return the input of the bundle adjustment, checked for enough nodes and boards of one size."""
+    named = [boards[name] for name in dict.fromkeys(seen.target.board for seen in observations)]
+    if not named:
+        raise TooFewViews("no board was found in any image; check [[board]] against the print, and the exposure")
+    gathered = gather(observations, {board.name: board.corner_shape for board in named}, reference)
+    if len(gathered.nodes) < _MIN_NODES:
+        raise TooFewViews(
+            f"{len(gathered.nodes)} node(s) show the boards that the reference node {reference} shows, limit "
+            f"{_MIN_NODES}; take more nodes, better 9 and more, and leave the boards where they are meanwhile"
+        )
+    sizes_mm = sorted({board.square_mm for board in named})
+    if len(sizes_mm) > 1:
+        raise ValueError(f"boards have squares of {sizes_mm} mm; all boards of one calibration must have the same")
+    one_shape = len({board.corner_shape for board in named}) == 1
+    return BundleProblem(gathered, size_px, sizes_mm[0], lens_model, with_warp=one_shape)
 
 
-def _solved(problem: Problem) -> Bundle:
+def _solve(problem: BundleProblem) -> Bundle:
+    """Return the solution, checked for convergence and a lens that can be."""
     try:
         bundle = solve(problem)
     except RuntimeError as failure:
@@ -139,25 +145,24 @@ def _solved(problem: Problem) -> Bundle:
 
 
 def _require_residuals(bundle: Bundle, observations: Observations) -> None:
-    """Refuse residuals that no board leaves, and name the worst view."""
+    """Check that the residuals are those of boards; the failure names the worst view."""
     square = np.square(bundle.residuals()).sum(axis=(1, 2, 3)) / (2 * np.maximum(bundle.inlier.sum(axis=(1, 2)), 1))
     rms_px = float(np.sqrt(np.square(bundle.residuals()[bundle.inlier]).mean()))
-    if not rms_px <= _MOST_RESIDUAL_PX:
+    if not rms_px <= _MAX_RESIDUAL_PX:
         worst = observations.view_name(int(np.argmax(square)))
         raise PoorFit(
-            f"the corners fit to {rms_px:.3g} px only, limit {_MOST_RESIDUAL_PX:g} px, worst at {worst}; {_REMEDY}"
+            f"the corners fit to {rms_px:.3g} px only, limit {_MAX_RESIDUAL_PX:g} px, worst at {worst}; {_REMEDY}"
         )
 
 
-def _geometry(problem: Problem, bundle: Bundle, known: Uncertainty) -> RigGeometry:
-    """Put the solution in raster order of the nodes."""
+def _geometry(problem: BundleProblem, bundle: Bundle, warnings: list[str], known: Uncertainty) -> RigGeometry:
+    """Return the solution in raster order of the nodes, without a hold-out ratio."""
     observations = problem.observations
     order = sorted(range(len(observations.nodes)), key=lambda index: observations.nodes[index])
-    fx_px, fy_px, cx_px, cy_px, *distortion = bundle.intrinsics.tolist()
     squares, inliers = float(np.sum(bundle.residuals() ** 2)), int(bundle.inlier.sum())
     poses = zip(observations.targets, bundle.rt_ref_board, strict=True)
     return RigGeometry(
-        lens=Lens(problem.size_px, fx_px, fy_px, cx_px, cy_px, tuple(distortion)),
+        lens=Lens.from_parameters(problem.size_px, bundle.intrinsics),
         lens_model=problem.lens_model,
         nodes=[observations.nodes[index] for index in order],
         reference=order.index(0),
@@ -172,18 +177,16 @@ def _geometry(problem: Problem, bundle: Bundle, known: Uncertainty) -> RigGeomet
         outliers=observations.corner_count - inliers,
         holdout_ratio=None,
         repeatability=known.repeatability,
+        warnings=warnings,
     )
 
 
 def _lens_and_poses(bundle: Bundle, covariance: NDArray[np.float64], order: list[int]) -> NDArray[np.float64]:
     """Return the covariance of the intrinsics and of all nodes in their order, zero for the reference."""
     slices = bundle.state_slices()
-    lens = np.arange(slices["intrinsics"].start, slices["intrinsics"].stop)
-    picks = [lens]
-    for index in order:
-        first = slices["cameras"].start + 6 * (index - 1)
-        picks.append(np.full(6, -1) if index == 0 else np.arange(first, first + 6))
-    chosen = np.concatenate(picks)
+    first = slices["cameras"].start + 6 * (np.array(order) - 1)
+    poses = np.where(np.array(order) > 0, first + np.arange(6)[:, np.newaxis], -1).T.ravel()
+    chosen = np.r_[slices["intrinsics"], poses]
     known = chosen >= 0
     result = np.zeros((len(chosen), len(chosen)))
     result[np.ix_(known, known)] = covariance[np.ix_(chosen[known], chosen[known])]
@@ -191,8 +194,8 @@ def _lens_and_poses(bundle: Bundle, covariance: NDArray[np.float64], order: list
 
 
 def _require_fit(geometry: RigGeometry, settings: GeometrySettings) -> None:
-    """Refuse a fit that does not explain boards that it has not seen."""
-    ratio, limit = geometry.holdout_ratio, settings.most_holdout_ratio
+    """Check that the fit explains boards that were left out of it."""
+    ratio, limit = geometry.holdout_ratio, settings.max_holdout_ratio
     if ratio is None or ratio <= limit:
         return
     added_px = geometry.rms_inlier_px * np.sqrt(ratio**2 - 1)

@@ -1,16 +1,15 @@
-"""How well the solution is known: the covariance of its state, and how far the gantry comes back to a node.
+"""Covariance of the solution, and repeatability of the gantry between sweeps.
 
-To first order the weighted residuals are `x = M (ε + G δ)`: M = I − J (JᵀJ)⁻¹ Jᵀ, with J the optimizer's Jacobian,
-ε the corners' noise of variance σ², and δ what the gantry missed each node by in each sweep, of variance τ² per axis,
-which moves the corners by G δ. With K = GᵀMG = Q Λ Qᵀ the numbers `v = Λ^(−1/2) Qᵀ Gᵀ x` are independent with variances
-`σ² + τ² λ`, and what they leave of the residuals has variance σ² alone: σ and τ follow from their restricted likelihood
-(REML). The state's covariance is `σ² (JᵀJ)⁻¹ + τ² B Bᵀ` with B = (JᵀJ)⁻¹ Jᵀ G.
+To first order the weighted residuals are `x = M (ε + G δ)` with M = I − J (JᵀJ)⁻¹ Jᵀ. Here J is the optimizer's
+Jacobian, ε the noise of the corners (variance σ²), and δ the gantry's position error at each node in each sweep
+(variance τ² per axis), which moves the corners by G δ. With K = GᵀMG = Q Λ Qᵀ the numbers `v = Λ^(−1/2) Qᵀ Gᵀ x` are
+independent and have variances `σ² + τ² λ`; the rest of the residuals has variance σ². The restricted likelihood (REML)
+of both gives σ and τ. The state's covariance is `σ² (JᵀJ)⁻¹ + τ² B Bᵀ` with B = (JᵀJ)⁻¹ Jᵀ G.
 """
 
 from dataclasses import dataclass
 from typing import Any
 
-import mrcal
 import numpy as np
 import scipy.sparse
 from numpy.typing import NDArray
@@ -20,26 +19,28 @@ from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.geometry.bundle import Bundle
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.geometry.rig_geometry import Repeatability
+from faintfield.calib.mrcal_loader import load_mrcal
 
-# Directions in which a node's misses are absorbed by the fit tell nothing of them.
-_LEAST_EIGENVALUE = 1e-6
+# Eigenvalues of K below this multiple of the largest are left out: the fit absorbs those directions of the gantry's
+# errors, so that the residuals contain nothing of them.
+_MIN_RELATIVE_EIGENVALUE = 1e-6
 
-# Below this variance ratio the gantry's misses cannot be told from none.
+# Range of ln(τ² λ / σ²) that is searched, λ being the mean eigenvalue; at its lower end τ is as good as zero.
 _LOG_RATIO_RANGE = (-12.0, 8.0)
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What the residuals say of the solution.
+    """Uncertainty of a solution, from its residuals.
 
     Attributes
     ----------
     covariance : array (state, state)
-        Of mrcal's state, in rad, mm and pixels.
+        Covariance of mrcal's state, in rad, mm and pixels.
     sigma_px : float
         Standard deviation of a corner of weight one, per axis.
     repeatability : Repeatability, optional
-        None with a single sweep.
+        Repeatability of the gantry between sweeps; None with a single sweep.
     """
 
     covariance: NDArray[np.float64]
@@ -48,13 +49,14 @@ class Uncertainty:
 
 
 def uncertainty(bundle: Bundle, observations: Observations) -> Uncertainty:
-    """Return the covariance of a solution's state, with the gantry's repeatability in it where there are sweeps.
+    """Return the covariance of a solution's state, which includes the gantry's repeatability if there are sweeps.
 
     Raises
     ------
     NotIdentifiable
-        Some direction of the state is not determined by the corners at all.
+        The corners leave some direction of the state undetermined.
     """
+    mrcal = load_mrcal()
     state, x, jacobian, factor = mrcal.optimizer_callback(**bundle.inputs)
     if factor is None:
         raise NotIdentifiable(
@@ -75,20 +77,20 @@ def uncertainty(bundle: Bundle, observations: Observations) -> Uncertainty:
     if len(sweeps) == 1:
         sigma = float(np.sqrt(squares / freedom))
         return Uncertainty(inverse * np.outer(scale, scale) * sigma**2, sigma, None)
-    misses = _misses(bundle, observations, jacobian[:boards], scale)
-    crossed = np.asarray((jacobian[:boards].T @ misses).todense())
+    motion = _corner_motion(bundle, observations, jacobian[:boards], scale)
+    crossed = np.asarray((jacobian[:boards].T @ motion).todense())
     absorbed = inverse @ crossed
-    spread = np.asarray((misses.T @ misses).todense()) - crossed.T @ absorbed
-    sigma, repeatability = _variance_components(spread, misses.T @ x[:boards], squares, freedom)
+    spread = np.asarray((motion.T @ motion).todense()) - crossed.T @ absorbed
+    sigma, repeatability = _variance_components(spread, motion.T @ x[:boards], squares, freedom)
     packed = inverse * sigma**2 + absorbed @ absorbed.T * repeatability.sd_mm**2
     return Uncertainty(packed * np.outer(scale, scale), sigma, repeatability)
 
 
-def _misses(bundle: Bundle, observations: Observations, jacobian: Any, scale: NDArray[np.float64]) -> Any:
-    """Return G (measurement, 3·(node, sweep)): how corners move when the camera moves by 1 mm at one node in one sweep.
+def _corner_motion(bundle: Bundle, observations: Observations, jacobian: Any, scale: NDArray[np.float64]) -> Any:
+    """Return G (measurement, 3·(node, sweep)): motion of the corners per mm of the camera at one node in one sweep.
 
-    A camera's translation is the last step of both its pose and, at the reference node, the boards': its columns are
-    those of the Jacobian, cut to the rows of one sweep.
+    The translation is the last step of a camera's pose and, at the reference node, of a board's pose. So the columns
+    of G are columns of the Jacobian, restricted to the rows of one sweep.
     """
     slices = bundle.state_slices()
     rows_per_view = 2 * int(np.prod(bundle.inlier.shape[1:]))
@@ -111,9 +113,9 @@ def _misses(bundle: Bundle, observations: Observations, jacobian: Any, scale: ND
 def _variance_components(
     spread: NDArray[np.float64], projected: NDArray[np.float64], squares: float, freedom: int
 ) -> tuple[float, Repeatability]:
-    """Return σ and the gantry's repeatability by restricted maximum likelihood; see the module's own words."""
+    """Return σ and the gantry's repeatability by restricted maximum likelihood, as the module describes it."""
     eigenvalues, vectors = np.linalg.eigh(spread)
-    kept = eigenvalues > _LEAST_EIGENVALUE * eigenvalues[-1]
+    kept = eigenvalues > _MIN_RELATIVE_EIGENVALUE * eigenvalues[-1]
     eigenvalues = eigenvalues[kept]
     v2 = (vectors[:, kept].T @ projected) ** 2 / eigenvalues
     rest = squares - v2.sum()
@@ -135,6 +137,6 @@ def _variance_components(
     tau2 = ratio * sigma2
     se_of_tau2 = np.sqrt(2 / ((eigenvalues / (sigma2 + tau2 * eigenvalues)) ** 2).sum())
     sd_mm = float(np.sqrt(tau2))
-    # at zero the square root has no slope: the standard error is then that of the square
+    # The root has no derivative at zero: near it, take the root of the standard error of τ².
     se_mm = float(se_of_tau2 / (2 * sd_mm)) if tau2 > se_of_tau2 else float(np.sqrt(se_of_tau2))
     return float(np.sqrt(sigma2)), Repeatability(sd_mm, se_mm)

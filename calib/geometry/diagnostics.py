@@ -1,4 +1,4 @@
-"""What does not fit together although a solution was found: said by name, with what to do about it."""
+"""Warnings about views, nodes and scales that contradict the solution, each with what to do about it."""
 
 from collections.abc import Sequence
 
@@ -9,43 +9,45 @@ from faintfield.calib.errors import PoorFit
 from faintfield.calib.geometry.bundle import Bundle
 from faintfield.calib.geometry.observations import Node, Observations
 
-# From this share of a view's corners on, it is the view that is wrong and not its corners.
-_DOUBTFUL_SHARE, _DOUBTFUL_CORNERS = 0.2, 3
+# A view is inconsistent if at least this share of its corners, and this many, are outliers: fewer are lone corners.
+_MIN_OUTLIER_SHARE_OF_VIEW, _MIN_OUTLIERS_OF_VIEW = 0.2, 3
 
-# Every corner thrown away is one the model did not explain.
-_MOST_OUTLIERS = 0.1
+# Largest share of outliers among all corners; the model does not explain a set with more.
+_MAX_OUTLIER_SHARE = 0.1
 
-_MOST_NAMED = 5
+# Views that a message names, so that it stays readable.
+_MAX_NAMED = 5
 
-# A node that lies this far from its place, in pitches, is another one, or the stage lost steps.
-_ELSEWHERE = 0.3
-_REWEIGHTINGS = 50
+# A node farther than this from its place, in pitches, has the label of another one, or the stage lost steps.
+_MAX_NODE_ERROR = 0.3
+_REWEIGHTINGS = 50  # of the least absolute distances
 
-# No stage is that wrong: then it is the boards that are not what is stated.
-_MOST_SCALE_ERROR, _SCALE_SIGMAS = 0.005, 4.0
+# Largest relative error of a stage's scale, and the standard errors that it must exceed as well; beyond, it is the
+# boards that differ from what is stated.
+_MAX_SCALE_ERROR, _SCALE_SIGMAS = 0.005, 4.0
 
 
-def doubtful_views(bundle: Bundle, observations: Observations) -> list[str]:
-    """Return the views whose corners disagree with all others.
+def inconsistent_views(bundle: Bundle, observations: Observations) -> list[str]:
+    """Return a warning that names the views whose corners disagree with all others; empty if there is none.
 
     Raises
     ------
     PoorFit
-        There are so many that none can be trusted.
+        Too many corners disagree for any view to be trusted.
     """
     seen = (observations.weights > 0).sum(axis=(1, 2))
     lost = seen - bundle.inlier.sum(axis=(1, 2))
     worst = [
         view
         for view in np.argsort(-lost / seen, kind="stable")
-        if lost[view] >= max(_DOUBTFUL_CORNERS, _DOUBTFUL_SHARE * seen[view])
+        if lost[view] >= max(_MIN_OUTLIERS_OF_VIEW, _MIN_OUTLIER_SHARE_OF_VIEW * seen[view])
     ]
-    named = [f"{observations.view_name(view)} ({lost[view]} of {seen[view]} corners)" for view in worst[:_MOST_NAMED]]
-    more = f" and {len(worst) - _MOST_NAMED} more" if len(worst) > _MOST_NAMED else ""
+    named = [f"{observations.view_name(view)} ({lost[view]} of {seen[view]} corners)" for view in worst[:_MAX_NAMED]]
+    more = f" and {len(worst) - _MAX_NAMED} more" if len(worst) > _MAX_NAMED else ""
     share = lost.sum() / seen.sum()
-    if share > _MOST_OUTLIERS:
+    if share > _MAX_OUTLIER_SHARE:
         raise PoorFit(
-            f"{share:.0%} of the corners disagree with the fit, limit {_MOST_OUTLIERS:.0%}"
+            f"{share:.0%} of the corners disagree with the fit, limit {_MAX_OUTLIER_SHARE:.0%}"
             f"{', most at ' + ', '.join(named) + more if named else ''}; check that every image has its right node and "
             "sweep, that columns and rows are those of the print, and that no board moved within a sweep"
         )
@@ -57,9 +59,9 @@ def doubtful_views(bundle: Bundle, observations: Observations) -> list[str]:
     ]
 
 
-def doubtful_scale(axis: str, scale: float, sigma: float) -> list[str]:
-    """Return a word on distances of nodes that no stage gets so wrong, over what it was told."""
-    if abs(scale - 1) <= max(_MOST_SCALE_ERROR, _SCALE_SIGMAS * sigma):
+def scale_warnings(axis: str, scale: float, sigma: float) -> list[str]:
+    """Return a warning if distances between nodes differ from the pitch by more than a stage's error."""
+    if abs(scale - 1) <= max(_MAX_SCALE_ERROR, _SCALE_SIGMAS * sigma):
         return []
     return [
         f"along {axis} the nodes lie {abs(scale - 1):.1%} {'farther apart' if scale > 1 else 'closer together'} than "
@@ -68,8 +70,8 @@ def doubtful_scale(axis: str, scale: float, sigma: float) -> list[str]:
     ]
 
 
-def nodes_elsewhere(nodes: Sequence[Node], centres_mm: NDArray[np.float64]) -> list[str]:
-    """Return the nodes that lie far from where the others put them, by least absolute distances to a regular grid."""
+def misplaced_nodes(nodes: Sequence[Node], centres_mm: NDArray[np.float64]) -> list[str]:
+    """Return a warning for each node far from its place in the regular grid of least absolute distances."""
     grid = np.column_stack([np.ones(len(nodes)), np.array(nodes, float)])
     if len(nodes) < grid.shape[1] + 2 or np.linalg.matrix_rank(grid) < grid.shape[1]:
         return []
@@ -81,10 +83,10 @@ def nodes_elsewhere(nodes: Sequence[Node], centres_mm: NDArray[np.float64]) -> l
     places = grid @ solution
     pitch_mm = float(np.linalg.norm(solution[1:], axis=1).min())
     found = []
-    for index in np.flatnonzero(distances > _ELSEWHERE * pitch_mm).tolist():
+    for index in np.flatnonzero(distances > _MAX_NODE_ERROR * pitch_mm).tolist():
         away = np.linalg.norm(places - centres_mm[index], axis=1)
         there = int(np.argmin(away))
-        known = there != index and away[there] < _ELSEWHERE * pitch_mm
+        known = there != index and away[there] < _MAX_NODE_ERROR * pitch_mm
         where = f", where node {nodes[there]} belongs" if known else ""
         found.append(
             f"node {nodes[index]} lies {distances[index]:.1f} mm from its place{where}: check the node of its images, "

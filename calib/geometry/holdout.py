@@ -1,4 +1,4 @@
-"""Hold-out: whether a geometry found without a board explains that board."""
+"""Hold-out validation: whether a geometry found without a board explains that board."""
 
 import numpy as np
 
@@ -8,16 +8,17 @@ from faintfield.calib.geometry.observations import Observations
 
 
 def holdout_ratio(bundle: Bundle, observations: Observations) -> float | None:
-    """Return the residual of boards left out over the residual of the fit, √(Σ held out² / Σ fitted²).
+    """Return the ratio of the residual of boards left out to that of the fit, √(Σ held out² / Σ fitted²).
 
-    Each board as it stood is left out in turn; lens and cameras are found from the others, and only its own six
-    numbers are then fitted to it. Near 1 the model is right and determined; a lens that does not fit, boards of
-    different size or a board that moved make it larger. None where a node would lose its only board.
+    Each target (a board in a sweep) is left out in turn. Lens and cameras are found from the others, then only the
+    pose of that board is fitted to its corners. A ratio near 1 says that the model is right and determined; a wrong
+    lens model, boards of different sizes, or a board that moved increase it. A target that some node sees alone is
+    not left out; None if that holds for all.
 
     Raises
     ------
     NotIdentifiable
-        Without one of the boards nothing can be solved.
+        There is no solution without one of the boards.
     """
     if len(observations.targets) < 2:
         return None

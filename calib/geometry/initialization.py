@@ -1,34 +1,38 @@
-"""A first guess: the focal length by trial, the poses by a tree of boards seen from two nodes."""
+"""Initial values of the bundle adjustment: the focal length by trial, the poses along a tree of views."""
 
 import heapq
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.geometry.observations import Observations
+from faintfield.calib.homography import rotation_matrix
 
 # Focal lengths tried, in widths of the detector: from a fisheye to a long telephoto.
 _FOCAL_WIDTHS = np.geomspace(0.35, 12.0, 30)
-_FOCAL_VIEWS = 24
+
+# Views that are tried with each focal length; more take longer and hardly change the choice among 30.
+_MAX_FOCAL_VIEWS = 24
 
 type Transform = NDArray[np.float64]
-"""4 x 4, destination from source."""
+"""Homogeneous matrix (4, 4) from the source to the destination frame."""
 
 
 @dataclass(frozen=True)
-class Seed:
-    """Where the solver starts.
+class Initialization:
+    """Initial values of the bundle adjustment.
 
     Attributes
     ----------
     focal_px : float
-        Of a pinhole whose principal point is the middle of the detector.
+        Focal length of a pinhole whose principal point is the middle of the detector.
     rt_cam_ref : array (node, 6)
-        Zero for the reference, which is the first.
+        Poses of the nodes; zero for the reference, which is the first.
     rt_ref_board : array (target, 6)
-        Rodrigues rad and mm.
+        Poses of the boards, Rodrigues rad and mm.
     """
 
     focal_px: float
@@ -36,14 +40,13 @@ class Seed:
     rt_ref_board: NDArray[np.float64]
 
 
-def seed_from(observations: Observations, size_px: tuple[int, int], square_mm: float) -> Seed:
-    """Return the focal length that fits single views best, and poses along the tree of the best-determined views."""
+def initialize(observations: Observations, size_px: tuple[int, int], square_mm: float) -> Initialization:
+    """Return the focal length that fits single views best, and poses along the tree of the best-fitting views."""
     focal_px = _focal_by_trial(observations, size_px, square_mm)
-    poses = [
-        _pose(observations, view, _matrix(focal_px, size_px), square_mm) for view in range(len(observations.node_of))
-    ]
+    matrix = _matrix(focal_px, size_px)
+    poses = [_pose(observations, view, matrix, square_mm) for view in range(len(observations.node_of))]
     camera_from_ref, ref_from_board = _tree(observations, [pose for pose, _ in poses], [error for _, error in poses])
-    return Seed(
+    return Initialization(
         focal_px,
         np.array([_rt(camera_from_ref[node]) for node in range(len(observations.nodes))]),
         np.array([_rt(ref_from_board[target]) for target in range(len(observations.targets))]),
@@ -51,12 +54,13 @@ def seed_from(observations: Observations, size_px: tuple[int, int], square_mm: f
 
 
 def _focal_by_trial(observations: Observations, size_px: tuple[int, int], square_mm: float) -> float:
-    """Return the focal length at which boards alone, each seen in perspective, are reprojected best."""
+    """Return the focal length at which single views, each with a pose of its own, have the least reprojection error."""
     counts = (observations.weights > 0).sum(axis=(1, 2))
     views = np.argsort(-counts, kind="stable")
-    # the best views of every target, since one board alone may face the camera and say nothing
-    first_of_each = [view for rank in range(_FOCAL_VIEWS) for view in _nth_view_of_targets(observations, views, rank)]
-    chosen = first_of_each[:_FOCAL_VIEWS]
+    # The best views of every target, since a board that faces the camera does not determine the focal length.
+    per_target = [views[observations.target_of[views] == target] for target in range(len(observations.targets))]
+    ranked = zip_longest(*(of_target.tolist() for of_target in per_target))
+    chosen = [view for rank in ranked for view in rank if view is not None][:_MAX_FOCAL_VIEWS]
     errors = [
         sum(_pose(observations, view, _matrix(focal, size_px), square_mm)[1] ** 2 for view in chosen)
         for focal in _FOCAL_WIDTHS * size_px[0]
@@ -64,16 +68,10 @@ def _focal_by_trial(observations: Observations, size_px: tuple[int, int], square
     return float(_FOCAL_WIDTHS[int(np.argmin(errors))] * size_px[0])
 
 
-def _nth_view_of_targets(observations: Observations, ordered: NDArray[np.intp], rank: int) -> list[int]:
-    """Return for every target its view of a rank among the ordered views."""
-    per_target = [ordered[observations.target_of[ordered] == target] for target in range(len(observations.targets))]
-    return [int(views[rank]) for views in per_target if len(views) > rank]
-
-
 def _pose(
     observations: Observations, view: int, matrix: NDArray[np.float64], square_mm: float
 ) -> tuple[Transform, float]:
-    """Return camera from board of one view alone, and the rms of its reprojection in pixels."""
+    """Return the transform from board to camera that fits one view, and its rms reprojection error in pixels."""
     row, column = np.nonzero(observations.weights[view] > 0)
     points = np.column_stack([column, row, np.zeros(len(row))]) * square_mm
     pixels = np.ascontiguousarray(observations.pixels[view, row, column])
@@ -82,7 +80,7 @@ def _pose(
         return np.eye(4), np.inf
     best = int(np.argmin(np.ravel(errors)))
     pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(rotations[best])[0]
+    pose[:3, :3] = rotation_matrix(np.ravel(rotations[best]))
     pose[:3, 3] = np.ravel(translations[best])
     return pose, float(np.ravel(errors)[best])
 
@@ -90,7 +88,7 @@ def _pose(
 def _tree(
     observations: Observations, poses: list[Transform], errors: list[float]
 ) -> tuple[dict[int, Transform], dict[int, Transform]]:
-    """Walk from the reference node along the views with the least error, (camera from ref, ref from board)."""
+    """Return the transforms (camera from ref, ref from board), found from the reference along the best views."""
     camera_from_ref, ref_from_board = {0: np.eye(4)}, dict[int, Transform]()
     views_of = _views_of(observations)
     waiting = [(errors[view], view) for view in views_of["node", 0]]

@@ -1,4 +1,4 @@
-"""What the bundle adjustment is given: corners of boards, by node and sweep."""
+"""Input of the bundle adjustment: corners of boards, by node and sweep."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from faintfield.calib.errors import TooFewViews
 
 type Node = tuple[int, int]
 
-# A view of a board with fewer corners tells less than its six unknowns cost.
-_FEWEST_CORNERS = 6
+# Corners of a view below which it is left out: fewer add less than the six unknowns of a pose take.
+_MIN_CORNERS = 6
 
 
 @dataclass(frozen=True)
 class Target:
-    """One standing of one board: it does not move within a sweep."""
+    """One board in one sweep, during which it does not move."""
 
     board: str
     sweep: int
@@ -35,9 +35,9 @@ class BoardObservation:
     corners : int array (corner,)
         Their numbers on the board.
     pixels : float array (corner, 2)
-        Where they were seen: column, row.
+        Their positions in the image: column, row.
     sigma_px : float array (corner,)
-        How far off each may be, per axis; only their ratios count, the level comes from the residuals.
+        Their standard deviations per axis. Only the ratios count; the level follows from the residuals.
     """
 
     node: Node
@@ -49,20 +49,20 @@ class BoardObservation:
 
 @dataclass(frozen=True)
 class Observations:
-    """All corners in the order that the solver wants: by target, then by node, the reference node first.
+    """All corners in the order that mrcal requires: by target, then by node, the reference node first.
 
     Attributes
     ----------
     nodes : list of (int, int)
-        The nodes that are connected to the reference, which is the first.
+        The nodes that boards connect to the reference, which is the first.
     targets : list of Target
-        Boards as they stood.
+        The boards in each sweep.
     node_of, target_of : int array (view,)
-        Indices into the two.
+        Indices into `nodes` and `targets`.
     pixels : float array (view, row, column, 2)
-        Corners on the largest board's lattice; zero where none was seen.
+        Corners on the lattice of the largest board; zero where none was seen.
     weights : float array (view, row, column)
-        The median σ over the corner's own, −1 where none was seen.
+        The median σ over that of the corner; −1 where none was seen.
     """
 
     nodes: list[Node]
@@ -74,11 +74,11 @@ class Observations:
 
     @property
     def corner_count(self) -> int:
-        """How many corners were seen."""
+        """Number of corners that were seen."""
         return int((self.weights > 0).sum())
 
     def view_name(self, view: int) -> str:
-        """Return words for one of the views."""
+        """Return the name of a view in messages."""
         target = self.targets[self.target_of[view]]
         sweep = f", sweep {target.sweep}" if len({one.sweep for one in self.targets}) > 1 else ""
         return f"node {self.nodes[self.node_of[view]]}, board '{target.board}'{sweep}"
@@ -87,12 +87,12 @@ class Observations:
 def gather(
     observations: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]], reference: Node
 ) -> Observations:
-    """Sort observations for the solver; nodes that share no board with the rest are left out.
+    """Sort observations for the solver, and leave out nodes that share no board with the rest.
 
     Parameters
     ----------
     observations : sequence of BoardObservation
-        In any order.
+        Observations in any order.
     corner_shapes : dict of board name to (int, int)
         Rows and columns of each board's inner corners.
     reference : (int, int)
@@ -103,42 +103,56 @@ def gather(
     TooFewViews
         The reference node saw no board.
     ValueError
-        A corner is none of its board.
+        A corner does not exist on its board.
     """
-    useful = [seen for seen in observations if len(seen.corners) >= _FEWEST_CORNERS and _spread(seen, corner_shapes)]
+    useful = [
+        seen for seen in observations if len(seen.corners) >= _MIN_CORNERS and _determines_pose(seen, corner_shapes)
+    ]
     nodes = _connected_nodes(useful, reference)
     if not nodes:
         raise TooFewViews(
-            f"node {reference}, whose camera is the reference, shows no board with {_FEWEST_CORNERS} corners or more; "
+            f"node {reference}, whose camera is the reference, shows no board with {_MIN_CORNERS} corners or more; "
             "take it again with a board in view"
         )
     kept = [seen for seen in useful if seen.node in nodes]
     targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.board))
     kept.sort(key=lambda seen: (targets.index(seen.target), nodes.index(seen.node)))
-    shape = tuple(max(corner_shapes[target.board][axis] for target in targets) for axis in (0, 1))
-    pixels, weights = np.zeros((len(kept), *shape, 2)), np.full((len(kept), *shape), -1.0)
-    typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in kept])))
-    for view, seen in enumerate(kept):
-        row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
-        if row.max() >= corner_shapes[seen.target.board][0]:
+    return Observations(
+        nodes,
+        targets,
+        np.array([nodes.index(seen.node) for seen in kept], np.int32),
+        np.array([targets.index(seen.target) for seen in kept], np.int32),
+        *_lattices(kept, corner_shapes),
+    )
+
+
+def _lattices(
+    views: Sequence[BoardObservation], corner_shapes: dict[str, tuple[int, int]]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `pixels` and `weights` of the views' corners, see `Observations`."""
+    shape = np.max([corner_shapes[seen.target.board] for seen in views], axis=0)
+    pixels, weights = np.zeros((len(views), *shape, 2)), np.full((len(views), *shape), -1.0)
+    typical_px = float(np.median(np.concatenate([seen.sigma_px for seen in views])))
+    for view, seen in enumerate(views):
+        rows, columns = corner_shapes[seen.target.board]
+        row, column = np.divmod(seen.corners, columns)
+        if row.max() >= rows:
             raise ValueError(
                 f"board '{seen.target.board}' has no corner {seen.corners.max()}; give the board as printed"
             )
         pixels[view, row, column] = seen.pixels
         weights[view, row, column] = typical_px / seen.sigma_px
-    node_of = np.array([nodes.index(seen.node) for seen in kept], np.int32)
-    target_of = np.array([targets.index(seen.target) for seen in kept], np.int32)
-    return Observations(nodes, targets, node_of, target_of, pixels, weights)
+    return pixels, weights
 
 
-def _spread(seen: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
-    """Return whether the corners fix a plane's pose: at least two rows and two columns of them."""
+def _determines_pose(seen: BoardObservation, corner_shapes: dict[str, tuple[int, int]]) -> bool:
+    """Return whether the corners lie on two rows and two columns at least, and so determine the pose of the board."""
     row, column = np.divmod(seen.corners, corner_shapes[seen.target.board][1])
     return len(set(row.tolist())) > 1 and len(set(column.tolist())) > 1
 
 
 def _connected_nodes(observations: Sequence[BoardObservation], reference: Node) -> list[Node]:
-    """Return the nodes reached from the reference through boards seen from both, the reference first."""
+    """Return the nodes that chains of common boards connect to the reference, the reference first."""
     nodes_of: dict[Target, set[Node]] = {}
     for seen in observations:
         nodes_of.setdefault(seen.target, set()).add(seen.node)

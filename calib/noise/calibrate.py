@@ -5,15 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.diagnostics import check_series, frame_doubts, level_doubt, noise_doubt
+from faintfield.calib.noise.diagnostics import check_series, frame_warnings, level_warning, noise_warning
 from faintfield.calib.noise.estimates import estimate_all
-from faintfield.calib.noise.fitting import Fitted, fit_series
+from faintfield.calib.noise.fitting import SeriesFit, fit_series
 from faintfield.calib.noise.histogram import Histogram, compare_histogram
 from faintfield.calib.noise.maps import offset_and_dark_signal, shrunk_variance_ratio
 from faintfield.calib.noise.pixels import hot_pixels, noisy_pixels, variance_ratio
 from faintfield.calib.noise.response import Response, measure_response
 from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
-from faintfield.calib.noise.selection import MOST_VALUES_DN, Likelihood, collect_counts
+from faintfield.calib.noise.selection import MAX_TABLE_WIDTH_DN, NoiseLikelihood, collect_counts
 from faintfield.calib.noise.statistics import Series
 
 
@@ -47,7 +47,7 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     if noisy.any():
         fitted = fit_series(darks, flats, ~hot & ~noisy)
     points = _points(fitted)
-    level, noise = level_doubt(fitted), noise_doubt(fitted, points)
+    level, noise = level_warning(fitted), noise_warning(fitted, points)
     offsets = _offsets(fitted, hot)
     response = _response(fitted, offsets[0], offsets[1], ~hot & ~noisy)
     estimates, covariance = estimate_all(fitted, response, levels_hold=level is None, noise_holds=noise is None)
@@ -64,23 +64,23 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         points=points,
         histograms=_histograms(fitted, ~hot & ~noisy),
         saturation_dn=saturation_dn,
-        warnings=(*frame_doubts(fitted), *filter(None, (level, noise))),
+        warnings=(*frame_warnings(fitted), *filter(None, (level, noise))),
     )
 
 
-def _noisy(fitted: Fitted) -> NDArray[np.bool_]:
+def _noisy(fitted: SeriesFit) -> NDArray[np.bool_]:
     """Return the noisy pixels; where values are cut off their variances tell nothing."""
-    if fitted.likelihood is Likelihood.CENSORED:
+    if fitted.likelihood is NoiseLikelihood.CENSORED:
         return np.zeros(fitted.darks[0].pattern_dn.shape, bool)
     return noisy_pixels(*variance_ratio(fitted.darks, fitted.dark_noise_dn2))
 
 
 def _offsets(
-    fitted: Fitted, hot: NDArray[np.bool_]
+    fitted: SeriesFit, hot: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return offset and dark signal of every pixel, with variances; those of the whole sensor where values are cut."""
     values = fitted.fit.values
-    if fitted.likelihood is Likelihood.CENSORED:
+    if fitted.likelihood is NoiseLikelihood.CENSORED:
         shape = hot.shape
         spreads = np.array([values["dsnu_dn2"], values["dcnu_dn2_per_s2"]])
         return (
@@ -92,7 +92,7 @@ def _offsets(
 
 
 def _maps(
-    fitted: Fitted,
+    fitted: SeriesFit,
     estimates: dict[str, Estimate],
     offsets: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
     response: Response | None,
@@ -121,7 +121,7 @@ def _maps(
 
 
 def _response(
-    fitted: Fitted,
+    fitted: SeriesFit,
     offset_dn: NDArray[np.float64],
     signal_dn_per_s: NDArray[np.float64],
     usable: NDArray[np.bool_],
@@ -134,7 +134,7 @@ def _response(
     return measure_response(signals, noise, usable)
 
 
-def _histograms(fitted: Fitted, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:
+def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:
     """Return the values of the shortest and the longest darks beside their prediction."""
     values = fitted.fit.values
     if "log_gain" not in values:
@@ -151,11 +151,11 @@ def _histograms(fitted: Fitted, usable: NDArray[np.bool_]) -> tuple[Histogram, .
             counts.floor_dn,
         )
         for j in ends
-        if np.ptp(counts.values_dn[j]) < MOST_VALUES_DN
+        if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN
     )
 
 
-def _points(fitted: Fitted) -> tuple[TransferPoint, ...]:
+def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     """Return the photon transfer and dark signal points."""
     values, moments = fitted.fit.values, fitted.moments
     slope = values.get("dark_signal_dn_per_s", 0.0)

@@ -6,13 +6,13 @@ import numpy as np
 from scipy import stats
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from faintfield.calib.noise.fitting import Fitted
+from faintfield.calib.noise.fitting import SeriesFit
 from faintfield.calib.noise.result import TransferPoint
-from faintfield.calib.noise.selection import Likelihood
+from faintfield.calib.noise.selection import NoiseLikelihood
 from faintfield.calib.noise.statistics import Series
 
 # Fewer pixels leave the spreads over pixels, and so everything, to chance.
-_LEAST_PIXELS = 256
+_MIN_PIXELS = 256
 
 # A model that the series contradict this improbably is wrong; by less than this fraction it does not matter.
 _CONTRADICTION, _CONTRADICTION_SIGMA, _NEGLIGIBLE = 1e-4, 6.0, 0.02
@@ -53,21 +53,21 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
                 "each light level: record another or leave it out"
             )
     pixels = darks[0].pattern_dn.size
-    if pixels < _LEAST_PIXELS or min(darks[0].pattern_dn.shape) < 8:
+    if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < 8:
         raise TooFewFrames(
-            f"frames of {pixels} pixels: {_LEAST_PIXELS} and 8 rows and columns are the least; "
+            f"frames of {pixels} pixels: {_MIN_PIXELS} and 8 rows and columns are the least; "
             "record larger frames, or widen the region"
         )
 
 
-def frame_doubts(fitted: Fitted) -> list[str]:
+def frame_warnings(fitted: SeriesFit) -> list[str]:
     """Return what is doubtful about the darks."""
     warnings = [
         f"{one.names[0]}: the only one of the {one.conditions}; it tells the mean but no noise: record at least 2"
         for one in fitted.darks
         if one.frames < 2
     ]
-    if fitted.likelihood is Likelihood.CENSORED:
+    if fitted.likelihood is NoiseLikelihood.CENSORED:
         warnings.append(
             "values are cut off at the black level: offset and dark current are given for the sensor, not per pixel; "
             "raise the camera's black offset if it has one"
@@ -75,13 +75,13 @@ def frame_doubts(fitted: Fitted) -> list[str]:
     return warnings
 
 
-def level_doubt(fitted: Fitted) -> str | None:
+def level_warning(fitted: SeriesFit) -> str | None:
     """Return a warning where the dark levels do not lie on a straight line over exposure time."""
     moments, values = fitted.moments, fitted.fit.values
     darks = moments.darks
     within = float((darks.frames - 1).sum())
     free = np.unique(darks.exposure_s).size - 2
-    if fitted.likelihood is Likelihood.CENSORED or free < 1 or within < 1:
+    if fitted.likelihood is NoiseLikelihood.CENSORED or free < 1 or within < 1:
         return None
     noise = np.array(fitted.dark_noise_dn2) / moments.pixels
     jitter = max(float(darks.level_scatter_dn2.sum()) / within - float(noise.mean()), 0.0)
@@ -100,9 +100,9 @@ def level_doubt(fitted: Fitted) -> str | None:
     )
 
 
-def noise_doubt(fitted: Fitted, points: Sequence[TransferPoint]) -> str | None:
+def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | None:
     """Return a warning where a series is noisier or quieter than eq. (1) allows."""
-    if fitted.likelihood is Likelihood.CENSORED:
+    if fitted.likelihood is NoiseLikelihood.CENSORED:
         return None
     measured = [point for point in points if point.frames > 1]
     excess = [point.variance_dn2 / point.model_variance_dn2 - 1 for point in measured]

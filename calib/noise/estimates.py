@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.fitting import Fitted
-from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2
+from faintfield.calib.noise.fitting import SeriesFit
+from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
 from faintfield.calib.noise.moments import Moments
 from faintfield.calib.noise.response import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.statistics import Series
 
 # A relative standard error above this is no measurement.
-MOST_RELATIVE_SE = 0.1
+MAX_RELATIVE_SE = 0.1
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
 _ONE_EXPOSURE = "all darks have one exposure; record darks of at least 2 exposures, better 4 up to 60 s"
@@ -31,13 +31,13 @@ _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of satur
 
 
 def estimate_all(
-    fitted: Fitted, response: Response | None, *, levels_hold: bool, noise_holds: bool
+    fitted: SeriesFit, response: Response | None, *, levels_hold: bool, noise_holds: bool
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return every quantity, and the covariance of offset, gain, read noise and dark current.
 
     Parameters
     ----------
-    fitted : Fitted
+    fitted : SeriesFit
         The fit and what it rests on.
     response : Response, optional
         What flats told.
@@ -62,7 +62,7 @@ def estimate_all(
 
 
 def _in_electrons(
-    fit: Fit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
+    fit: NoiseFit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return the four main quantities, those with a reason why not left out of the covariance."""
     transforms = _transforms(fit)
@@ -77,7 +77,7 @@ def _in_electrons(
     return estimates, (known, covariance)
 
 
-def _levels_quantile(fit: Fit, moments: Moments) -> float:
+def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
     """Return how many standard errors make 95 % of what rests on the levels of the darks.
 
     Student's where the jitter of the levels, known from few frames, matters.
@@ -89,7 +89,7 @@ def _levels_quantile(fit: Fit, moments: Moments) -> float:
     return float(stats.norm.ppf(0.975))
 
 
-def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
+def _transforms(fit: NoiseFit) -> dict[str, tuple[float, NDArray[np.float64]]]:
     """Return the four main quantities and their derivatives by the parameters."""
     values = fit.values
     index = {name: i for i, name in enumerate(values)}
@@ -112,17 +112,17 @@ def _transforms(fit: Fit) -> dict[str, tuple[float, NDArray[np.float64]]]:
     }
 
 
-def _why_no_gain(fit: Fit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
+def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
     """Return why gain and read noise in electrons cannot be told, None if they can."""
     if "log_gain" not in fit.values:
         return f"{_why_no_growth(moments)}, or flats"
     relative = fit.standard_error("log_gain")
     if from_darks and not holds:
         return f"without flats it rests on the darks, which contradict the model (see the warnings); {_FLATS_REMEDY}"
-    if not relative <= MOST_RELATIVE_SE:
+    if not relative <= MAX_RELATIVE_SE:
         error = f"{relative:.0%}" if relative < 10 else "larger than itself"
         return (
-            f"its standard error would be {error} (limit {MOST_RELATIVE_SE:.0%}): the darks hold too few dark "
+            f"its standard error would be {error} (limit {MAX_RELATIVE_SE:.0%}): the darks hold too few dark "
             f"electrons to tell the gain from the read noise; {_FLATS_REMEDY}"
         )
     return None
@@ -134,7 +134,7 @@ def _why_no_growth(moments: Moments) -> str:
 
 
 def _why_no_current(
-    fit: Fit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
+    fit: NoiseFit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
 ) -> str | None:
     """Return why the dark current cannot be told, None if it can."""
     if "dark_signal_dn_per_s" not in fit.values:
@@ -154,7 +154,7 @@ def _why_no_current(
             f"the dark level falls with exposure time ({signal:.2g} DN/s), which dark current cannot do: the black "
             "level drifted; record the exposures in turn, the camera settled"
         )
-    if se > MOST_RELATIVE_SE * abs(signal) and se * longest / gain > MOST_RELATIVE_SE * noise_e2:
+    if se > MAX_RELATIVE_SE * abs(signal) and se * longest / gain > MAX_RELATIVE_SE * noise_e2:
         rise = "" if signal > 0 else f"the dark level does not rise with exposure time ({signal:.2g} DN/s); "
         return (
             f"{rise}its standard error would be {se / gain:.2g} e-/s, which over {longest:g} s is more than a tenth of "
@@ -190,7 +190,7 @@ def _negative(errors: float) -> str:
     )
 
 
-def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
+def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
     """Return what needs no gain."""
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
     read = _interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), quantile, positive=True)
@@ -201,7 +201,7 @@ def _in_dn(fit: Fit, quantile: float, levels_quantile: float) -> dict[str, Estim
     return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
 
 
-def _spreads(fitted: Fitted, gain: Estimate, quantile: float) -> dict[str, Estimate]:
+def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
     """Return the pixels' own spreads: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
@@ -216,7 +216,7 @@ def _spreads(fitted: Fitted, gain: Estimate, quantile: float) -> dict[str, Estim
     return spreads
 
 
-def _shared_noise(fitted: Fitted, quantile: float) -> dict[str, Estimate]:
+def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
     """Return the noise that the pixels of a frame, a row or a column share."""
     fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
     if "jitter_dn2" not in fit.values:
@@ -241,7 +241,7 @@ def _shared_noise(fitted: Fitted, quantile: float) -> dict[str, Estimate]:
     }
 
 
-def _profiles(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+def _profiles(fit: NoiseFit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
     """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, here in DN."""
     dark = max(darks, key=lambda one: one.frames)
     rows, columns = dark.pattern_dn.shape
@@ -257,7 +257,7 @@ def _profiles(fit: Fit, darks: Sequence[Series], quantile: float) -> dict[str, E
     }
 
 
-def _from_flats(fitted: Fitted, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
+def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
     """Return what only flats tell."""
     prnu = Estimate(None, why=_NO_FLATS)
     if response is not None:
@@ -281,7 +281,7 @@ def _from_flats(fitted: Fitted, gain: Estimate, response: Response | None, quant
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
 
 
-def _light_e(fit: Fit, flat: Series, mean_dn: float) -> float:
+def _light_e(fit: NoiseFit, flat: Series, mean_dn: float) -> float:
     """Return the electrons that light made in a flat series."""
     values = fit.values
     signal = mean_dn - values["offset_dn"]

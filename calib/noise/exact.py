@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from faintfield.calib.errors import PoorFit
-from faintfield.calib.noise.gaussian import Fit, flat_log_likelihood
+from faintfield.calib.noise.gaussian import NoiseFit, flat_log_likelihood
 from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, MASS_PARAMETERS, MassTable, mass_function
 from faintfield.calib.noise.moments import FlatMoments
 
@@ -28,7 +28,7 @@ PARAMETERS = (*MASS_PARAMETERS, "offset_dn", "log_dsnu_dn")
 _DCNU = PARAMETERS.index("dcnu")
 
 _CHUNK_PX = 2048
-_MOST_STEPS = 80
+_MAX_STEPS = 80
 
 # Spreads of the dark current to try, relative, and by how much one must raise ln L to be believed.
 _TRIED_DCNU, _CONVINCING = (0.08, 0.3), 4.0
@@ -55,7 +55,7 @@ class Counts:
 
 def fit_exact(
     counts: Counts, start: dict[str, float], flats: FlatMoments, freedom: float, *, exact: bool, try_spread: bool
-) -> Fit:
+) -> NoiseFit:
     """Maximise the likelihood (4), with the flats' photon transfer where there is one.
 
     Dark currents are taken to be the same for all pixels unless the values are much likelier when they are not.
@@ -77,7 +77,7 @@ def fit_exact(
 
     Returns
     -------
-    Fit
+    NoiseFit
         In the parameters of the Gaussian fit; the covariance is the inverse of the summed products of the scores.
 
     Raises
@@ -135,7 +135,7 @@ def _maximise(objective: _Objective, start: dict[str, float]) -> _Maximum:
     x = np.array([start[name] for name in PARAMETERS])
     x[~free] = 0.0
     best = objective(x)
-    for _ in range(_MOST_STEPS):
+    for _ in range(_MAX_STEPS):
         step = np.zeros_like(x)
         step[free] = np.linalg.lstsq(best[2][np.ix_(free, free)], best[1][free])[0]
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
@@ -148,12 +148,12 @@ def _maximise(objective: _Objective, start: dict[str, float]) -> _Maximum:
             length /= 2
         x, best = x + length * step, tried
     raise PoorFit(
-        f"the likelihood of the dark values did not settle in {_MOST_STEPS} steps; check that the darks were taken "
+        f"the likelihood of the dark values did not settle in {_MAX_STEPS} steps; check that the darks were taken "
         "with the lens covered, or record flats, which fix the gain"
     )
 
 
-def _as_fit(maximum: _Maximum) -> Fit:
+def _as_fit(maximum: _Maximum) -> NoiseFit:
     """Return the result in the parameters of the Gaussian fit, from those in `PARAMETERS`."""
     log_gain, log_read_e, log_dark, dcnu, offset, log_dsnu = maximum.x
     slope, dsnu2 = np.exp(log_gain + log_dark), np.exp(2 * log_dsnu)
@@ -177,7 +177,7 @@ def _as_fit(maximum: _Maximum) -> Fit:
         "log_gain": log_gain,
     }
     covariance = jacobian @ maximum.covariance @ jacobian.T
-    return Fit({name: float(v) for name, v in values.items()}, covariance, maximum.log_likelihood)
+    return NoiseFit({name: float(v) for name, v in values.items()}, covariance, maximum.log_likelihood)
 
 
 def exact_likelihood(

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise.exact import fit_exact
-from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
+from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
 from faintfield.calib.noise.moments import Moments, gather_moments
 from faintfield.calib.noise.selection import (
-    Likelihood,
+    NoiseLikelihood,
     censored_start,
     choose_likelihood,
     collect_counts,
@@ -21,7 +21,7 @@ from faintfield.calib.noise.statistics import Series
 
 
 @dataclass(frozen=True)
-class Fitted:
+class SeriesFit:
     """A fit and what it rests on.
 
     Attributes
@@ -30,20 +30,20 @@ class Fitted:
         The frames, reduced.
     moments : Moments
         The same, reduced further.
-    likelihood : Likelihood
+    likelihood : NoiseLikelihood
         Which likelihood was maximised.
-    fit : Fit
+    fit : NoiseFit
         Where.
-    bend : Fit, optional
+    bend : NoiseFit, optional
         The fit that let the response bend, where flats of three levels allow one.
     """
 
     darks: Sequence[Series]
     flats: Sequence[Series]
     moments: Moments
-    likelihood: Likelihood
-    fit: Fit
-    bend: Fit | None
+    likelihood: NoiseLikelihood
+    fit: NoiseFit
+    bend: NoiseFit | None
 
     @property
     def dark_noise_dn2(self) -> list[float]:
@@ -61,7 +61,7 @@ class Fitted:
         return float(self.darks[0].row_dn.var() + self.darks[0].column_dn.var())
 
 
-def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_]) -> Fitted:
+def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_]) -> SeriesFit:
     """Fit with the simplest likelihood that the frames allow.
 
     Parameters
@@ -82,8 +82,8 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
     # Among values cut off at the floor the highest look suspect, and leaving them out would bias the rest.
     counts = collect_counts(darks, usable)
     likelihood = choose_likelihood(counts, fit, shared_noise_dn2(darks, fit))
-    if likelihood is not Likelihood.GAUSSIAN:
-        exact = likelihood is Likelihood.EXACT
+    if likelihood is not NoiseLikelihood.GAUSSIAN:
+        exact = likelihood is NoiseLikelihood.EXACT
         if exact:
             counts = collect_counts(darks, usable & ~suspect)
         start = gaussian_start(fit) if exact else censored_start(counts)
@@ -91,10 +91,10 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
         bend = None
-    return Fitted(darks, flats, moments, likelihood, fit, bend)
+    return SeriesFit(darks, flats, moments, likelihood, fit, bend)
 
 
-def _fit_gaussian(moments: Moments) -> tuple[Fit, Fit | None]:
+def _fit_gaussian(moments: Moments) -> tuple[NoiseFit, NoiseFit | None]:
     """Fit a straight response, and where three light levels allow it a bent one; the bent one where it is bent."""
     straight = fit_gaussian(moments)
     if np.unique(np.round(moments.flats.mean_dn, -1)).size < 3:

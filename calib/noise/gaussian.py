@@ -25,13 +25,13 @@ from faintfield.calib.noise.moments import FlatMoments, Moments
 ROUNDING_DN2 = 1.0 / 12.0
 
 # All three are needed for silence; the solver tries points where a variance is negative, and backs off by itself.
-SILENT: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
+_QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
 _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
 
 
 @dataclass(frozen=True)
-class Fit:
+class NoiseFit:
     """Maximum-likelihood parameters and their covariance, here the inverse of the exact Hessian.
 
     Attributes
@@ -57,7 +57,7 @@ class Fit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
+def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
     """Maximise the marginal likelihood.
 
     Parameters
@@ -77,7 +77,7 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
     x = ca.SX.sym("x", len(names))
     parameters = {name: x[i] * scale[name] for i, name in enumerate(names)}
     objective = _negative_log_likelihood(parameters, moments)
-    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, SILENT | {"ipopt.acceptable_iter": 0})
+    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0})
     # The spreads over pixels may come out negative, as unbiased differences of variances do: a bound at zero would
     # push what contradicts it (a pickup whose phase turns from frame to frame, say) into the read noise.
     lower = [0.0 if name == "jitter_dn2" else -np.inf for name in names]
@@ -97,7 +97,7 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> Fit:
     hessian = np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
     free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(names)])
     units = np.array([scale[name] for name in names])
-    return Fit(
+    return NoiseFit(
         values={name: float(at[i] * scale[name]) for i, name in enumerate(names)},
         covariance=_inverse_on(hessian, free) * np.outer(units, units),
         log_likelihood=-float(found["f"]),

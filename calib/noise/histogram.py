@@ -10,7 +10,7 @@ from scipy.signal import fftconvolve
 from faintfield.calib.noise.mass import mass_function
 
 # The Poisson sum costs memory with the charge; beyond this many electrons the normal law is as good.
-_MOST_CHARGE_E = 200.0
+_MAX_POISSON_CHARGE_E = 200.0
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,6 @@ def _logs(
     slope = max(fitted.get("dark_signal_dn_per_s", 0.0), 1e-9)
     log_gain = fitted["log_gain"]
     charge = float(slope / np.exp(log_gain)) * exposure_s
-    masses = mass_function(u_dn, exposure_s, charge, exact=charge < _MOST_CHARGE_E, spread=False)
+    masses = mass_function(u_dn, exposure_s, charge, exact=charge < _MAX_POISSON_CHARGE_E, spread=False)
     table = masses(np.array([log_gain, 0.5 * fitted["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
     return table.log_mass[:, 0], table.log_tail[:, 0]

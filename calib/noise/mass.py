@@ -49,7 +49,7 @@ class MassTable:
 
 
 def mass_function(
-    u_dn: NDArray[np.float64], exposure_s: float, most_charge_e: float, *, exact: bool, spread: bool
+    u_dn: NDArray[np.float64], exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
 ) -> Callable[[NDArray[np.float64]], MassTable]:
     """Build the mass function of one exposure; casadi differentiates it.
 
@@ -59,7 +59,7 @@ def mass_function(
         Values y − o at which to tabulate.
     exposure_s : float
         Exposure time t.
-    most_charge_e : float
+    max_charge_e : float
         The largest λ that will be asked for; the Poisson sum reaches well above it.
     exact : bool
         Eq. (2) rather than (3).
@@ -77,7 +77,7 @@ def mass_function(
     for z in DARK_NODES if spread else (0.0,):
         charge = dark * ca.fmax(1 + x[3] * z, 0.05) * exposure_s
         upper, lower = (
-            _poisson_tail(u_dn + half, charge, gain, read, most_charge_e)
+            _poisson_tail(u_dn + half, charge, gain, read, max_charge_e)
             if exact
             else _normal_tail(u_dn + half, charge, gain, read)
             for half in (0.5, -0.5)
@@ -102,9 +102,9 @@ def _normal_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca
     return _ndtr((ca.MX(u_dn) - gain * charge) / (gain * ca.sqrt(read**2 + charge)))
 
 
-def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX, most_charge_e: float) -> ca.MX:
+def _poisson_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX, max_charge_e: float) -> ca.MX:
     """Return Σ_k P(k; λ) Φ((u − g k) / gσ), eq. (2)."""
-    k = np.arange(int(most_charge_e + 8 * np.sqrt(most_charge_e) + 10))
+    k = np.arange(int(max_charge_e + 8 * np.sqrt(max_charge_e) + 10))
     poisson = ca.exp(ca.DM(k) * ca.log(charge) - charge - ca.DM(gammaln(k + 1.0)))
     u, electrons = np.repeat(u_dn[:, None], k.size, 1), np.repeat(k[None, :].astype(float), u_dn.size, 0)
     return ca.mtimes(_ndtr((ca.DM(u) - gain * ca.DM(electrons)) / (gain * read)), poisson)

@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.noise.exact import Counts
-from faintfield.calib.noise.gaussian import Fit, dark_variances_dn2
+from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
 from faintfield.calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.
@@ -26,10 +26,10 @@ _MOST_SHARED = 0.03
 _CUT_OFF_FRACTION = 2e-3
 
 # A table of masses wider than this is refused: then the Gaussian is good enough.
-MOST_VALUES_DN = 2000
+MAX_TABLE_WIDTH_DN = 2000
 
 
-class Likelihood(StrEnum):
+class NoiseLikelihood(StrEnum):
     """The likelihoods by the names that results give."""
 
     GAUSSIAN = "marginal Gaussian"
@@ -48,7 +48,7 @@ def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
     return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
 
 
-def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
+def shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
     """Return the variance that frames, rows and columns add to all their pixels at once, in the quietest series."""
     noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
     variance, quietest = min(
@@ -60,35 +60,35 @@ def shared_noise_dn2(darks: Sequence[Series], gaussian: Fit) -> float:
     return gaussian.values["jitter_dn2"] + max(float(banding), 0.0)
 
 
-def choose_likelihood(counts: Counts, gaussian: Fit, shared_dn2: float) -> Likelihood:
+def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> NoiseLikelihood:
     """Return the simplest likelihood that the frames allow.
 
     Parameters
     ----------
     counts : Counts
         The values, with their floor where they are cut off.
-    gaussian : Fit
+    gaussian : NoiseFit
         What the Gaussian likelihood makes of them.
     shared_dn2 : float
         Noise that pixels share. It blurs single electrons and has no part in the exact likelihood, so that with more
         than a little of it the Gaussian is the better one.
     """
     widest = max(int(np.ptp(values)) for values in counts.values_dn)
-    if widest > MOST_VALUES_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
-        return Likelihood.GAUSSIAN
+    if widest > MAX_TABLE_WIDTH_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
+        return NoiseLikelihood.GAUSSIAN
     read_dn = np.exp(0.5 * gaussian.values["log_read_dn2"])
     read_e = read_dn / np.exp(gaussian.values["log_gain"])
     telling = gaussian.standard_error("log_gain") < 0.5 and gaussian.values["dark_signal_dn_per_s"] > 0
     if counts.floor_dn is not None:
-        return Likelihood.CENSORED
+        return NoiseLikelihood.CENSORED
     if shared_dn2 > _MOST_SHARED * read_dn**2:
-        return Likelihood.GAUSSIAN
+        return NoiseLikelihood.GAUSSIAN
     if read_dn < _SUBTLE_READ_DN or (telling and read_e < _SUBTLE_READ_E):
-        return Likelihood.EXACT
-    return Likelihood.GAUSSIAN
+        return NoiseLikelihood.EXACT
+    return NoiseLikelihood.GAUSSIAN
 
 
-def gaussian_start(gaussian: Fit) -> dict[str, float]:
+def gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
     """Return a start for the exact likelihood from the Gaussian fit."""
     values = gaussian.values
     signal = max(values["dark_signal_dn_per_s"], 1e-6)

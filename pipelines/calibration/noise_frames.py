@@ -1,4 +1,4 @@
-"""From the files of a noise set to series of statistics: each frame is read once, one at a time."""
+"""Series of statistics from the frames of a noise set; each frame is read once, one at a time."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +11,12 @@ from faintfield.calib.noise import Series, SeriesSums
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
 from faintfield.pipelines.formats.sets.noise_set import NoiseSet, Region, group_frames
 
 
 @dataclass(frozen=True)
-class Plane:
+class MosaicPhase:
     """The pixels of one phase of the colour filter mosaic; of the whole sensor when there are no filters.
 
     Attributes
@@ -27,7 +28,7 @@ class Plane:
     series : list of Series
         Statistics of its pixels.
     black_dn : list of float
-        Black level that each dark's file brings, from the sensor's masked pixels where it has any.
+        Black level stated in each dark's file, from the sensor's masked pixels where it has any.
     """
 
     phase: tuple[int, int]
@@ -38,12 +39,12 @@ class Plane:
 
     @property
     def name(self) -> str:
-        """Name of the plane for people and files, "" when it is the only one."""
+        """Name of the phase in messages and file names, "" when it is the only one."""
         return f"{self.colour}_r{self.phase[0]}c{self.phase[1]}" if self.colour else ""
 
     def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Return the plane's part of an array (row, column), as a view."""
-        return pixels[self.phase[0] :: self.period[0], self.phase[1] :: self.period[1]]
+        """Return the phase's part of an array (row, column), as a view."""
+        return at_phase(pixels, self.phase, self.period)
 
 
 @dataclass(frozen=True)
@@ -55,12 +56,12 @@ class Readout:
     size_px : (int, int)
         Width and height of a frame.
     rows, columns : slice
-        The region that was used.
+        Region that was used.
     mosaic : tuple of str, optional
         Colour filters.
     saturation_dn : float
         As stated in `noise.toml`, else by the file, else the last value of the files' type.
-    planes : list of Plane
+    phases : list of MosaicPhase
         One per phase of the mosaic.
     """
 
@@ -69,7 +70,7 @@ class Readout:
     columns: slice
     mosaic: tuple[str, ...] | None
     saturation_dn: float
-    planes: list[Plane]
+    phases: list[MosaicPhase]
 
 
 def read_series(folder: Path, settings: NoiseSet) -> Readout:
@@ -86,21 +87,21 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
     sums: list[SeriesSums] = []
     for index, (conditions, path) in enumerate(progress(frames, "reading frames")):
         if index == 0 or conditions != frames[index - 1][0]:
-            sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.planes]
+            sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
         frame = read_frame(path)
         pixels = _checked(frame, path, readout)[readout.rows, readout.columns]
-        for plane, plane_sums in zip(readout.planes, sums, strict=True):
-            plane_sums.add(str(path), plane.of(pixels))
+        for phase, phase_sums in zip(readout.phases, sums, strict=True):
+            phase_sums.add(str(path), phase.of(pixels))
             if conditions.kind == "dark" and frame.black_dn is not None:
-                plane.black_dn.append(float(frame.black_dn[plane.phase]))
+                phase.black_dn.append(float(frame.black_dn[phase.phase]))
         if index + 1 == len(frames) or conditions != frames[index + 1][0]:
-            for plane, plane_sums in zip(readout.planes, sums, strict=True):
-                plane.series.append(plane_sums.series())
+            for phase, phase_sums in zip(readout.phases, sums, strict=True):
+                phase.series.append(phase_sums.series())
     return readout
 
 
 def _layout(first: Path, settings: NoiseSet) -> Readout:
-    """Return what the first frame and the settings say of all frames."""
+    """Return the layout of all frames, from the first one and the settings."""
     frame = read_frame(first)
     if frame.pixels_dn.ndim != 2 or not np.issubdtype(frame.pixels_dn.dtype, np.integer):
         raise UnreadableImage(
@@ -109,9 +110,9 @@ def _layout(first: Path, settings: NoiseSet) -> Readout:
         )
     height, width = frame.pixels_dn.shape
     mosaic = settings.mosaic or frame.mosaic
-    period = (1, 1) if mosaic is None else (len(mosaic), len(mosaic[0]))
+    period = mosaic_period(mosaic)
     rows, columns = _slices(settings.region, (height, width), period)
-    phases = [Plane((r, c), period, "" if mosaic is None else mosaic[r][c]) for r, c in np.ndindex(*period)]
+    phases = [MosaicPhase((r, c), period, "" if mosaic is None else mosaic[r][c]) for r, c in np.ndindex(*period)]
     saturation_dn = settings.saturation_dn or frame.saturation_dn or float(np.iinfo(frame.pixels_dn.dtype).max)
     return Readout((width, height), rows, columns, mosaic, saturation_dn, phases)
 
@@ -131,7 +132,7 @@ def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, in
 
 
 def _checked(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
-    """Return a frame's pixels, refusing one that is unlike the first."""
+    """Return a frame's pixels; a frame unlike the first is refused."""
     pixels = frame.pixels_dn
     width, height = readout.size_px
     if pixels.shape != (height, width):

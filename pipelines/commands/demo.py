@@ -1,49 +1,61 @@
-"""`faintfield demo`: the whole experiment on a rig that exists in the computer alone, ending with report.html."""
+"""`faintfield demo`: the whole experiment on a simulated rig, ending with report.html."""
 
 import shutil
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
+
+import msgspec
 
 from faintfield.pipelines.arguments import Positive, Seed
 from faintfield.pipelines.commands.capture import capture
-from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
-from faintfield.pipelines.commands.run import run_steps, session_steps
-from faintfield.pipelines.commands.simulate import NOISE_FREE
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.demo_rig import DemoSize, demo_rig
 from faintfield.pipelines.paper.demo_truth import demo_metrics, true_set, write_truth
-from faintfield.pipelines.reconstruction.accuracy import METRICS_FILE
-from faintfield.pipelines.reconstruction.planes import TOGETHER, Method
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+from faintfield.pipelines.reconstruction.steps import run_steps
+from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
 
-# By this file a folder is known as one that an earlier demo made, and that the next may replace.
+# The file that marks a folder as made by a demo; the next demo may replace such a folder.
 _MARK = "demo.json"
 
-# All that find each plane by itself; what finds planes together would take the demo too long.
-_METHODS: list[Method] = [method for method in get_args(Method.__value__) if method not in TOGETHER]
+# The methods that reconstruct each plane by itself; those of all planes together would take too long.
+_METHODS: list[Method] = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 
 
-def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.16, seed: Seed = 1) -> dict[str, Any]:
+class DemoResult(msgspec.Struct, frozen=True):
+    """The result of `faintfield demo`."""
+
+    out: str
+    report: str
+    metrics: Metrics
+
+
+def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.16, seed: Seed = 1) -> DemoResult:
     """Run the paper's experiment on a simulated rig, from the first board sweep to the report.
 
-    A simulated gantry behind a pseudo-terminal carries a simulated camera; boards, objects, dark and flat frames are
-    captured as a session, and noise, geometry and planes found from it. Only then the truth is looked up, in OUT/truth,
-    and metrics.json says how far off everything is: with measured poses, with nominal ones, and with the true ones.
+    A simulated gantry behind a pseudo-terminal carries a simulated camera, which captures boards, objects, dark and
+    flat frames as a session; noise, geometry and planes are found from that session. The truth is looked up last, in
+    OUT/truth, and metrics.json gives the errors of the results: with measured poses, with nominal ones, and with the
+    true ones.
 
     Parameters
     ----------
     out
         Folder to write; the results of an earlier demo are replaced.
     quick
-        A small one: fewer nodes and pixels.
+        Capture fewer nodes and pixels.
     snr
-        Of the dark views, eq. (4).
+        SNR of the dark views, eq. (4).
     seed
-        Of all chance.
+        Seed of the random generator.
     """
     _make_free(out)
     settings = demo_rig(DemoSize.quick() if quick else DemoSize.full(), snr, seed)
@@ -57,13 +69,13 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     run_steps(session, session_steps(session, Request(depths, _METHODS)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
-    reconstruct_set(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
+    reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))
     alone = Request(depths, [DEFAULT_METHOD])
-    reconstruct_set(nominal_session(session), out / "nominal", alone)
-    reconstruct_set(true_set(session, truth), out / "true", alone)
+    reconstruct_and_report(nominal_session(session), out / "nominal", alone)
+    reconstruct_and_report(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth, _METHODS, DEFAULT_METHOD)
     write_json(out / METRICS_FILE, metrics)
-    return {"out": str(out), "report": str(write_report(out)), "metrics": metrics}
+    return DemoResult(str(out), str(write_report(out)), metrics)
 
 
 def _make_free(out: Path) -> None:

@@ -1,18 +1,25 @@
-"""`faintfield report`: draw report.html anew."""
+"""`faintfield report`: write report.html again."""
 
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.pages.report import write_report
 
 
-def report(directory: Path, /) -> dict[str, Any]:
-    """Draw report.html anew from the results in a folder and the folders within it.
+class Reported(msgspec.Struct, frozen=True):
+    """The result of `faintfield report`."""
 
-    It leads with the planes beside what the camera saw; then come sliders, errors, the noise and the geometry of the
-    camera where noise.json and geometry.json lie there or in one of the two folders above, the set and its light, and
-    how everything was made.
+    report: str
+
+
+def report(directory: Path, /) -> Reported:
+    """Write report.html again from the results in a folder and the folders within it.
+
+    The page begins with the planes next to what the camera saw. Then come sliders; errors; noise and geometry of the
+    camera, if noise.json and geometry.json are in the folder or in one of the two above; the set and its light; and how
+    everything was made.
 
     Parameters
     ----------
@@ -21,4 +28,4 @@ def report(directory: Path, /) -> dict[str, Any]:
     """
     path = write_report(directory)
     inform(f"{path}")
-    return {"report": str(path)}
+    return Reported(str(path))

@@ -1,60 +1,28 @@
 """`faintfield run`: everything after the capture of a session, only what is out of date."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
-from faintfield.pipelines.commands.reconstruct import (
-    DEFAULT_METHOD,
-    Request,
-    folder_of_method,
-    options_of,
-    reconstruct_set,
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.errors import MissingFile, WrongUsage
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, GeometryRecord
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
+from faintfield.pipelines.formats.results.records import (
+    RECONSTRUCTION_FILE,
+    REPORT_FILE,
+    Method,
+    ReconstructionRecord,
 )
-from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile, WrongUsage
-from faintfield.pipelines.formats.hashes import Hashes
-from faintfield.pipelines.formats.provenance import first_difference, provenance
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, files_beside
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
-from faintfield.pipelines.pages.report import RECONSTRUCTION_FILE, REPORT_FILE, write_report
+from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_depths
-from faintfield.pipelines.reconstruction.planes import Method, Settings
+from faintfield.pipelines.reconstruction.planes import Settings
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method
+from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 from faintfield.rig.session.session import PLAN
-
-
-@dataclass(frozen=True)
-class Step:
-    """One thing that is made of a session.
-
-    Attributes
-    ----------
-    name : str
-        As the command that does it alone.
-    needs : tuple of str
-        The steps whose results it reads.
-    inputs : callable
-        Returns the names of all files that it reads.
-    origins : dict of str to dict
-        By result file: the options that it was made with, if it is up to date; None where its being there is enough.
-    beside : callable
-        Returns the names of the files that lie beside a result file, from its contents.
-    make : callable
-        Does it.
-    """
-
-    name: str
-    needs: tuple[str, ...]
-    inputs: Callable[[], Sequence[str]]
-    origins: dict[str, dict[str, Any] | None]
-    beside: Callable[[dict[str, Any]], Sequence[str]]
-    make: Callable[[], object]
 
 
 def run(
@@ -69,7 +37,7 @@ def run(
     pitch_mm: Positive | None = None,
     lens: LensName = "opencv5",
     limit_px: Positive = 0.5,
-) -> dict[str, Any]:
+) -> RunOutcome:
     """Do everything after the capture: noise, geometry, reconstruction, report; only what is out of date.
 
     A result is up to date while the files that it was made from, its options and the versions of what made it are
@@ -86,7 +54,7 @@ def run(
     method
         How planes are reconstructed, as for `reconstruct`; give it once per method.
     penalty_weight
-        The paper's β; chosen from the noise level by default.
+        The paper's β; by default pmlem chooses it by cross-validation, pmlem-osl from the noise level.
     passes
         At most this many passes over the data.
     pitch_mm
@@ -111,15 +79,8 @@ def run(
 
 def session_steps(session: Path, request: Request, lens: LensName = "opencv5", limit_px: float = 0.5) -> list[Step]:
     """Return the steps from a captured session to the planes of a request, in order."""
-    out = session / RECONSTRUCTIONS
-    # Not those of the request: other planes need no other geometry
-    gated_mm = list(read_plan(session).rig.scene.depth_mm) or [500.0, 700.0]
-    of_geometry = {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}
-    folders = [(name, folder_of_method(out, name, request.methods)) for name in request.methods]
-    records: dict[str, dict[str, Any] | None] = {
-        str((folder / RECONSTRUCTION_FILE).relative_to(session)): options_of(name, request, "measured")
-        for name, folder in folders
-    }
+    # Depths of the rig, not of the request: the geometry stays the same for other planes
+    gated_mm = list(read_plan(session).rig.scene.depth_mm or DEFAULT_DEPTHS_MM)
 
     def measure_noise() -> None:
         from faintfield.pipelines.commands.noise import noise  # the fitting is heavy to load, and most runs need none
@@ -135,116 +96,55 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
         Step(
             "noise",
             (),
-            lambda: _frames(session, "dark", "flat"),
-            {NOISE_FILE: {}},
-            lambda _: [NOISE_MAPS],
-            measure_noise,
+            inputs=lambda: _frames(session, "dark", "flat"),
+            results={NOISE_FILE: {}},
+            sidecars=lambda _: [NOISE_MAPS],
+            make=measure_noise,
         ),
         Step(
             "geometry",
             (),
-            lambda: _frames(session, "charuco"),
-            {GEOMETRY_FILE: of_geometry},
-            files_beside,
-            measure_geometry,
+            inputs=lambda: _frames(session, "charuco"),
+            results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
+            sidecars=lambda content: msgspec.json.decode(content, type=GeometryRecord).files_beside(),
+            make=measure_geometry,
         ),
+        *_steps_of_request(session, request),
+    ]
+
+
+def _steps_of_request(session: Path, request: Request) -> list[Step]:
+    """Return the steps from a calibrated session to the planes and the report."""
+    out = session / RECONSTRUCTIONS
+    folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
+    return [
         Step(
             "reconstruct",
             ("noise", "geometry"),
-            lambda: files_of_scene(session, "dark_scene"),
-            records,
-            lambda content: [plane["file"] for plane in content["planes"]],
-            lambda: reconstruct_set(load_session(session), out, request),
+            inputs=lambda: files_of_scene(session, "dark_scene"),
+            results={
+                str((folder / RECONSTRUCTION_FILE).relative_to(session)): request.options(name, "measured")
+                for name, folder in folders.items()
+            },
+            sidecars=_plane_files,
+            make=lambda: reconstruct_and_report(load_session(session), out, request),
         ),
         Step(
             "report",
             ("reconstruct",),
-            lambda: [],
-            {f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
-            lambda _: [],
-            lambda: write_report(out),
+            inputs=lambda: [],
+            results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
+            sidecars=lambda _: [],
+            make=lambda: write_report(out),
         ),
     ]
 
 
-def run_steps(session: Path, steps: Sequence[Step]) -> dict[str, Any]:
-    """Make what is out of date, in order; what fails, or needs what failed, is left as it is.
-
-    Raises
-    ------
-    RigError, CalibrationError, ReconstructionError, InputError
-        The first failure, after all other steps were done.
-    """
-    hashes = Hashes(session)
-    altered = _altered_frames(session, hashes)
-    done: list[dict[str, Any]] = []
-    failed: dict[str, Exception] = {}
-    for step in steps:
-        if missing := [name for name in step.needs if name in failed]:
-            failed[step.name] = failed[missing[0]]
-            inform(f"{step.name}: left as it is, for it needs {missing[0]}")
-            continue
-        try:
-            why = _out_of_date(session, step, hashes)
-            inform(f"{step.name}: {why or 'up to date'}")
-            if why is not None:
-                step.make()
-        except NAMED_FAILURES as failure:
-            failed[step.name] = failure
-            inform(f"{step.name}: failed: {failure}")
-        else:
-            done.append({"step": step.name, "ran": why is not None, "why": why or "up to date"})
-    hashes.save()
-    for first in failed.values():
-        again = f"mend that and run `faintfield run {session}` again; still to be done: {', '.join(failed)}"
-        raise type(first)(f"{first}; {again}") from first
-    return {
-        "session": str(session),
-        "report": str(session / RECONSTRUCTIONS / REPORT_FILE),
-        "steps": done,
-        "altered_frames": altered,
-    }
+def _plane_files(content: bytes) -> list[str]:
+    """Return the names of the planes of a reconstruction.json."""
+    return [plane.file for plane in msgspec.json.decode(content, type=ReconstructionRecord).planes]
 
 
 def _frames(session: Path, *kinds: str) -> list[str]:
     """Return the names of the plan and of the frames of some kinds that count."""
     return [PLAN, *(str(path.relative_to(session)) for it, _, path in taken_frames(session) if it.kind in kinds)]
-
-
-def _altered_frames(session: Path, hashes: Hashes) -> list[str]:
-    """Return the frames that are not what was captured, and say so: results are made from what is there now."""
-    altered = [
-        str(path.relative_to(session))
-        for _, taken, path in taken_frames(session)
-        if path.is_file() and hashes.of(str(path.relative_to(session))) != taken.sha256
-    ]
-    if altered:
-        inform(
-            f"warning: {altered[0]} and {len(altered) - 1} other frames are not what was captured; results are made "
-            f"from them as they are now. Restore them from a copy; `faintfield verify {session}` names the first"
-        )
-    return altered
-
-
-def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
-    """Return why a step has to be done, None when its results are those of its inputs, options and versions."""
-    inputs: dict[str, str] = {}
-    for name in step.inputs():
-        if not (session / name).is_file():
-            raise MissingFile(f"{session / name}: is missing; restore it from a copy")
-        inputs[name] = hashes.of(name)
-    for file, options in step.origins.items():
-        if not (session / file).is_file():
-            return f"{file} is not there yet"
-        if options is None:
-            continue
-        try:
-            content = msgspec.json.decode((session / file).read_bytes(), type=dict[str, Any])
-            if why := first_difference(content.get("provenance", content), provenance(step.name, options, inputs)):
-                return f"{file} was made with another {why}"
-            beside = [(session / file).parent / name for name in step.beside(content)]
-        except (msgspec.MsgspecError, UnicodeDecodeError, AttributeError, LookupError, TypeError):
-            return f"{file} is damaged"
-        if missing := [path for path in beside if not path.is_file()]:
-            return f"{missing[0].relative_to(session)} is missing"
-    return None

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and the fingerprints by which results name their inputs."""
+"""Files and folders written whole or not at all, and the hashes by which results name their inputs."""
 
 import errno
 import fcntl
@@ -17,27 +17,27 @@ import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 
-# A short write of an array comes without a number: it, too, means that the disk is full.
+# Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
 
-# How temporary names end; what still has one when nobody writes was left by a process that was killed.
+# Suffix of temporary names; a file that keeps it was left by a process that was killed.
 UNFINISHED = ".unfinished"
 
 
 @contextmanager
 def writing(path: Path) -> Iterator[BinaryIO]:
-    """Open `path` for writing such that it appears whole, on disk, or not at all.
+    """Open a file for writing that appears at `path` whole or not at all.
 
-    The bytes go to a temporary name in the same folder, are flushed to the disk, and take their name in one step.
+    The bytes go to a temporary file in the same folder, which is flushed to the disk and then renamed in one step.
 
     Raises
     ------
     DiskFull, CannotWrite
-        In words, with the path; the temporary file is gone and what stood at `path` before still stands.
+        The file cannot be written. The temporary file is removed, and an earlier file at `path` is unchanged.
     """
-    with reported_as_cannot_write(path):
+    with translated_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The name is known before the file is there: an interrupt at any moment finds what to remove
+        # Named before it is created, so that an interrupt at any moment can remove it
         unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}{UNFINISHED}")
         try:
             with unfinished.open("xb") as file:
@@ -58,32 +58,31 @@ def write_whole(path: Path, content: bytes | str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON-able value or msgspec Struct, indented for people, whole or not at all."""
+    """Write a JSON-able value or msgspec Struct, indented, whole or not at all."""
     write_whole(path, msgspec.json.format(msgspec.json.encode(value)) + b"\n")
 
 
 @contextmanager
-def building_folder(
+def writing_folder(
     out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = (), reads: Iterable[Path] = ()
 ) -> Iterator[Path]:
-    """Fill a folder under a temporary name; it becomes `out` only when the block ends well.
+    """Yield a temporary folder, which becomes `out` when the block ends without an exception.
 
     Parameters
     ----------
     out : Path
-        Where the folder will stand. It may exist when it is empty.
+        The final folder. It may exist if it is empty.
     replace_if : str, optional
-        A file name by which a folder made earlier by the same command is known: such a folder is replaced, any other
-        is left alone.
+        A file that marks a folder made earlier by the same command: such a folder is replaced.
     replace_only : collection of str
-        Patterns of all the names that an earlier folder may hold to be replaced, where no one file is in each of them.
+        Patterns: an earlier folder is replaced if every name in it matches one. For folders without a marking file.
     reads : paths
-        What the block reads: it must not be replaced.
+        Files and folders that the block reads, which must not be replaced.
 
     Raises
     ------
     OutputExists
-        `out` holds something that would be lost.
+        `out` holds something else, or something that is read.
     """
     out = out.resolve()
     check_free(out, replace_if=replace_if, replace_only=replace_only)
@@ -91,9 +90,9 @@ def building_folder(
         # A link counts both where it leads and where it lies
         if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
-    with reported_as_cannot_write(out):
+    with translated_write_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        # The name is known before the folder is there: an interrupt at any moment finds what to remove
+        # Named before it is created, so that an interrupt at any moment can remove it
         building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
         try:
             building.mkdir(mode=0o700)
@@ -107,7 +106,7 @@ def building_folder(
 
 
 def _put_in_place(building: Path, out: Path) -> None:
-    """Give a folder its name; what had the name goes in one step, so that nobody sees it half removed."""
+    """Rename a folder to `out`; an earlier one is first renamed, so that nobody sees it half removed."""
     if not out.exists():
         os.replace(building, out)
         return
@@ -122,7 +121,7 @@ def _put_in_place(building: Path, out: Path) -> None:
 
 
 def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collection[str] = ()) -> None:
-    """Refuse `out` when it holds something, unless it holds the file `replace_if`, or only names of `replace_only`."""
+    """Refuse `out` if it holds anything, unless it holds the file `replace_if`, or only names of `replace_only`."""
     if not out.exists() or (replace_if is not None and (out / replace_if).is_file()):
         return
     if not out.is_dir():
@@ -135,15 +134,15 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Have a folder of results to oneself, made if need be; it goes again if nothing was put into it.
+def exclusive(folder: Path) -> Iterator[None]:
+    """Lock a folder of results while the block runs; it is created if missing, and removed if it stays empty.
 
     Raises
     ------
     OutputBusy
         Another command is writing there.
     """
-    with reported_as_cannot_write(folder):
+    with translated_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -154,7 +153,7 @@ def alone_in(folder: Path) -> Iterator[None]:
             f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
         ) from failure
     except OSError:
-        pass  # some network file systems lock no folders
+        pass  # some network file systems cannot lock folders
     try:
         yield
     finally:
@@ -164,13 +163,13 @@ def alone_in(folder: Path) -> Iterator[None]:
 
 
 def remove(path: Path) -> None:
-    """Remove a result that others will replace, if it is there."""
-    with reported_as_cannot_write(path):
+    """Remove a result that is about to be replaced, if there is one."""
+    with translated_write_errors(path):
         path.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what a process that was killed has left half-written in a folder; nobody may be writing there."""
+    """Remove unfinished files that a killed process left in a folder; no other process may be writing there."""
     for path in folder.glob(f".*{UNFINISHED}"):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -179,7 +178,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def require_room(path: Path, needed_bytes: int) -> None:
-    """Refuse to begin what would not fit on the disk of `path`.
+    """Refuse to begin work whose results would not fit on the disk of `path`.
 
     Raises
     ------
@@ -194,7 +193,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 
 def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal; MissingFile where it cannot be read."""
+    """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
@@ -203,8 +202,8 @@ def sha256(path: Path) -> str:
 
 
 @contextmanager
-def reported_as_cannot_write(path: Path) -> Iterator[None]:
-    """Turn what the system says about a failed write into a named failure with the path in it."""
+def translated_write_errors(path: Path) -> Iterator[None]:
+    """Turn the system's write errors into DiskFull or CannotWrite with the path."""
     try:
         yield
     except OSError as failure:
@@ -217,7 +216,7 @@ def reported_as_cannot_write(path: Path) -> Iterator[None]:
 
 
 def _free_bytes(path: Path) -> int:
-    """Return the room on the disk where `path` is or would be."""
+    """Return the free bytes on the disk where `path` is or would be."""
     existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
     return shutil.disk_usage(existing).free
 

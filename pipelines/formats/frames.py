@@ -1,4 +1,4 @@
-"""Image files as the sensor gave them: 16-bit TIFF or PNG, photographs, and raw files with their mosaic."""
+"""Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their mosaic."""
 
 import contextlib
 import logging
@@ -20,17 +20,17 @@ PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
 
-# What tifffile is known to raise on files that are damaged or end early; what it logs besides is said in one line here.
+# What tifffile raises on damaged or truncated files. Its log messages are dropped: UnreadableImage says it all.
 _TIFF_FAILURES = (
     *(tifffile.TiffFileError, zlib.error, struct.error, OSError, LookupError, RuntimeError, TypeError, ValueError),
     *(ArithmeticError, MemoryError),
 )
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
-# OpenCV fills the rest of a truncated photograph with grey and says nothing; a whole one ends with these bytes.
+# The last bytes of a whole file. OpenCV silently fills the rest of a truncated photograph with grey.
 _END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
-# The pixels next to the edge of the active area catch a little of its light.
+# Masked pixels this close to the active area are not used, px: they catch a little of its light.
 _MASKED_GUARD_PX = 4
 
 
@@ -43,14 +43,14 @@ class Frame:
     pixels_dn : array
         (row, column), or (row, column, colour) in the order red, green, blue.
     mosaic : tuple of str, optional
-        Rows of the colour filter array's smallest period, such as ("RG", "GB"); None without filters.
+        Rows of the smallest period of the colour filter array, such as ("RG", "GB"); None without filters.
     black_dn : array, optional
-        Black level of each phase of the mosaic (row, column of the period): from the sensor's masked pixels where it
-        has any, else as the camera states it; None where the file says nothing.
+        Black level of each phase of the mosaic (row, column of the period), from the sensor's masked pixels if it has
+        any, else as the camera states it; None if the file states none.
     saturation_dn : float, optional
-        The camera's stated white level, None where the file says nothing.
+        The white level that the camera states; None if the file states none.
     exposure_s : float, optional
-        From EXIF; None where it is missing or zero, never a default.
+        From EXIF; None if it is missing or zero.
     """
 
     pixels_dn: NDArray[Any]
@@ -91,7 +91,7 @@ def read_frame(path: Path) -> Frame:
 
 
 def _read_tiff(path: Path) -> NDArray[Any]:
-    """Read a TIFF; the compressions that tifffile leaves to extra packages are read by OpenCV."""
+    """Read a TIFF; compressions for which tifffile needs extra packages are read by OpenCV."""
     try:
         return np.asarray(tifffile.imread(path))
     except _TIFF_FAILURES as failure:
@@ -101,7 +101,7 @@ def _read_tiff(path: Path) -> NDArray[Any]:
 
 
 def _read_with_opencv(path: Path) -> NDArray[Any]:
-    """Read what OpenCV decodes, as (row, column) or (row, column, RGB), bit depth and orientation untouched."""
+    """Read a file with OpenCV as (row, column) or (row, column, RGB), with its own bit depth and orientation."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
     try:
         content = path.read_bytes()
@@ -117,7 +117,7 @@ def _read_with_opencv(path: Path) -> NDArray[Any]:
 
 
 def _sound_png(content: bytes) -> bool:
-    """Return whether every chunk of a PNG has its checksum, true of other files; the decoder would print, not say."""
+    """Return whether every chunk of a PNG has a right checksum, True for other files; the decoder would only print."""
     start = 8
     while content.startswith(b"\x89PNG") and start < len(content):
         end = start + 8 + int.from_bytes(content[start : start + 4])
@@ -130,8 +130,8 @@ def _sound_png(content: bytes) -> bool:
 
 
 def _read_raw(path: Path) -> Frame:
-    """Read the mosaic of a raw file, with its black level from the masked pixels."""
-    import rawpy  # only sessions with raw files pay for loading it
+    """Read the mosaic of a raw file, and its black level from the masked pixels."""
+    import rawpy  # slow to load, and only raw files need it
 
     try:
         with rawpy.imread(str(path)) as raw:
@@ -149,7 +149,7 @@ def _read_raw(path: Path) -> Frame:
 
 
 def _mosaic_of(raw: Any) -> tuple[str, ...] | None:
-    """Return the colours of one period of the visible area, as rows of letters."""
+    """Return the colour filters of one period of the visible area, as rows of letters."""
     if raw.raw_pattern is None or raw.raw_pattern.shape == (1, 1):
         return None
     rows, columns = raw.raw_pattern.shape
@@ -158,7 +158,7 @@ def _mosaic_of(raw: Any) -> tuple[str, ...] | None:
 
 
 def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the black level per phase: the masked pixels' mean without outliers, else the level the file states."""
+    """Return the black level per phase: the mean of the masked pixels without outliers, else the stated level."""
     top, left = raw.sizes.top_margin, raw.sizes.left_margin
     masked = np.zeros(raw.raw_image.shape, bool)
     masked[:, : max(left - _MASKED_GUARD_PX, 0)] = True
@@ -178,8 +178,8 @@ def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def exif_exposure_s(path: Path) -> float | None:
-    """Return the exposure that EXIF states, None where it states none (rawpy would say 1 s)."""
-    import exifread  # only sessions with raw files pay for loading it
+    """Return the exposure that EXIF states, None if it states none (rawpy would report 1 s)."""
+    import exifread  # slow to load, and only raw files need it
 
     with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
         tag = exifread.process_file(file, details=False, stop_tag="EXIF ExposureTime").get("EXIF ExposureTime")
@@ -189,6 +189,6 @@ def exif_exposure_s(path: Path) -> float | None:
 
 
 def _cannot_decode(path: Path, reason: str) -> str:
-    """Return the message for a file that no decoder accepts."""
+    """Return the message for a file that cannot be decoded."""
     reason = " ".join(reason.split())
     return f"{path}: cannot be decoded ({reason}; {path.stat().st_size} bytes); take or copy the image again"

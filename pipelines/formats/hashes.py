@@ -1,4 +1,4 @@
-"""Hashes of a session's files, remembered as long as the files do not change: frames are read once, not every time."""
+"""Hashes of a session's files, cached until the files change: frames are read once, not every time."""
 
 import time
 from contextlib import suppress
@@ -11,12 +11,12 @@ from faintfield.pipelines.formats.files import sha256, write_json
 
 CACHE_FILE = ".hashes.json"
 
-# A file changed within this time of its hashing could change again without its time stamp showing it.
+# In nanoseconds: a file changed this shortly before its hashing could change again with the same time stamp.
 _AT_REST_NS = 2_000_000_000
 
 
 class _Known(msgspec.Struct, frozen=True):
-    """A hash, and the size and time of change of the file when it was taken."""
+    """A hash, with the size and the time of change of the file at that time."""
 
     size: int
     mtime_ns: int
@@ -24,12 +24,12 @@ class _Known(msgspec.Struct, frozen=True):
 
 
 class Hashes:
-    """SHA-256 of the files of a folder, each computed again only when its size or its time of change has changed.
+    """SHA-256 of the files of a folder, each computed again only if its size or its time of change differs.
 
     Parameters
     ----------
     folder : Path
-        The folder; the hashes are kept in a hidden file there, which may be removed at any time.
+        The folder; the hashes are stored in a hidden file in it, which may be removed at any time.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -38,7 +38,7 @@ class Hashes:
         try:
             self._known = msgspec.json.decode((folder / CACHE_FILE).read_bytes(), type=dict[str, _Known])
         except (OSError, msgspec.MsgspecError, UnicodeDecodeError):
-            self._changed = True  # there is none, or it is no use: everything is hashed
+            self._changed = True  # there is none, or it cannot be read: everything is hashed
         else:
             self._changed = False
 
@@ -58,9 +58,9 @@ class Hashes:
         return digest
 
     def save(self) -> None:
-        """Keep what was computed for the next time, but for files that had changed only just before.
+        """Store the hashes, except of files that had changed just before.
 
-        Where the folder cannot be written to, nothing is kept: it costs time, nothing else.
+        If the folder cannot be written to, nothing is stored, which costs time only.
         """
         if self._changed:
             with suppress(CannotWrite):

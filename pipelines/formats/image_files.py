@@ -1,4 +1,4 @@
-"""Pictures and planes written: 16-bit frames, float planes with their scale, and previews for the eye."""
+"""Image files that are written: 16-bit frames, float planes with their scale, and previews."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ type Picture = NDArray[np.uint8]
 
 
 def write_frame(path: Path, pixels: NDArray[Any]) -> None:
-    """Write a frame (row, column[, colour]) as TIFF in its own type, losslessly compressed."""
+    """Write a frame (row, column[, colour]) as TIFF of its own data type, losslessly compressed."""
     with writing(path) as file:
         photometric = "rgb" if pixels.ndim == 3 else "minisblack"
         tifffile.imwrite(file, pixels, compression="zlib", predictor=True, photometric=photometric)
@@ -34,12 +34,12 @@ def write_plane(path: Path, plane: NDArray[np.floating], pitch_mm: float) -> Non
 
 
 def write_png(path: Path, picture: Picture) -> None:
-    """Write a picture (row, column[, RGB])."""
+    """Write a picture (row, column[, RGB]) as PNG."""
     write_whole(path, encoded(picture, ".png"))
 
 
 def encoded(picture: Picture, suffix: str) -> bytes:
-    """Return a picture (row, column[, RGB]) as the bytes of a file of that kind."""
+    """Return a picture (row, column[, RGB]) as the bytes of a file with that suffix."""
     ordered = picture if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, ::-1])
     done, content = cv2.imencode(suffix, ordered)
     if not done:
@@ -59,13 +59,13 @@ def mask_picture(mask: NDArray[np.bool_]) -> Picture:
 
 
 def white_level(plane: NDArray[np.floating]) -> float:
-    """Return the white of a scale that shows a plane well: its 99.8 % quantile."""
+    """Return the white level of a plane's grey scale: its 99.8 % quantile."""
     return float(np.quantile(plane, 0.998))
 
 
 def contact_sheet(views: list[Picture], columns: int) -> Picture:
-    """Return small pictures of one size (row, column[, RGB]) laid out in rows with a thin line between them."""
-    gap = 3  # thinner lines get lost when a page is shown smaller
+    """Return small pictures of one size (row, column[, RGB]) laid out in rows, with thin lines between them."""
+    gap = 3  # px; thinner lines vanish when a page is shown smaller
     height, width = views[0].shape[:2]
     rows = -(-len(views) // columns)
     sheet = np.full((rows * (height + gap) - gap, columns * (width + gap) - gap, *views[0].shape[2:]), 40, np.uint8)
@@ -76,7 +76,7 @@ def contact_sheet(views: list[Picture], columns: int) -> Picture:
 
 
 def shrunk(picture: Picture, width_px: int) -> Picture:
-    """Return a picture reduced to a width by averaging, or itself when it is no wider."""
+    """Return a picture reduced to a width by averaging, or the picture itself if it is no wider."""
     height, width = picture.shape[:2]
     if width <= width_px:
         return picture

@@ -1,4 +1,4 @@
-"""Arrays that memory has no room for: files read by memory map."""
+"""Arrays that are too large for memory: memory-mapped files."""
 
 import os
 import re
@@ -10,27 +10,27 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from faintfield.pipelines.formats.files import reported_as_cannot_write
+from faintfield.pipelines.formats.files import translated_write_errors
 
-# Makes an array of a shape and a kind, its contents yet to be written.
+# Makes an uninitialised array, given its shape and dtype.
 type Allocate = Callable[[tuple[int, ...], DTypeLike], NDArray[Any]]
 
-# Of the memory that is free, what one array may take; the rest is for planes, other programs, and other arrays.
+# Share of the free memory that one array may take; the rest is for planes, other programs, and other arrays.
 SHARE_OF_MEMORY = 0.5
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 
 def memory_or_file(folder: Path) -> Allocate:
-    """Return what makes arrays in memory, and those of more than half of what is free of it in a file in `folder`.
+    """Return a function that makes arrays in memory, or in a file in `folder` if they exceed half of the free memory.
 
-    The file has no name: it is gone with the array, whatever ends the process.
+    The file has no name: it disappears with the array, however the process ends.
     """
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         if _bytes(shape, dtype) <= SHARE_OF_MEMORY * available_bytes():
             return np.empty(shape, dtype)
-        with reported_as_cannot_write(folder):
+        with translated_write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder) as file:
                 return mapped(file, shape, dtype)
@@ -39,16 +39,16 @@ def memory_or_file(folder: Path) -> Allocate:
 
 
 def mapped(file: IO[bytes], shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return an array whose elements are those of a new file; the file may be closed, and even removed.
+    """Return an array in a new file, which may be closed, and even removed.
 
-    Its room is taken at once: a disk that fills up later would end the process without a word.
+    Its space is allocated at once: if the disk filled up later, the process would be killed without a message.
     """
     os.posix_fallocate(file.fileno(), 0, _bytes(shape, dtype))
     return np.asarray(np.memmap(file, dtype, "r+", shape=shape))
 
 
 def available_bytes() -> int:
-    """Return how much memory this process can take: what the system has free, as far as its control groups let it."""
+    """Return the memory that this process can take: the free memory, within the limits of its control groups."""
     free = re.search(r"^MemAvailable:\s+(\d+) kB", (_PROC / "meminfo").read_text(), re.MULTILINE)
     assert free is not None
     group = re.search(r"^0::/(.*)$", _read(_PROC / "self" / "cgroup"), re.MULTILINE)
@@ -58,7 +58,7 @@ def available_bytes() -> int:
 
 
 def _left_of_group(folder: Path) -> int:
-    """Return what a control group leaves to its processes; what it keeps of files it would give up."""
+    """Return the memory that a control group leaves to its processes; its file cache counts as free."""
     limit = _read(folder / "memory.max").strip()
     if not limit.isdigit():
         return 1 << 62

@@ -1,33 +1,43 @@
-"""What every artefact records of itself (command, options, inputs' hashes, versions), and whether it still holds."""
+"""What every result records of its making (command, options, inputs, versions), and whether it is still current."""
 
 import platform
+from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
 
 import msgspec
 
 _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "mrcal", "casadi")
 
 
-def provenance(command: str, options: dict[str, Any], inputs: dict[str, str]) -> dict[str, Any]:
-    """Return the record that goes beside or into a result.
+class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
+    """How a result was made: the last keys of its JSON file.
 
-    Parameters
+    Attributes
     ----------
     command : str
-        The command's name.
-    options : dict
+        The name of the command.
+    options : mapping or msgspec.Struct
         Its options as they took effect.
     inputs : dict
         SHA-256 by file name.
+    versions : dict
+        Of Python and the packages that compute results.
     """
-    return {
-        "command": command,
-        "options": options,
-        "inputs": inputs,
-        "versions": versions(),
-    }
+
+    command: str
+    options: Options
+    inputs: dict[str, str]
+    versions: dict[str, str]
+
+
+# Provenance whose options are known by their keys only: of any command.
+type AnyProvenance = Provenance[Mapping[str, object]]
+
+
+def provenance[Options](command: str, options: Options, inputs: dict[str, str]) -> Provenance[Options]:
+    """Return the provenance of a result that is made now."""
+    return Provenance(command=command, options=options, inputs=inputs, versions=versions())
 
 
 def versions() -> dict[str, str]:
@@ -39,21 +49,25 @@ def versions() -> dict[str, str]:
     return found
 
 
-def first_difference(origin: dict[str, Any], now: dict[str, Any]) -> str | None:
-    """Return in words the first thing in which the origin of a result differs from what it would be now.
+def first_difference[Options](written: AnyProvenance, now: Provenance[Options]) -> str | None:
+    """Return in words the first difference between the provenance of a result and what it would be now, None if equal.
 
     Parameters
     ----------
-    origin : dict
-        What the result says of itself, as it was read from its file.
-    now : dict
-        Of `provenance`: what it would say if it were made now.
+    written : Provenance
+        As read from the result's file.
+    now : Provenance
+        Of the same result, were it made now.
     """
-    now = msgspec.json.decode(msgspec.json.encode(now))
-    for key, called in (("inputs", "input"), ("options", "option"), ("versions", "version")):
-        before, after = origin.get(key, {}), now[key]
+    now_options: dict[str, object] = msgspec.json.decode(msgspec.json.encode(now.options))
+    compared: tuple[tuple[str, Mapping[str, object], Mapping[str, object]], ...] = (
+        ("input", written.inputs, now.inputs),
+        ("option", written.options, now_options),
+        ("version", written.versions, now.versions),
+    )
+    for kind, before, after in compared:
         changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
         if changed:
             more = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
-            return f"{called}: {changed[0]}{more}"
+            return f"{kind}: {changed[0]}{more}"
     return None

@@ -1,4 +1,4 @@
-"""Settings read from TOML: every key known, every value of its type, every complaint with its path."""
+"""Settings in TOML: unknown keys and wrong values are refused, with their place in the file."""
 
 import difflib
 import re
@@ -12,8 +12,8 @@ import tomli_w
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
 from faintfield.pipelines.formats.files import write_whole
 
-# No quantity is larger, and what is computed of numbers up to it overflows nowhere.
-_MOST = 1e12
+# No quantity of a rig is larger, and computing with numbers up to it does not overflow.
+_MAX_NUMBER = 1e12
 
 
 def read_toml[T](path: Path, kind: type[T]) -> T:
@@ -24,10 +24,10 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
     MissingFile
         There is no such file.
     UnknownKey
-        A key that nothing reads, with its path and the nearest key that is read, or whose it is.
+        A key is not read; the message names its place, and the nearest key or the table where it belongs.
     BadValue
-        The file is not TOML, a key is missing, a value has the wrong type or is none of its choices, or a number is not
-        finite.
+        The file is not TOML, a key is missing, a value has the wrong type or is not one of its choices, or a number
+        is not finite.
     """
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
@@ -38,18 +38,18 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
     except msgspec.ValidationError as failure:
-        raise _in_words(path, str(failure), kind) from None
+        raise _failure_of(path, str(failure), kind) from None
     except (tomllib.TOMLDecodeError, msgspec.DecodeError, UnicodeDecodeError) as failure:
         raise BadValue(f"{path}: is not TOML ({failure}); correct the line") from failure
 
 
 def write_toml(path: Path, settings: msgspec.Struct) -> None:
-    """Write what `read_toml` reads, whole or not at all; keys without a value are left out, for TOML has no null."""
+    """Write what `read_toml` reads, whole or not at all; keys whose value is None are left out, as TOML has no null."""
     write_whole(path, tomli_w.dumps(_without_none(msgspec.to_builtins(settings))))
 
 
 def inside(folder: Path, name: str, key: str) -> Path:
-    """Return the path of a file that a settings file names, which must lie in its own folder.
+    """Return the path of a file named in a settings file, which must lie in the same folder.
 
     Raises
     ------
@@ -63,21 +63,21 @@ def inside(folder: Path, name: str, key: str) -> Path:
 
 
 def _require_finite(path: Path, value: Any, place: str = "") -> None:
-    """Refuse numbers that are none, or that no rig has, wherever they stand."""
+    """Refuse numbers that are not finite or larger than any rig has, at any depth."""
     if isinstance(value, dict):
         for key, part in value.items():
             _require_finite(path, part, f"{place}.{key}" if place else key)
     elif isinstance(value, list):
         for index, part in enumerate(value):
             _require_finite(path, part, f"{place}[{index}]")
-    elif isinstance(value, int | float) and not abs(value) <= _MOST:
+    elif isinstance(value, int | float) and not abs(value) <= _MAX_NUMBER:
         raise BadValue(
-            f"{path}: {place} = {value!s:.24}; numbers are finite, and at most {_MOST:g} in size: correct it"
+            f"{path}: {place} = {value!s:.24}; numbers are finite, and at most {_MAX_NUMBER:g} in size: correct it"
         )
 
 
-def _in_words(path: Path, complaint: str, kind: type) -> InputError:
-    """Return what msgspec complains of, in the words of this project."""
+def _failure_of(path: Path, complaint: str, kind: type) -> InputError:
+    """Return the failure that says what msgspec found, in words for people."""
     reason, _, place = complaint.partition(" - at ")
     place = place.strip("`").removeprefix("$").removeprefix(".")
     if unknown := re.search(r"unknown field `(.+?)`", reason):
@@ -90,7 +90,7 @@ def _in_words(path: Path, complaint: str, kind: type) -> InputError:
 
 
 def _better_key(kind: type, place: str, key: str) -> str:
-    """Return what to do about a key that the table at `place` does not have."""
+    """Return the remedy for a key that the table at `place` does not have."""
     tables = _tables(kind)
     known = {name for table in tables.values() for name in table}
     if key not in known:
@@ -104,25 +104,25 @@ def _better_key(kind: type, place: str, key: str) -> str:
 
 
 def _better_value(kind: type, place: str, value: str) -> str:
-    """Return what may stand at `place`, and which of these is most like `value`."""
+    """Return the choices at `place`, and the one most like `value`."""
     choices = [repr(it) for table in _tables(kind).values() for it in table.get(_name(place), {}).get("enum", [])]
     near = difflib.get_close_matches(value, choices, n=1, cutoff=0.5)
     return f"choose from {', '.join(choices)}" + (f"; did you mean {near[0]}?" if near else "")
 
 
 def _tables(kind: type) -> dict[str, dict[str, Any]]:
-    """Return what the JSON schema of `kind` says of each key of each Struct in it, by its references."""
+    """Return the keys of each Struct in the JSON schema of `kind`, by reference."""
     parts = msgspec.json.schema(kind)["$defs"]
     return {f"#/$defs/{name}": part.get("properties", {}) for name, part in parts.items()}
 
 
 def _name(place: str) -> str:
-    """Return the last key of a place such as `step[2].kind`."""
+    """Return the last key of a place: "kind" of `step[2].kind`."""
     return re.sub(r"\[.*?\]", "", place).rpartition(".")[2]
 
 
 def _without_none(value: Any) -> Any:
-    """Drop the keys that say nothing."""
+    """Return a value without the keys whose value is None, at any depth."""
     if isinstance(value, dict):
         return {key: _without_none(part) for key, part in value.items() if part is not None}
     return [_without_none(part) for part in value] if isinstance(value, list | tuple) else value

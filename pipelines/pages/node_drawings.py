@@ -1,38 +1,35 @@
 """Drawings of a measured geometry: real against nominal nodes, and how well each is known."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.pages.page import INK, inked, svg
 
-_MOST_MAGNIFIED_SHARE = 0.35
+# The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
+_MAX_DRAWN_SHARE = 0.35
 
-# From here on rotations are in mrad, below in µrad.
+# Rotations are shown in mrad from here on, in µrad below.
 _COARSE_RAD = 1e-4
 
-# More nodes than this have no number written into their cell.
-_MOST_WRITTEN = 121
+# With more nodes than this, numbers would not fit into their cells.
+_MAX_WRITTEN = 121
 
 
-def node_drawing(geometry: dict[str, Any]) -> str | None:
-    """Return real against nominal nodes as SVG, deviations magnified; None where there is no regular grid to compare.
-
-    Parameters
-    ----------
-    geometry : dict
-        The contents of geometry.json.
-    """
+def node_drawing(geometry: GeometryRecord) -> str | None:
+    """Return real against nominal nodes as SVG, deviations magnified; None without a regular grid to compare."""
     from matplotlib.figure import Figure  # loading it costs most of a second
 
-    stage = geometry["stage"]
-    pitch = np.array([stage[name]["value"] for name in ("pitch_x_mm", "pitch_y_mm")], float)
-    residuals = np.array(stage["residuals_mm"] or [], float)
+    stage = geometry.stage
+    pitch = np.array([stage.pitch_x_mm.value, stage.pitch_y_mm.value], float)
+    residuals = np.array(stage.residuals_mm, float)
     if not len(residuals) or np.isnan(pitch).any():
         return None
-    nodes = np.array([entry["node"] for entry in geometry["nodes"]], float)
-    nominal = (nodes - geometry["reference_node"])[:, ::-1] * pitch
+    nodes = np.array([entry.node for entry in geometry.nodes], float)
+    nominal = (nodes - geometry.reference_node)[:, ::-1] * pitch
     factor = _magnification(residuals, float(pitch.min()))
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
@@ -59,34 +56,31 @@ def node_drawing(geometry: dict[str, Any]) -> str | None:
     return svg(figure)
 
 
-def sigma_maps(geometry: dict[str, Any]) -> list[str]:
-    """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each.
-
-    Parameters
-    ----------
-    geometry : dict
-        The contents of geometry.json.
-    """
-    largest_rad = max(node["sigma_rad"] for node in geometry["nodes"])
+def sigma_maps(geometry: GeometryRecord) -> list[str]:
+    """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each."""
+    nodes = [entry.node for entry in geometry.nodes]
+    sigma_um = [1e3 * entry.sigma_mm for entry in geometry.nodes]
+    largest_rad = max(entry.sigma_rad for entry in geometry.nodes)
     per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
+    sigma_rotation = [per_rad * entry.sigma_rad for entry in geometry.nodes]
     return [
-        _sigma_map(geometry["nodes"], "sigma_mm", 1e3, "σ of position, √ of the variances' sum (µm)"),
-        _sigma_map(geometry["nodes"], "sigma_rad", per_rad, f"σ of rotation, √ of the variances' sum ({unit})"),
+        _sigma_map(nodes, sigma_um, "σ of position, √ of the variances' sum (µm)"),
+        _sigma_map(nodes, sigma_rotation, f"σ of rotation, √ of the variances' sum ({unit})"),
     ]
 
 
-def _sigma_map(nodes: list[dict[str, Any]], key: str, factor: float, words: str) -> str:
-    """Return the map of one number of the nodes."""
+def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words: str) -> str:
+    """Return the map of one number of each node."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.8, 4.0), layout="constrained")
     axes = figure.subplots()
-    first, values = _map_of_nodes(nodes, key, factor)
+    first, values = _map_of_nodes(nodes, sigmas)
     rows, columns = values.shape
     extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
     _colour_bar(figure, image, axes, words)
-    if values.size <= _MOST_WRITTEN:
+    if values.size <= _MAX_WRITTEN:
         _write_values(axes, first, values)
     axes.set_xlabel("column of the grid")
     axes.set_ylabel("row of the grid")
@@ -95,12 +89,14 @@ def _sigma_map(nodes: list[dict[str, Any]], key: str, factor: float, words: str)
     return svg(figure)
 
 
-def _map_of_nodes(nodes: list[dict[str, Any]], key: str, factor: float) -> tuple[tuple[int, int], NDArray[np.float64]]:
-    """Return the first row and column, and a number of each node at its place, NaN where there is no node."""
-    places = np.array([entry["node"] for entry in nodes])
+def _map_of_nodes(
+    nodes: Sequence[tuple[int, int]], numbers: Sequence[float]
+) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    """Return the first row and column, and each node's number at its place, NaN where there is no node."""
+    places = np.array(nodes)
     first = places.min(axis=0)
     values = np.full(np.ptp(places, axis=0) + 1, np.nan)
-    values[tuple((places - first).T)] = [factor * entry[key] for entry in nodes]
+    values[tuple((places - first).T)] = numbers
     return (int(first[0]), int(first[1])), values
 
 
@@ -122,10 +118,10 @@ def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:
 
 
 def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
-    """Return by how much deviations are drawn larger: a round number that keeps the largest within its cell."""
+    """Return the factor by which deviations are magnified: a round number that keeps the largest within its cell."""
     largest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
     if largest <= 0:
         return 1.0
-    wanted = _MOST_MAGNIFIED_SHARE * pitch_mm / largest
+    wanted = _MAX_DRAWN_SHARE * pitch_mm / largest
     power = 10 ** np.floor(np.log10(wanted))
     return float(max(next(step for step in (5, 2, 1) if step * power <= wanted) * power, 1.0))

@@ -1,4 +1,4 @@
-"""What all pages share: their template, pictures within them, and drawings in the page's own ink."""
+"""Parts that all pages share: templates, embedded pictures, and drawings in the colours of the page."""
 
 import base64
 import io
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from jinja2 import Template
     from matplotlib.figure import Figure
 
-# Drawn with this, and replaced by the page's own colour, light or dark.
+# Colour of lines and text in drawings; in the SVG it is replaced by the page's own text colour, light or dark.
 INK = "#010203"
 
 
 def template(name: str) -> "Template":
-    """Return a page's template, with `figure` to write a number to three digits."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined  # loaded when all images are out of memory
+    """Return a page's template; its filter `figure` writes a number to three digits."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # only pages need it
 
     environment = Environment(
         loader=PackageLoader("faintfield.pipelines.pages"),
@@ -30,7 +30,7 @@ def template(name: str) -> "Template":
 
 
 def figure(value: float | None, digits: int = 3) -> str:
-    """Return a number to so many digits, zeros at its end among them, a dash where there is none."""
+    """Return a number to `digits` significant digits, trailing zeros included; a dash for None."""
     if value is None:
         return "–"
     rounded = float(f"{value:.{digits}g}")
@@ -41,13 +41,13 @@ def figure(value: float | None, digits: int = 3) -> str:
 
 
 def data_uri(content: bytes, suffix: str) -> str:
-    """Return a picture's file as an address that holds it."""
+    """Return the bytes of a picture's file as a data URI."""
     kind = {".png": "png", ".jpg": "jpeg"}[suffix]
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 def svg(figure: "Figure") -> str:
-    """Return a drawing as SVG that takes its colour from the page; the same drawing gives the same text."""
+    """Return a drawing as SVG in the text colour of the page; equal drawings give equal text."""
     from matplotlib import rc_context
 
     text = io.StringIO()
@@ -65,7 +65,7 @@ def svg(figure: "Figure") -> str:
 
 
 def inked(*axes: Any) -> None:
-    """Draw axes in the page's ink, without a frame above and to the right."""
+    """Give axes the colour `INK`, and remove the frame above and to the right."""
     for one in axes:
         one.tick_params(which="both", colors=INK)
         one.spines[:].set_color(INK)

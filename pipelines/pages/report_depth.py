@@ -1,22 +1,36 @@
-"""What a report shows of a sweep's depth map."""
+"""The depth map of a sweep in a report."""
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord
 from faintfield.pipelines.pages.page import data_uri
 
-_PICTURES = ("all_in_focus", "file", "confidence")
+
+@dataclass(frozen=True)
+class DepthSection:
+    """A depth map with its pictures as data URIs; None if the file is missing."""
+
+    title: str
+    record: DepthMapRecord
+    all_in_focus: str | None
+    map: str | None
+    confidence: str | None
 
 
-def depth_sections(directory: Path, results: dict[Path, dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return what the page shows of each depth map: what is recorded of it, and its pictures, where they are there."""
-    sections = []
-    for folder, result in results.items():
-        if found := result.get("depth_map"):
-            pictures = {key: _picture(folder / Path(found[key]).name) for key in _PICTURES}
-            title = folder.relative_to(directory).as_posix()
-            sections.append({**found, "title": title, "pictures": pictures})
-    return sections
+def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -> list[DepthSection]:
+    """Return what the page shows of each depth map."""
+    return [
+        DepthSection(
+            folder.relative_to(directory).as_posix(),
+            found,
+            all_in_focus=_picture(folder / Path(found.all_in_focus).name),
+            map=_picture(folder / Path(found.file).name),
+            confidence=_picture(folder / Path(found.confidence).name),
+        )
+        for folder, result in results.items()
+        if (found := result.depth_map)
+    ]
 
 
 def _picture(path: Path) -> str | None:

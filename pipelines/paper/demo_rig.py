@@ -1,4 +1,4 @@
-"""The rig of the demo: as large as the paper's, or small, and as dark as asked for."""
+"""The configuration of the demo's rig, full-sized or small, with light for the SNR asked for."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -24,12 +24,14 @@ from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.settings import StageSettings
 
 EXPOSURE_S = 0.1
-_SWEEPS = 6
+
+# Sweeps over the nodes with a board at another place each.
+_BOARD_SWEEPS = 6
 
 
 @dataclass(frozen=True)
 class DemoSize:
-    """How much is captured."""
+    """How much is captured: nodes along each side of the grid, their pitch, pixels, and dark and flat frames."""
 
     nodes: int
     pitch_mm: float
@@ -55,13 +57,13 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
     size : DemoSize
         How much is captured.
     snr : float
-        Of the dark views, eq. (4), by which the light is set.
+        SNR of the dark views, eq. (4); it sets the light.
     seed : int
-        Of all chance.
+        Seed of the random generator.
     """
     camera = SimulatedSettings(size.size_px, position_error_mm=0.3, rotation_error_mrad=3.5, seed=seed)
     steps = [
-        *[StepSettings("charuco", 0.1)] * _SWEEPS,
+        *[StepSettings("charuco", 0.1)] * _BOARD_SWEEPS,
         StepSettings("bright", 0.02),
         StepSettings("dark_scene", EXPOSURE_S),
         StepSettings("noise_reference", EXPOSURE_S, at="centre"),
@@ -82,7 +84,7 @@ def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
 
 
 def _photons_per_s(camera: SimulatedSettings, snr: float) -> float:
-    """Return the light on a white object, in photons per second and pixel, at which the reference view has an SNR."""
+    """Return the light of a white object, in photons per second and pixel, that gives the reference view an SNR."""
     experiment = lab_experiment(camera)
     sensor = experiment.sensor
     view = next(render(experiment.planes, experiment.optics, np.zeros((1, 6)), samples_per_px=1))

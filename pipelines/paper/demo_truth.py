@@ -1,10 +1,8 @@
-"""What only the simulated world knows of a session, and how far off its results are."""
+"""The truth about a session of the simulated lab, and how far its results are from it."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
@@ -12,16 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.commands.reconstruct import folder_of_method
-from faintfield.pipelines.commands.simulate import NOISE_FREE, write_ground_truth
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE
+from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import read_geometry
+from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
-from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.pipelines.reconstruction.request import folder_of_method
+from faintfield.pipelines.simulation.scene_truth import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.session.access import read_plan, taken_frames
 from faintfield.rig.simulation.camera import TRUE_POSE
@@ -42,8 +40,10 @@ def write_truth(out: Path, session: Path, snr: float) -> Path:
         lab.planes, lab.optics, lab.sensor, grid.rows, grid.columns, grid.pitch_mm, sum(exposures)
     )
     white_e = camera.unlit_photons_per_s * sum(exposures) * lab.sensor.quantum_efficiency
+    in_order = np.stack([poses[node] for node in sorted(poses)])
+    scene = render_scene(experiment, in_order, camera.mosaic, samples_per_px=1)  # as the simulated camera renders
     out.mkdir(parents=True)
-    write_ground_truth(out, experiment, np.stack([poses[node] for node in sorted(poses)]), white_e, snr, camera.mosaic)
+    write_ground_truth(out, scene, white_e, snr)
     return out
 
 
@@ -58,8 +58,8 @@ def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
     return {node: relative(pose, reference) for node, pose in recorded.items()}
 
 
-def true_set(session: Path, truth: Path) -> LoadedSet:
-    """Return a session's dark-scene views with the lens, the poses, the response and the noise that they really had."""
+def true_set(session: Path, truth: Path) -> ElementalSet:
+    """Return a session's dark-scene views with their true lens, poses, response and noise."""
     loaded, free = nominal_session(session), load_set(truth / NOISE_FREE)
     poses = {view.node: view.rt_cam_ref for view in free.settings.view}
     views = [msgspec.structs.replace(view, rt_cam_ref=poses[view.node]) for view in loaded.settings.view]
@@ -78,49 +78,60 @@ def true_set(session: Path, truth: Path) -> LoadedSet:
     )
 
 
-def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method], compared: Method) -> dict[str, Any]:
-    """Return the contents of metrics.json: geometry, noise and planes against the truth."""
+def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method], compared: Method) -> Metrics:
+    """Return the errors of geometry, noise and planes against the truth.
+
+    Parameters
+    ----------
+    out, session, truth : Path
+        Folders of the demo, of its session, and of what `write_truth` wrote.
+    methods : sequence of Method
+        The methods by which the session was reconstructed.
+    compared : Method
+        The method by which it was also reconstructed with nominal and with true poses.
+    """
     depths = read_plan(session).rig.scene.depth_mm
     results = session / RECONSTRUCTIONS
     measured = {
-        (method, depth): folder_of_method(results, method, list(methods)) / f"{plane_name(depth)}.tiff"
+        (method, depth): folder_of_method(results, method, methods) / f"{plane_name(depth)}.tiff"
         for method in methods
         for depth in depths
     }
     metrics = assess(load_session(session), measured, truth)
     assert metrics is not None
+    errors = list(metrics.planes)
     for loaded in (nominal_session(session), true_set(session, truth)):
         planes = {(compared, depth): out / loaded.poses / f"{plane_name(depth)}.tiff" for depth in depths}
         assessed = assess(loaded, planes, truth)
         assert assessed is not None
-        metrics["planes"] += assessed["planes"]
-    return {"geometry": _geometry_errors(session), "noise": _noise_errors(session), **metrics}
+        errors += assessed.planes
+    geometry, noise = _geometry_errors(session), _noise_errors(session)
+    return msgspec.structs.replace(metrics, geometry=geometry, noise=noise, planes=errors)
 
 
-def _geometry_errors(session: Path) -> dict[str, Any]:
-    """Return by how much the measured camera centres, and directions, are off in the reference frame."""
+def _geometry_errors(session: Path) -> GeometryErrors:
+    """Return how far the measured camera centres and directions are off in the reference frame."""
     poses = true_poses(session)
     measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session).nodes}
     shared = sorted(measured.keys() & poses.keys())
     off_mm = np.array([_centre_mm(measured[node]) - _centre_mm(poses[node]) for node in shared])
     turned_rad = np.array([relative(measured[node], poses[node])[:3] for node in shared])
-    return {
-        "nodes": len(shared),
-        "centre_rms_mm": float(np.sqrt(np.mean(np.sum(np.square(off_mm), axis=1)))),
-        "centre_rms_axes_mm": np.sqrt(np.mean(np.square(off_mm), axis=0)).tolist(),
-        "rotation_rms_mdeg": float(1e3 * np.degrees(np.sqrt(np.mean(np.sum(np.square(turned_rad), axis=1))))),
-    }
+    x_mm, y_mm, z_mm = np.sqrt(np.mean(np.square(off_mm), axis=0)).tolist()
+    return GeometryErrors(
+        nodes=len(shared),
+        centre_rms_mm=float(np.sqrt(np.mean(np.sum(np.square(off_mm), axis=1)))),
+        centre_rms_axes_mm=(x_mm, y_mm, z_mm),
+        rotation_rms_mdeg=float(1e3 * np.degrees(np.sqrt(np.mean(np.sum(np.square(turned_rad), axis=1))))),
+    )
 
 
-def _noise_errors(session: Path) -> dict[str, Any]:
-    """Return what was measured of the sensor beside what is true."""
+def _noise_errors(session: Path) -> dict[str, KnownValue]:
+    """Return what was measured of the sensor, with the truth."""
     sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
-    measured = json.loads((session / NOISE_FILE).read_bytes())
+    noise = read_noise(session / NOISE_FILE)
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
-    return {
-        name: {"value": measured[name]["value"], "se": measured[name].get("se"), "truth": getattr(sensor, name)}
-        for name in names
-    }
+    measured: dict[str, Measured] = {name: getattr(noise, name) for name in names}
+    return {name: KnownValue(found.value, found.se, getattr(sensor, name)) for name, found in measured.items()}
 
 
 def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -129,5 +140,6 @@ def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _simulated(camera: object) -> SimulatedSettings:
+    """Return the settings of a camera that is known to be simulated."""
     assert isinstance(camera, SimulatedSettings)
     return camera

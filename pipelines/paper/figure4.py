@@ -1,11 +1,8 @@
 """Figure 4 of the paper: the error of the reconstruction against the SNR, for four objects."""
 
-import csv
-import io
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +11,7 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.paper.figure_methods import METHODS, FigureMethod
+from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
@@ -28,49 +26,26 @@ PAPERS_AXIS = (0.0, 0.12)
 
 _DEPTH_MM = 600.0
 
-# A plane goes beyond its object by this part of its width, where there is nothing to see.
-_MARGIN = 16
+# A plane extends beyond its object on each side by the object's width divided by this.
+_MARGIN_DIVISOR = 16
 
 _POSITION_SD_MM, _ROTATION_SD_RAD = 0.3, 3.5e-3
 
 
 @dataclass(frozen=True)
-class Error:
-    """One point of the figure, of one draw of the noise.
-
-    Attributes
-    ----------
-    mse : float
-        Against the back-projection of the views without noise, over the object, which is scaled to 0…1.
-    mse_texture : float
-        The same against the object itself.
-    weight : float, optional
-        The weight that was best for this object and SNR, where the method was given the best one.
-    """
-
-    object: str
-    snr: float
-    method: str
-    mse: float
-    seed: int
-    mse_texture: float
-    weight: float | None
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One object alone before the camera, and what it should give.
+class StagedObject:
+    """One object alone before the camera, and the planes that reconstructions are compared with.
 
     Attributes
     ----------
     light : float32 array (view, row, column)
-        Relative to that of a white object.
+        Light of the views, relative to that of a white object.
     region : bool array (row, column)
         Where the reference view shows the object.
     window : (slice, slice)
-        Rows and columns of the reference view that the plane's samples overlay: those about the object.
+        Rows and columns of the reference view that the plane's samples overlay: the object and a margin.
     bright, texture : float array (row, column)
-        The back-projection of `light`, and the object, at the plane's samples.
+        The back-projection of `light`, and the object itself, at the plane's samples.
     """
 
     name: str
@@ -85,8 +60,8 @@ class Stage:
     def exposures(self, seed: int) -> Iterator[tuple[float, ElementalImages, float]]:
         """Yield SNR, images, and the electrons of a white object, from the darkest exposure to the brightest.
 
-        Each exposure is the one before with more photons and the same read noise. Each has the statistics of an
-        exposure of its own; what differs from one to the next is their light alone, not their luck.
+        Each exposure is the previous one with more photons and the same read noise. By itself each has the statistics
+        of an independent exposure; from one to the next only the light differs.
         """
         sensor, exposure_s = self.experiment.sensor, self.experiment.exposure_s
         dark_e = sensor.dark_current_e_per_s * exposure_s
@@ -111,10 +86,10 @@ class Stage:
 
 # By method and SNR.
 type _Weights = dict[tuple[str, float], float | None]
-type _Case = tuple[Stage, _Weights, int, tuple[float, ElementalImages, float]]
+type _Case = tuple[StagedObject, _Weights, int, tuple[float, ElementalImages, float]]
 
 
-def measure(size_px: tuple[int, int], seeds: int) -> list[Error]:
+def measure_errors(size_px: tuple[int, int], seeds: int) -> list[ErrorPoint]:
     """Return the errors of all objects, SNRs, methods and draws of the noise.
 
     Parameters
@@ -134,7 +109,7 @@ def _exposures(
 ) -> Iterator[_Case]:
     """Yield every object at every SNR with every draw; an object's draws share the best weights."""
     for make in makers:
-        stage = staged(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
+        stage = stage_object(make(0.0, 0.0, _DEPTH_MM).grey(), size_px)
         weights: _Weights = {}
         for seed in range(1, seeds + 1):
             for exposure in stage.exposures(seed):
@@ -142,13 +117,13 @@ def _exposures(
 
 
 def _errors(
-    stage: Stage,
+    stage: StagedObject,
     weights: _Weights,
     seed: int,
     snr: float,
     images: ElementalImages,
     scale_e: float,
-) -> Iterator[Error]:
+) -> Iterator[ErrorPoint]:
     """Yield the errors of all methods on one exposure; best weights are those of the first draw, kept in `weights`."""
     for method in METHODS:
         if seed > (method.draws or seed):
@@ -158,10 +133,10 @@ def _errors(
         weight = weights[method.name, snr]
         given = () if weight is None else (weight,)
         mse, mse_texture = stage.errors(method.plane(stage.operator, images, *given), scale_e)
-        yield Error(stage.name, snr, method.name, mse, seed, mse_texture, weight)
+        yield ErrorPoint(stage.name, snr, method.name, mse, seed, mse_texture, weight)
 
 
-def _best_weight(stage: Stage, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
+def _best_weight(stage: StagedObject, method: FigureMethod, images: ElementalImages, scale_e: float) -> float | None:
     """Return the weight whose plane is nearest to the bright one, None for a method that finds its own."""
     tried = {
         weight: stage.errors(method.plane(stage.operator, images, weight), scale_e)[0] for weight in method.weights
@@ -169,7 +144,7 @@ def _best_weight(stage: Stage, method: FigureMethod, images: ElementalImages, sc
     return min(tried, key=tried.__getitem__) if tried else None
 
 
-def staged(shown: TexturedPlane, size_px: tuple[int, int]) -> Stage:
+def stage_object(shown: TexturedPlane, size_px: tuple[int, int]) -> StagedObject:
     """Render an object from all nodes, and without noise, and make the operator of its plane."""
     paper = paper_experiment(*size_px)
     experiment = SimulatedExperiment((shown,), paper.optics, paper.sensor)
@@ -187,13 +162,13 @@ def staged(shown: TexturedPlane, size_px: tuple[int, int]) -> Stage:
         flat=optics.relative_illumination(),
     )
     bright = back_projection(operator, ElementalImages(light))
-    return Stage(shown.name, experiment, operator, light, region, window, bright, ideal.light[window])
+    return StagedObject(shown.name, experiment, operator, light, region, window, bright, ideal.light[window])
 
 
 def _window(region: NDArray[np.bool_]) -> tuple[slice, slice]:
     """Return the rows and columns of a region with a margin: a plane of these costs a fraction of a whole one."""
     rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
-    margin = -(-len(columns) // _MARGIN)
+    margin = -(-len(columns) // _MARGIN_DIVISOR)
     first_row, first_column = max(rows[0] - margin, 0), max(columns[0] - margin, 0)
     return slice(first_row, rows[-1] + 1 + margin), slice(first_column, columns[-1] + 1 + margin)
 
@@ -208,55 +183,43 @@ def _grid(experiment: SimulatedExperiment, window: tuple[slice, slice]) -> Plane
     return PlaneGrid((bottom - top, right - left), pitch_mm, origin_mm)
 
 
-def curves(errors: Sequence[Error]) -> list[dict[str, Any]]:
+def mean_curves(errors: Sequence[ErrorPoint]) -> list[CurvePoint]:
     """Return the mean over the draws, and its standard error, for each object, method and SNR."""
-    groups: dict[tuple[str, str, float], list[Error]] = {}
+    groups: dict[tuple[str, str, float], list[ErrorPoint]] = {}
     for error in errors:
         groups.setdefault((error.object, error.method, error.snr), []).append(error)
-    return [
-        {
-            "object": name,
-            "method": method,
-            "snr": snr,
-            "draws": len(group),
-            "mse": float(np.mean([error.mse for error in group])),
-            "standard_error": float(np.std([e.mse for e in group], ddof=1) / np.sqrt(len(group)))
-            if len(group) > 1
-            else None,
-            "mse_texture": float(np.mean([error.mse_texture for error in group])),
-        }
-        for (name, method, snr), group in groups.items()
-    ]
+    return [_mean_point(group) for group in groups.values()]
 
 
-def is_monotone(points: Sequence[dict[str, Any]], method: str) -> bool:
+def _mean_point(draws: list[ErrorPoint]) -> CurvePoint:
+    """Return the mean of the draws at one point."""
+    first, mses = draws[0], [error.mse for error in draws]
+    return CurvePoint(
+        first.object,
+        first.method,
+        first.snr,
+        draws=len(draws),
+        mse=float(np.mean(mses)),
+        standard_error=float(np.std(mses, ddof=1) / np.sqrt(len(draws))) if len(draws) > 1 else None,
+        mse_texture=float(np.mean([error.mse_texture for error in draws])),
+    )
+
+
+def is_monotone(points: Sequence[CurvePoint], method: str) -> bool:
     """Return whether every object's mean error by a method falls from each SNR to the next."""
-    falls = True
-    for name in {point["object"] for point in points}:
-        curve = sorted((p["snr"], p["mse"]) for p in points if (p["object"], p["method"]) == (name, method))
-        falls &= all(after[1] < before[1] for before, after in pairwise(curve))
-    return falls
+    curves: dict[str, list[tuple[float, float]]] = {}
+    for point in points:
+        if point.method == method:
+            curves.setdefault(point.object, []).append((point.snr, point.mse))
+    return all(after[1] < before[1] for curve in curves.values() for before, after in pairwise(sorted(curve)))
 
 
-def over_best(points: Sequence[dict[str, Any]], method: str, best: str) -> dict[str, float]:
-    """Return for each object how many times its error with the best weight a method's is at most, of all SNRs."""
-    of = {(point["object"], point["method"], point["snr"]): float(point["mse"]) for point in points}
+def over_best(points: Sequence[CurvePoint], method: str, best: str) -> dict[str, float]:
+    """Return for each object the largest ratio, over all SNRs, of the error by `method` to that by `best`."""
+    mse = {(point.object, point.method, point.snr): point.mse for point in points}
     ratios: dict[str, float] = {}
-    for (name, of_method, snr), mse in of.items():
-        if of_method == method:
-            ratios[name] = max(ratios.get(name, 0.0), mse / of[name, best, snr])
+    for point in points:
+        if point.method == method:
+            ratio = point.mse / mse[point.object, best, point.snr]
+            ratios[point.object] = max(ratios.get(point.object, 0.0), ratio)
     return ratios
-
-
-def as_csv(rows: Sequence[dict[str, Any]]) -> str:
-    """Return rows of equal keys as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def as_rows(errors: Sequence[Error]) -> list[dict[str, Any]]:
-    """Return the errors as JSON-able rows."""
-    return [asdict(error) for error in errors]

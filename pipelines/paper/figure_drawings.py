@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, SNRS
 from faintfield.pipelines.paper.figure_methods import METHODS, OURS
+from faintfield.pipelines.paper.figure_records import CurvePoint
 
-# Colours that stay apart for colour-blind readers (Okabe and Ito), with marks and dashes that tell them without colour.
+# The colours of Okabe and Ito, which colour-blind readers can tell apart; marks and dashes tell curves without colour.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 _MARKS, _DASHES = "os^Dv<>", ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 _STYLE: Any = {
@@ -27,8 +28,8 @@ _STYLE: Any = {
 
 
 @dataclass(frozen=True)
-class Shown:
-    """A plane (row, column) in electrons with what its axes need."""
+class ShownPlane:
+    """A plane (row, column) in electrons, and its scale in mm."""
 
     pixels: NDArray[Any]
     depth_mm: float
@@ -36,7 +37,7 @@ class Shown:
     origin_mm: tuple[float, float]
 
 
-def draw_figure2(integral: NDArray[Any], planes: Sequence[Shown]) -> bytes:
+def draw_figure2(integral: NDArray[Any], planes: Sequence[ShownPlane]) -> bytes:
     """Return figure 2 as PNG: the bright integral image, and back-projections on one grey scale."""
     with rc_context(_STYLE):
         figure = Figure(figsize=(10.5, 3.1), layout="constrained")
@@ -49,7 +50,7 @@ def draw_figure2(integral: NDArray[Any], planes: Sequence[Shown]) -> bytes:
 
 
 def draw_figure3(
-    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[Shown]
+    dark: NDArray[Any], reference: NDArray[Any], scale_dn: tuple[float, float], snr: float, planes: Sequence[ShownPlane]
 ) -> bytes:
     """Return figure 3 as PNG: one dark view and the noise reference on one scale, and the planes on another."""
     with rc_context(_STYLE):
@@ -68,7 +69,7 @@ def draw_figure3(
         return _png(figure)
 
 
-def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[Shown], letters: str, what: str) -> None:
+def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[ShownPlane], letters: str, what: str) -> None:
     """Draw planes on one grey scale, with axes in millimetres."""
     white = max(float(np.quantile(plane.pixels, 0.998)) for plane in planes)
     for one, plane, letter in zip(axes, planes, letters, strict=True):
@@ -82,9 +83,9 @@ def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[Shown], 
     figure.colorbar(image, ax=list(axes), shrink=0.85, label="expected e⁻ per pixel")
 
 
-def draw_figure4(points: Sequence[dict[str, Any]]) -> bytes:
-    """Return figure 4 as PNG: as in the paper above, and below every method for each object."""
-    objects = list(dict.fromkeys(point["object"] for point in points))
+def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
+    """Return figure 4 as PNG: above, our method as in the paper; below, all methods for each object."""
+    objects = list(dict.fromkeys(point.object for point in points))
     with rc_context(_STYLE):
         figure = Figure(figsize=(10.5, 7.6), layout="constrained")
         above, below = np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))).flat
@@ -111,25 +112,27 @@ def draw_figure4(points: Sequence[dict[str, Any]]) -> bytes:
         return _png(figure)
 
 
-def _of(points: Sequence[dict[str, Any]], name: str, method: str) -> list[dict[str, Any]]:
-    """Return one curve's points in the order of SNR."""
-    chosen = [point for point in points if (point["object"], point["method"]) == (name, method)]
-    return sorted(chosen, key=lambda point: float(point["snr"]))
+def _of(points: Sequence[CurvePoint], name: str, method: str) -> list[CurvePoint]:
+    """Return the points of one curve in the order of SNR."""
+    chosen = [point for point in points if (point.object, point.method) == (name, method)]
+    return sorted(chosen, key=lambda point: point.snr)
 
 
 def _title(method: str) -> str:
+    """Return what a method is called on figures."""
     return next(known.title for known in METHODS if known.name == method)
 
 
-def _curve(axes: Axes, points: Sequence[dict[str, Any]], index: int, label: str) -> None:
+def _curve(axes: Axes, points: Sequence[CurvePoint], index: int, label: str) -> None:
     """Draw the means with twice their standard errors."""
     look: dict[str, Any] = {"color": _COLOURS[index % 7], "marker": _MARKS[index % 7], "linestyle": _DASHES[index % 7]}
-    bars = [2 * (point["standard_error"] or 0.0) for point in points]
-    snr, mse = [point["snr"] for point in points], [point["mse"] for point in points]
+    bars = [2 * (point.standard_error or 0.0) for point in points]
+    snr, mse = [point.snr for point in points], [point.mse for point in points]
     axes.errorbar(snr, mse, bars, label=label, markersize=4, linewidth=1.3, capsize=2, **look)
 
 
 def _name_axes(axes: Axes) -> None:
+    """Label the axes of a panel of curves."""
     axes.set_xlabel("SNR, eq. (4)")
     axes.set_ylabel("mean square error, object 0…1")
     axes.set_xticks(SNRS[::2] if axes.get_position().width < 0.3 else SNRS)
@@ -137,6 +140,7 @@ def _name_axes(axes: Axes) -> None:
 
 
 def _png(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": None})
     return content.getvalue()

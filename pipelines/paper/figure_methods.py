@@ -1,4 +1,4 @@
-"""The reconstructions that figure 4 compares, in one list; a further one is a further entry of `METHODS`."""
+"""The methods that figure 4 compares: to add one, add an entry to `METHODS`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -7,7 +7,9 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from faintfield.pipelines.reconstruction.planes import Method, Settings, solve
+from faintfield.pipelines.errors import MissingPackage
+from faintfield.pipelines.formats.results.records import Method
+from faintfield.pipelines.reconstruction.planes import Settings, solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
@@ -15,19 +17,20 @@ from faintfield.recon.solver.initialization import back_projection
 
 @dataclass(frozen=True)
 class FigureMethod:
-    """One way from dark views to a plane.
+    """A method that makes a plane from dark views.
 
     Attributes
     ----------
     name, title : str
-        In files, and on figures.
+        Names in files, and on figures.
     plane : callable
-        Of operator, images and, where the method has one, a weight; gives the plane (row, column) in electrons.
+        Takes the operator, the images and, if the method has one, a weight; returns the plane (row, column) in
+        electrons.
     weights : tuple of float
-        The weights that are tried where the best one is found from the true object, which no experiment can do; empty
-        where the method finds its own.
+        Weights to try if the method is given the best one, which is found from the true object: no experiment can do
+        that. Empty if the method finds its own weight.
     draws : int, optional
-        Only the first so many draws of the noise, for a method that is slow and far from the one it is compared with.
+        Number of draws of the noise, fewer for methods that are slow and far from the best.
     """
 
     name: str
@@ -43,18 +46,35 @@ def _solved(method: Method, operator: PlaneOperator, images: ElementalImages, we
 
 
 def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
-    """Return what a naive reading of eq. (2) gives: negative pixels clipped at zero, read noise not modelled."""
+    """Return the plane by a naive reading of eq. (2): negative pixels clipped at zero, read noise not modelled."""
     floor = np.maximum(images.electrons, 0)
     return _solved("pmlem-osl", operator, replace(images, electrons=floor, read_variance_e2=0.0))
 
 
-def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
-    """Return the back-projection, denoised by total variation (Chambolle 2004, as scikit-image has it)."""
-    from skimage.restoration import denoise_tv_chambolle  # loading it takes a second
+def tv_denoiser() -> Callable[..., Image]:
+    """Return scikit-image's denoising by total variation (Chambolle 2004).
 
+    Raises
+    ------
+    MissingPackage
+        scikit-image is not installed.
+    """
+    try:
+        from skimage.restoration import denoise_tv_chambolle  # slow to load
+    except ImportError as failure:
+        raise MissingPackage(
+            "scikit-image is not installed, and figure 4 needs it to compare with; it is an extra: "
+            "pip install 'faintfield[figures]'"
+        ) from failure
+    denoiser: Callable[..., Image] = denoise_tv_chambolle
+    return denoiser
+
+
+def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
+    """Return the back-projection, denoised by total variation."""
     plane = back_projection(operator, images)
-    # Its usual tolerance stops it anywhere, and weights could not be compared
-    return np.asarray(denoise_tv_chambolle(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
+    # At the default tolerance it stops too early to compare weights
+    return np.asarray(tv_denoiser()(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
 
 
 def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
@@ -64,15 +84,16 @@ def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: flo
     return np.asarray(bm3d.bm3d(back_projection(operator, images), sigma_psd=weight), np.float32)
 
 
-# The reconstruction that stands for the paper's, and the same with a weight that only the truth can tell.
+# The method that stands for the paper's, and the same with the best weight, which only the truth can tell.
 OURS: Method = "pmlem"
 BEST = "pmlem-best"
 
+# Weights to try: β for PMLEM, electrons for the denoisers.
 _PMLEM_WEIGHTS = tuple(np.geomspace(1.0, 3.2, 6).tolist())
 _TV_WEIGHTS_E = tuple(np.geomspace(0.1, 1.6, 12).tolist())
 _BM3D_WEIGHTS_E = tuple(np.geomspace(0.4, 1.2, 5).tolist())
 
-# What stands first is drawn as the reference that the others have to beat.
+# The first is the reference for the others.
 METHODS = (
     FigureMethod("backprojection", "back-projection", back_projection),
     FigureMethod("tv", "back-projection + TV denoising, best weight", _tv_denoised, _TV_WEIGHTS_E),

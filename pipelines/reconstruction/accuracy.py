@@ -1,4 +1,4 @@
-"""How right the planes of a simulated set are: their errors against what the simulator knows."""
+"""The errors of the planes of a simulated set, against the truth that the simulator knows."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,36 +8,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, load_set
+from faintfield.pipelines.formats.results.records import Method, Metrics, PhotonsRecord, PlaneErrors, Poses, SnrRecord
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.ground_truth import Truth, read_truth, texture_and_region, true_plane
 from faintfield.pipelines.reconstruction.brightness import brightness
-from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.grids import plane_grid
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
-from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.metrics import mean_square_error, peak_snr_db
 from faintfield.recon.solver.initialization import back_projection
 
-METRICS_FILE = "metrics.json"
-
 
 def assess(
-    loaded: LoadedSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
-) -> dict[str, Any] | None:
-    """Return the contents of metrics.json, None for a set without ground truth or without planes at its objects.
+    loaded: ElementalSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
+) -> Metrics | None:
+    """Return the errors of planes; None for a set without ground truth, or without planes at its objects.
 
-    Three mean square errors per plane and method, the object scaled to 0…1. Over the region where the object is
-    visible: `mse_bright` against the back-projection of the noise-free set (what more light would have shown), and
-    `mse_texture` against the object's true texture (which also counts the blur of other objects there). Over the whole
-    plane: `mse_plane` against the texture, which is zero beside the object, where most of that blur lies.
+    Each plane of each method has three mean square errors, with the object scaled to 0…1:
+
+    - `mse_bright`, over the region where the object is visible, against the back-projection of the noise-free set
+      (what more light would have shown);
+    - `mse_texture`, over the same region, against the true texture of the object (which also counts the blur of
+      other objects there);
+    - `mse_plane`, over the whole plane, against the texture, which is zero beside the object, where most of that
+      blur is.
 
     Parameters
     ----------
-    loaded : LoadedSet
+    loaded : ElementalSet
         The set that was reconstructed.
     planes : mapping of (method, depth in mm) to Path
-        The planes' files.
+        Files of the planes.
     truth_in : Path, optional
-        The folder of the truth; the set's own when None.
+        Folder of the truth; the set's own if None.
     """
     folder = truth_in or loaded.folder
     truth = read_truth(folder)
@@ -51,47 +55,42 @@ def assess(
         for (method, depth), path in planes.items()
         if depth in depths
     ]
-    figures = brightness(loaded, folder / OBJECT_REGION)
-    return {
-        "planes": [row for row in rows if row is not None],
-        "snr": {"asked": truth.snr, "measured": figures.snr},
-        "photons_per_px": {
-            "linear": truth.photons_linear,
-            "from_moments": truth.photons_from_moments,
-            "on_object": truth.photons_on_object,
-        },
-    }
+    return Metrics(
+        planes=[row for row in rows if row is not None],
+        snr=SnrRecord(truth.snr, brightness(loaded, folder / OBJECT_REGION).snr),
+        photons_per_px=PhotonsRecord(truth.photons_linear, truth.photons_from_moments, truth.photons_on_object),
+    )
 
 
 def _errors(
-    folder: Path, poses: str, truth: Truth, method: str, depth: float, plane: NDArray[Any], bright: NDArray[Any]
-) -> dict[str, Any] | None:
-    """Return the errors of one plane, None where its samples are not those of the truth."""
+    folder: Path, poses: Poses, truth: Truth, method: Method, depth: float, plane: NDArray[Any], bright: NDArray[Any]
+) -> PlaneErrors | None:
+    """Return the errors of one plane, None if its samples are not those of the truth."""
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)
     if plane.shape != texture.shape:
         return None
     error = mean_square_error(plane, bright, region)
-    return {
-        "depth_mm": depth,
-        "method": method,
-        "poses": truth.poses if poses == "stated" else poses,
-        "object": at_depth.name,
-        "mse_bright": error,
-        "mse_texture": mean_square_error(plane, texture, region),
-        "mse_plane": mean_square_error(plane, texture),
-        "psnr_db": peak_snr_db(error),
-    }
+    return PlaneErrors(
+        depth_mm=depth,
+        method=method,
+        poses=truth.poses if poses == "stated" else poses,
+        object=at_depth.name,
+        mse_bright=error,
+        mse_texture=mean_square_error(plane, texture, region),
+        mse_plane=mean_square_error(plane, texture),
+        psnr_db=peak_snr_db(error),
+    )
 
 
-def _back_projections(noise_free: LoadedSet, depths: list[float]) -> dict[float, NDArray[np.floating]]:
+def _back_projections(noise_free: ElementalSet, depths: list[float]) -> dict[float, NDArray[np.floating]]:
     """Return the back-projection of the noise-free set at each depth, (row, column[, colour])."""
     colours: dict[float, list[NDArray[np.floating]]] = {depth: [] for depth in depths}
     for layout in channel_layouts(noise_free):
         images = load_channel(noise_free, layout)
         factory = OperatorFactory(noise_free, layout, images)
         for depth in depths:
-            operator = factory.at_depth(depth, plane_grid(noise_free, depth))
+            operator = factory.at(depth, plane_grid(noise_free, depth))
             colours[depth].append(back_projection(operator, images))
     return {depth: parts[0] if len(parts) == 1 else np.dstack(parts) for depth, parts in colours.items()}

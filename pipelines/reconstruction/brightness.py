@@ -1,91 +1,58 @@
 """How dark a set is: its SNR and photons per pixel, by the paper's formulas and by counting."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
+from faintfield.pipelines.formats.results.records import Brightness
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.object_region import Region, object_region
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 
 
-@dataclass(frozen=True)
-class Brightness:
-    """The SNR and photon figures of a set's reference view.
-
-    Attributes
-    ----------
-    region : str
-        "object region" where the set brings one, "object region of the bright view" where it brings that, else
-        "whole view".
-    noise_from : str
-        "noise reference" image where the set brings one, else "noise model".
-    snr : float, optional
-        Eq. (4), a ratio of powers; None where the noise model states no read noise to compare with.
-    electrons_linear : float, optional
-        Electrons per pixel that eq. (7) reads from it, by the paper's way; None where the SNR is not positive.
-    electrons_from_moments : float, optional
-        Electrons per pixel of a uniform object that has this SNR.
-    mean_signal_e : float
-        Mean electrons per pixel above the dark level.
-    photons_linear, photons_from_moments : float, optional
-        The same in photons; None where the quantum efficiency is not known.
-    """
-
-    region: str
-    noise_from: str
-    snr: float | None
-    electrons_linear: float | None
-    electrons_from_moments: float | None
-    mean_signal_e: float
-    photons_linear: float | None = None
-    photons_from_moments: float | None = None
+def brightness(loaded: ElementalSet, region_path: Path | None = None) -> Brightness:
+    """Measure the reference view of a set, all colours together; over the set's own object region by default."""
+    region, name = object_region(loaded, region_path)
+    return brightness_within(loaded, region, name)
 
 
-def brightness(loaded: LoadedSet, region_path: Path | None = None) -> Brightness:
-    """Measure the reference view of a set, in all its colours together; over the set's own object region by default."""
-    region, words = object_region(loaded, region_path)
-    return brightness_within(loaded, region, words)
-
-
-def brightness_within(loaded: LoadedSet, region: Region | None, words: str) -> Brightness:
-    """Measure the reference view over a region (row, column), all of it where that is None; `words` name the region."""
+def brightness_within(loaded: ElementalSet, region: Region | None, name: str) -> Brightness:
+    """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
     has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
     signal, reference = [], []
     for layout in channel_layouts(loaded):
         images = view_electrons(loaded, layout, loaded.frame_paths(loaded.reference_view))
-        nothing = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
+        no_light = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
         for index, lattice in enumerate(layout.lattices):
             where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
             signal.append(images[index][0][where])
             if has_reference:
-                reference.append(nothing[index][0].ravel())
+                reference.append(no_light[index][0].ravel())
             else:
                 noise = lattice_noise(loaded, lattice, None)
                 dark_e = loaded.background_e(noise)
                 power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
                 reference.append(np.sqrt(power).ravel())
-    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), words, has_reference)
+    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), name, has_reference)
 
 
 def _figures(
-    loaded: LoadedSet,
+    loaded: ElementalSet,
     signal_e: NDArray[np.floating],
     reference_e: NDArray[np.floating],
     region: str,
     has_reference: bool,
 ) -> Brightness:
-    """Apply the formulas."""
+    """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
     noise = loaded.noise
     read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
     snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
     dark_e = float(np.mean(loaded.background_e(noise)))
     linear_e = moments_e = None
     if snr and snr > 0:
-        # A detector that makes an electron of every photon counts electrons
+        # With a quantum efficiency of 1 the formulas for photons give electrons
         counting = {"quantum_efficiency": 1.0, "read_noise_e": read_noise_e}
         linear_e, moments_e = (
             photons_from_linear_snr(snr, **counting),

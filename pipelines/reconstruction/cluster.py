@@ -1,4 +1,4 @@
-"""Tasks of a sweep on dask.distributed: on processes of this machine, or on whatever a scheduler has."""
+"""Tasks of a sweep on dask.distributed: in processes of this machine, or by the workers of a scheduler."""
 
 import logging
 import pickle
@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
-from faintfield.pipelines.formats.files import UNFINISHED, reported_as_cannot_write
+from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
 from faintfield.pipelines.formats.large_arrays import mapped
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
-from faintfield.pipelines.reconstruction.sweep import Channel, Crew, PlaneTask, one_by_one
+from faintfield.pipelines.reconstruction.sweep import Channel, PlaneTask, Runner, run_serially
 from faintfield.recon.likelihood.images import ElementalImages, Image
 
 _LOST = "run the same command again, and only what is missing is done; the logs of the workers say more"
 
 
-def crew_of(workers: int | None, scheduler: str | None) -> Crew:
-    """Return who does the tasks: this process, `workers` processes of one thread, or the workers of a scheduler.
+def make_runner(workers: int | None, scheduler: str | None) -> Runner:
+    """Return what runs the tasks: this process, `workers` processes of one thread, or the workers of a scheduler.
 
     Raises
     ------
@@ -36,22 +36,22 @@ def crew_of(workers: int | None, scheduler: str | None) -> Crew:
         dask.distributed is not installed.
     """
     if workers is None and scheduler is None:
-        return one_by_one
+        return run_serially
     if workers is not None and scheduler is not None:
         raise WrongUsage("--workers starts processes here, --scheduler names one that has its own; give one of them")
     _distributed()
 
-    def crew(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+    def run(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         if not tasks:
             return
         with _client(workers, scheduler) as client, _shared_folder(out) as shared:
             yield from _as_done(client, loaded, shared, tasks)
 
-    return crew
+    return run
 
 
 def _distributed() -> Any:
-    """Return dask.distributed, which nothing else needs."""
+    """Return dask.distributed, an optional package that only this module needs."""
     try:
         import distributed
     except ImportError as failure:
@@ -64,7 +64,7 @@ def _distributed() -> Any:
 
 @contextmanager
 def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """Connect to the workers, having started those of this machine."""
+    """Connect to the workers; start them if they are those of this machine."""
     distributed = _distributed()
     if scheduler is None:
         options = {"dashboard_address": "127.0.0.1:0", "memory_limit": 0, "silence_logs": logging.CRITICAL}
@@ -87,8 +87,8 @@ def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
 
 @contextmanager
 def _shared_folder(out: Path) -> Iterator[Path]:
-    """Make a folder in `out` for what the workers read, and remove it in the end."""
-    with reported_as_cannot_write(out):
+    """Make a folder in `out` for what the workers read, and remove it at the end."""
+    with translated_write_errors(out):
         out.mkdir(parents=True, exist_ok=True)
         folder = tempfile.TemporaryDirectory(
             prefix=".shared.", suffix=UNFINISHED, dir=out.resolve(), ignore_cleanup_errors=True
@@ -98,9 +98,9 @@ def _shared_folder(out: Path) -> Iterator[Path]:
 
 
 def _as_done(
-    client: Any, loaded: LoadedSet, shared: Path, tasks: Sequence[PlaneTask]
+    client: Any, loaded: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]
 ) -> Generator[tuple[PlaneTask, list[str]]]:
-    """Hand out the tasks, and yield each when it is done; those of a worker that dies are done by another."""
+    """Submit the tasks and yield each when it is done; those of a worker that dies go to another."""
     distributed = _distributed()
     channels: dict[str, Path] = {}
     pending: dict[Any, PlaneTask] = {}
@@ -114,9 +114,9 @@ def _as_done(
             )
             pending[client.submit(_do, channels[name], elsewhere, pure=False)] = task
         for future in distributed.as_completed(list(pending)):
-            words = future.result()
-            future.release()  # or what a worker has done would be done again when it dies
-            yield pending.pop(future), words
+            messages = future.result()
+            future.release()  # otherwise it would be computed again if its worker died
+            yield pending.pop(future), messages
     except distributed.KilledWorker as failure:
         raise ClusterFailed(f"{failure.allowed_failures + 1} workers died of the same plane; {_LOST}") from failure
     except FileNotFoundError as failure:
@@ -133,9 +133,9 @@ def _as_done(
 
 @dataclass(frozen=True)
 class _SharedChannel:
-    """A colour of a set as workers get it: the pixels by the files they are in, and what is small."""
+    """A colour of a set as workers get it: paths of the files with its pixels, and small values."""
 
-    loaded: LoadedSet
+    loaded: ElementalSet
     layout: ChannelLayout
     shape: tuple[int, ...]
     electrons: Path
@@ -144,7 +144,7 @@ class _SharedChannel:
     read_variance_e2: float | Image
 
     def opened(self) -> Channel:
-        """Return the colour, its pixels read by memory map."""
+        """Return the colour, with its pixels memory-mapped."""
         images = ElementalImages(
             np.asarray(np.memmap(self.electrons, np.float32, "r", shape=self.shape)),
             self.background_e,
@@ -154,14 +154,14 @@ class _SharedChannel:
         return Channel(self.loaded, self.layout, images)
 
 
-def _share(loaded: LoadedSet, layout: ChannelLayout, shared: Path) -> Path:
-    """Read a colour into files, and return the one that leads to them."""
+def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> Path:
+    """Read a colour into files, and return the path of the pickled `_SharedChannel` that names them."""
 
     def path_of(dtype: DTypeLike) -> Path:
         return shared / f"{layout.name}.{np.dtype(dtype).name}"
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        with reported_as_cannot_write(shared.parent), path_of(dtype).open("wb+") as file:
+        with translated_write_errors(shared.parent), path_of(dtype).open("wb+") as file:
             return mapped(file, shape, dtype)
 
     images = load_channel(loaded, layout, allocate)
@@ -181,7 +181,7 @@ def _share(loaded: LoadedSet, layout: ChannelLayout, shared: Path) -> Path:
 
 @lru_cache(maxsize=1)
 def _opened(path: Path) -> Channel:
-    """Return the colour that a file of `_share` leads to; a worker keeps the last."""
+    """Return the colour of a file of `_share`; a worker keeps the last one."""
     shared: _SharedChannel = pickle.loads(path.read_bytes())
     return shared.opened()
 

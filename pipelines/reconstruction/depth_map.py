@@ -1,12 +1,13 @@
-"""The depth map of a sweep, how sure it is, and the picture that is sharp everywhere: computed, written, recorded."""
+"""The depth map of a sweep, its confidence, and the all-in-focus picture: computed, written, recorded."""
 
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,36 +17,42 @@ from faintfield.pipelines.formats.files import remove, sha256, write_json, write
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
 from faintfield.pipelines.formats.large_arrays import memory_or_file
-from faintfield.pipelines.formats.results.plane_files import vouched_for
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
-from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
-from faintfield.pipelines.reconstruction.planes import Method
+from faintfield.pipelines.formats.results.plane_files import Origin, read_current
+from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.grids import plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.best_focus import SURE
 
-LEAST_DEPTHS = 5
+# Fewer depths leave nothing to interpolate between.
+MIN_DEPTHS = 5
 
-# Bins are no larger than leave so many across the detector.
-_LEAST_ACROSS = 8
+# Fewest bins across the detector: limits the size of a bin.
+_MIN_BINS_ACROSS = 8
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
-DEPTH_MAP_FILE = "depth_map.json"
 
+# Hatching of unknown depths in the preview: two levels of grey (0 to 1), and their period.
 _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
+# Widths in inches of the preview and of the map in it, and the height of what is not the map.
+_PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
-def require_sweep(depths: Sequence[float]) -> None:
+
+def check_sweep(depths: Sequence[float]) -> None:
     """Refuse a depth map from too few depths (WrongUsage)."""
-    if len(depths) < LEAST_DEPTHS:
+    if len(depths) < MIN_DEPTHS:
         raise WrongUsage(
-            f"--depth-map compares depths, and {len(depths)} are given; give at least {LEAST_DEPTHS}, by --sweep-mm "
+            f"--depth-map compares depths, and {len(depths)} are given; give at least {MIN_DEPTHS}, by --sweep-mm "
             "or --sweep-px"
         )
 
 
 @dataclass(frozen=True)
 class Compared:
-    """How the views agree at each depth, all colours together.
+    """The agreement of the views at each depth, all colours together.
 
     Attributes
     ----------
@@ -54,7 +61,7 @@ class Compared:
     depths_mm : sequence of float
         The depths.
     bins_px : int
-        So many detector pixels across have been added up.
+        Width of the bins in which pixels were added up, in detector pixels.
     """
 
     planes: list[Agreement]
@@ -67,12 +74,11 @@ class Compared:
 
 
 def compared_depths(
-    loaded: LoadedSet, depths_mm: Sequence[float], out: Path, *, least_bins_px: int = 1, bins_px: int | None = None
+    loaded: ElementalSet, depths_mm: Sequence[float], out: Path, *, min_bins_px: int = 1, bins_px: int | None = None
 ) -> Compared:
-    """Compare the views at each depth; one colour's images are in memory at a time, or in a file in `out`.
+    """Compare the views at each depth; the images of one colour at a time are in memory, or in a file in `out`.
 
-    Pixels are added up in bins of `bins_px`; without, in bins of at least `least_bins_px`, more where the light asks
-    for it.
+    Pixels are added up in bins of `bins_px`; by default in bins of at least `min_bins_px`, larger ones in low light.
     """
     planes: list[Agreement] = []
     bins = 0
@@ -84,132 +90,164 @@ def compared_depths(
         elif not bins:
             middle_mm = sorted(depths_mm)[len(depths_mm) // 2]
             needed = bins_for(
-                OperatorFactory(loaded, layout, images).at_depth(middle_mm, plane_grid(loaded, middle_mm)), images
+                OperatorFactory(loaded, layout, images).at(middle_mm, plane_grid(loaded, middle_mm)), images
             )
-            bins = min(max(needed, -(-least_bins_px // step)), min(layout.lattices[0].shape) // _LEAST_ACROSS)
+            bins = min(max(needed, -(-min_bins_px // step)), min(layout.lattices[0].shape) // _MIN_BINS_ACROSS)
         images = images.binned(bins)
         factory = OperatorFactory(loaded, layout, images, bins=bins)
         found = [
-            agreement(factory.at_depth(depth, plane_grid(loaded, depth).binned(bins * step)), images)
+            agreement(factory.at(depth, plane_grid(loaded, depth).binned(bins * step)), images)
             for depth in progress(depths_mm, f"comparing views, {layout.name}")
         ]
-        planes = [_both(*pair) for pair in zip(planes, found, strict=True)] if planes else found
+        planes = [_sum(*pair) for pair in zip(planes, found, strict=True)] if planes else found
     return Compared(planes, depths_mm, bins * step)
 
 
-def _both(one: Agreement, other: Agreement) -> Agreement:
-    """Return what two colours say together."""
+def _sum(one: Agreement, other: Agreement) -> Agreement:
+    """Return the agreement of two colours together."""
     return Agreement(*(a + b for a, b in zip(one, other, strict=True)))
 
 
+@dataclass(frozen=True)
+class _Map:
+    """A depth map on the samples of the planes.
+
+    Attributes
+    ----------
+    unit : str
+        "mm" of depth, or "px" of disparity.
+    scale : list of float
+        Depth or disparity of each plane.
+    index : float array (row, column)
+        Between which planes each sample is sharp.
+    values, confidence : float array (row, column)
+        In the unit, NaN where not known; and the probability that this is right.
+    """
+
+    unit: Literal["mm", "px"]
+    scale: list[float]
+    index: NDArray[np.float64]
+    values: NDArray[np.float64]
+    confidence: NDArray[np.float64]
+
+    @property
+    def name(self) -> str:
+        """Name of the file of the values, without suffix."""
+        return "depth_mm" if self.unit == "mm" else "disparity_px"
+
+    def record(self, bins_px: int) -> DepthMapRecord:
+        """Return what reconstruction.json records of the map."""
+        known = np.isfinite(self.values)
+        return DepthMapRecord(
+            file=f"{self.name}.tiff",
+            confidence=f"{CONFIDENCE}.tiff",
+            all_in_focus=f"{ALL_IN_FOCUS}.tiff",
+            unit=self.unit,
+            bins_px=bins_px,
+            sure_above=SURE,
+            sure_share=float(known.mean()),
+            median=float(np.median(self.values[known])) if known.any() else None,
+        )
+
+
 def write_depth_map(
-    loaded: LoadedSet,
+    loaded: ElementalSet,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
-    origins: Mapping[Method, dict[str, Any]],
+    origins: Mapping[Method, Origin],
     out: Path,
-) -> dict[str, Any]:
-    """Write the maps and the picture into each folder of planes, and return what reconstruction.json says of them.
+) -> DepthMapRecord:
+    """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
 
     Parameters
     ----------
-    loaded : LoadedSet
+    loaded : ElementalSet
         The set.
     planes : mapping of (method, depth in mm) to Path
-        The planes' files; each method has a folder.
+        Files of the planes; each method has a folder.
     disparities_px : mapping of depth in mm to px
-        Of every depth, where disparities were asked for: the map then is in px.
-    origins : mapping of Method to dict
-        What each method's planes are made of: maps that were made of the same stay.
+        Disparity of every depth if disparities were asked for: the map then is in px.
+    origins : mapping of Method to Provenance
+        Provenance of each method's planes: maps with the same are kept.
     out : Path
-        Where a file may lie that holds the images while memory is short.
+        Folder of a temporary file for the images if memory is short.
     """
     folders = {method: path.parent for (method, _), path in planes.items()}
-    there = [_finished(folder, origins[method]) for method, folder in folders.items()]
-    if there and there[0] is not None and all(there):
-        return there[0]
+    kept = [
+        read_current(folder / DEPTH_MAP_FILE, DepthMapFileRecord, origins[method]) for method, folder in folders.items()
+    ]
+    if kept and kept[0] is not None and all(kept):
+        return kept[0].depth_map
     depths = sorted({depth for _, depth in planes})
     compared = compared_depths(loaded, depths, out)
-    found, bins = compared.depth_map(), compared.bins_px
-    scale = [disparities_px[depth] if disparities_px else depth for depth in depths]
-    unit, name = ("px", "disparity_px") if disparities_px else ("mm", "depth_mm")
-    shape = plane_grid(loaded, depths[0]).shape
-    index, confidence = (_enlarged(part, shape, bins) for part in (found.index, found.confidence))
-    values = np.interp(index, np.arange(len(depths)), scale)
-    values[confidence < SURE] = np.nan
-    known = np.isfinite(values)
-    record = {
-        "file": f"{name}.tiff",
-        "confidence": f"{CONFIDENCE}.tiff",
-        "all_in_focus": f"{ALL_IN_FOCUS}.tiff",
-        "unit": unit,
-        "bins_px": bins,
-        "sure_above": SURE,
-        "sure_share": float(known.mean()),
-        "median": float(np.median(values[known])) if known.any() else None,
-    }
+    found = _map_of(loaded, compared, disparities_px)
+    record = found.record(compared.bins_px)
     for method, folder in folders.items():
         remove(folder / DEPTH_MAP_FILE)
-        _write(folder, name, unit, values, confidence, scale)
-        sharp = _all_in_focus([planes[method, depth] for depth in depths], index)
-        write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
-        write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
-        files = [f"{stem}.{suffix}" for stem in (name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
-        hashes = {file: sha256(folder / file) for file in files}
-        write_json(folder / DEPTH_MAP_FILE, {"format": 1, "depth_map": record, "sha256": hashes, **origins[method]})
+        sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
+        hashes = _write_maps(folder, found, sharp)
+        vouching = DepthMapFileRecord(1, record, hashes, **msgspec.structs.asdict(origins[method]))
+        write_json(folder / DEPTH_MAP_FILE, vouching)
     return record
 
 
-def _finished(folder: Path, origin: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what is known of maps that are there, None unless they are whole and made of what they have to be."""
-    content = vouched_for(folder / DEPTH_MAP_FILE, origin)
-    return None if content is None else content["depth_map"]
+def _map_of(loaded: ElementalSet, compared: Compared, disparities_px: Mapping[float, float]) -> _Map:
+    """Return the depth map of compared depths on the samples of the planes, in px if there are disparities."""
+    depths = compared.depths_mm
+    scale = [disparities_px[depth] if disparities_px else depth for depth in depths]
+    found = compared.depth_map()
+    shape = plane_grid(loaded, depths[0]).shape
+    index, confidence = (_enlarged(part, shape, compared.bins_px) for part in (found.index, found.confidence))
+    values = np.interp(index, np.arange(len(depths)), scale)
+    values[confidence < SURE] = np.nan
+    return _Map("px" if disparities_px else "mm", scale, index, values, confidence)
 
 
-def _write(
-    folder: Path,
-    name: str,
-    unit: str,
-    values: NDArray[np.floating],
-    confidence: NDArray[np.floating],
-    scale: Sequence[float],
-) -> None:
-    """Write both maps with their previews."""
-    words = "disparity (px)" if unit == "px" else "depth (mm)"
-    write_plane(folder / f"{name}.tiff", values, 1.0)
-    write_plane(folder / f"{CONFIDENCE}.tiff", confidence, 1.0)
-    write_whole(folder / f"{name}.png", _picture(values, words, min(scale), max(scale)))
-    write_whole(folder / f"{CONFIDENCE}.png", _picture(confidence, "probability of the depth", 0.0, 1.0))
+def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
+    """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
+    label = "disparity (px)" if found.unit == "px" else "depth (mm)"
+    write_plane(folder / f"{found.name}.tiff", found.values, 1.0)
+    write_plane(folder / f"{CONFIDENCE}.tiff", found.confidence, 1.0)
+    write_whole(folder / f"{found.name}.png", _picture(found.values, label, min(found.scale), max(found.scale)))
+    write_whole(folder / f"{CONFIDENCE}.png", _picture(found.confidence, "probability of the depth", 0.0, 1.0))
+    write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
+    write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
+    files = [f"{stem}.{suffix}" for stem in (found.name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
+    return {file: sha256(folder / file) for file in files}
 
 
-def _picture(values: NDArray[np.floating], words: str, low: float, high: float) -> bytes:
-    """Return a map as PNG, in colours with its scale; where it is not known it is hatched grey."""
+def _picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:
+    """Return a map as PNG in colours, with a colour bar; unknown values are hatched grey."""
     from matplotlib.figure import Figure  # loading it costs most of a second
 
     rows, columns = np.indices(values.shape)
     hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
-    figure = Figure(figsize=(8.6, 0.6 + 7.2 * values.shape[0] / values.shape[1]), layout="constrained")
+    figure = Figure(
+        figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]),
+        layout="constrained",
+    )
     axes = figure.subplots()
     axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
     axes.set_axis_off()
-    figure.colorbar(shown, label=words)
+    figure.colorbar(shown, label=label)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
     return content.getvalue()
 
 
 def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> NDArray[np.float64]:
-    """Return a map of bins on the samples of the planes; what is left at the far edges takes its neighbours' values."""
+    """Return a map of bins on the samples of the planes; samples beyond the last bin repeat its value."""
     whole = np.kron(part, np.ones((bins, bins), part.dtype))[: shape[0], : shape[1]]
     missing = [(0, size - known) for size, known in zip(shape, whole.shape, strict=True)]
     return np.asarray(np.pad(whole, missing, "edge"), np.float64)
 
 
 def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return of each sample what the two planes around its depth say, (row, column[, colour]), one plane in memory.
+    """Return each sample (row, column[, colour]) interpolated between the two planes around its depth.
 
-    Samples are those of the farthest plane, which has the most where all planes have one pitch.
+    The samples are those of the farthest plane, which has the most if all planes have the same pitch. One plane at a
+    time is in memory.
     """
     sharp: NDArray[np.float32] | None = None
     for number, path in reversed(list(enumerate(paths))):

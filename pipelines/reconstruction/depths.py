@@ -1,4 +1,4 @@
-"""The planes that are asked for: depths one by one, in sweeps, by disparity, or to be found."""
+"""Depths as the options state them: one by one, in sweeps, or by disparity."""
 
 import re
 
@@ -6,18 +6,18 @@ import numpy as np
 
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.plane_files import plane_name
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
-from faintfield.pipelines.reconstruction.channels import require_in_front
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.grids import check_in_front
 
-# More are a slip of the hand: files of so many planes would fill any disk.
-_MOST_PLANES = 10_000
+# Largest sweep: more planes are a typing error, and would fill any disk.
+_MAX_PLANES = 10_000
 
 
 def distinct_depths(depths: list[float]) -> list[float]:
-    """Return each depth once; two that would share a file name but differ are refused, and what is no depth."""
+    """Return each depth once; refuse those behind the camera, and two different ones that would share a file name."""
     by_name: dict[str, float] = {}
     for depth in depths:
-        require_in_front(depth)
+        check_in_front(depth)
         other = by_name.setdefault(plane_name(depth), depth)
         if other != depth:
             raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
@@ -37,17 +37,17 @@ def swept_disparities(sweep_px: str) -> list[float]:
     return _swept("--sweep-px", sweep_px, "-3.5:0.8:40")
 
 
-def depths_by_disparity(loaded: LoadedSet, disparities_px: list[float]) -> dict[float, float]:
-    """Return each disparity by the depth that has it."""
+def depths_by_disparity(loaded: ElementalSet, disparities_px: list[float]) -> dict[float, float]:
+    """Return a mapping from depth in mm to disparity in px."""
     return {loaded.depth_of_disparity(disparity): disparity for disparity in disparities_px}
 
 
 def _swept(option: str, given: str, example: str) -> list[float]:
-    """Return COUNT numbers in equal steps."""
+    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
     parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", given)
     if parts is None:
         raise WrongUsage(f"{option} {given}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
     first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if first == last or not 2 <= count <= _MOST_PLANES:
-        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and 2 to {_MOST_PLANES} planes")
+    if first == last or not 2 <= count <= _MAX_PLANES:
+        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
     return [round(float(value), 6) for value in np.linspace(first, last, count)]

@@ -1,22 +1,24 @@
-"""All planes of a scene together, in one channel: g = Σ_z H_z f_z + b, or with what nearer ones hide of farther."""
+"""All planes of a scene together, in one colour: g = Σ_z H_z f_z + b, optionally with nearer planes hiding others."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import Any
+
+from msgspec import structs
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MemoryShort
 from faintfield.pipelines.formats.large_arrays import available_bytes
 from faintfield.pipelines.formats.plane_poses import Place, depth_of
-from faintfield.pipelines.reconstruction.channels import OperatorFactory
-from faintfield.pipelines.reconstruction.planes import Method, Objective, Settings, Solution, certified, mean_e
+from faintfield.pipelines.formats.results.records import Method, SolveRecord
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.planes import Objective, Settings, Solution, mean_e, solve_pmlem
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity, transmission
 from faintfield.recon.solver.problem import SceneProblem
 
-# What is computed of each pixel of each view for all planes together: what it sees, of ones and of light, and ratios.
+# Arrays as large as the images that a fit of all planes needs: forward images of ones and of light, and ratios.
 _ARRAYS_OF_IMAGES = 5
 
 
@@ -27,33 +29,32 @@ def solve_together(
     methods: Collection[Method],
     settings: Settings,
 ) -> dict[Method, dict[Place, Solution]]:
-    """Reconstruct all planes of one channel together, so that none has to explain the light of the others.
+    """Reconstruct all planes of one colour together, so that no plane has to explain the light of the others.
 
     Parameters
     ----------
     grids : mapping of Place to PlaneGrid
         The samples of each plane.
     methods : collection of Method
-        "joint", "occlusion" or both: by the latter planes hide those behind them, where that explains the images
-        better.
+        "joint", "occlusion" or both; with the latter planes hide those behind them if that explains the images better.
 
     Returns
     -------
     dict of Method to dict of Place to Solution
-        By method and plane. All records tell of one iteration: its penalty weight, passes, objective and certificate.
+        All records are of one iteration: its penalty weight, passes, objective and certificate.
     """
-    _require_memory(images, len(grids) if "occlusion" in methods else 0)
+    _check_memory(images, len(grids) if "occlusion" in methods else 0)
     operator = factory.of_scene(grids)
     objective = Objective.of(SceneProblem(operator, images), settings)
-    joint = certified(objective, settings)
+    joint = solve_pmlem(objective, settings)
     found: dict[Method, list[Solution]] = {"joint": joint}
     if "occlusion" in methods:
         found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings)
     return {method: dict(zip(grids, found[method], strict=True)) for method in methods}
 
 
-def _require_memory(images: ElementalImages, masks: int) -> None:
-    """Refuse what memory has no room for: arrays as large as the images, and with occlusion one per plane."""
+def _check_memory(images: ElementalImages, masks: int) -> None:
+    """Refuse to begin without memory for the arrays as large as the images, with occlusion one more per plane."""
     needed, free = (_ARRAYS_OF_IMAGES + masks) * images.electrons.nbytes, available_bytes()
     if needed > free:
         raise MemoryShort(
@@ -69,36 +70,46 @@ def _with_occlusion(
     joint: list[Solution],
     settings: Settings,
 ) -> list[Solution]:
-    """Find opacity from the planes, and the light once more behind it, with the penalty weight found without.
+    """Estimate opacity from the planes, then reconstruct the light again behind it with the same penalty weight.
 
-    Likelihood and penalty stay, too, so that the least of either objective tells which explains the images better.
-    What is written of each plane is `α f`: where a plane lets through what is behind it, it is not there, and has no
-    light of its own. The certificate is that of f.
+    Likelihood and penalty stay the same, too, so that the lower of both objectives explains the images better.
+    The plane written is `α f`: where a plane is transparent it has no light of its own. The certificate is that of f.
     """
-    chosen = {key: joint[0].record[key] for key in ("penalty_weight_chosen", "penalty_weight_curve", "passes_before")}
-    settings = replace(settings, penalty_weight=joint[0].record["penalty_weight"])
+    first = joint[0].record
+    settings = replace(settings, penalty_weight=first.penalty_weight)
     opacities = [opacity(one.plane) for one in joint]
     hidden = transmission(objective.posed.operator, opacities, [depth_of(place) for place in grids])
     try:
         occluded = factory.of_scene(grids, hidden)
     except GeometryMismatch:
         return _without_occlusion(joint, "a plane would be hidden from all views")
-    better = certified(replace(objective, posed=replace(objective.posed, operator=occluded)), settings)
-    if better[0].record["objective"] >= joint[0].record["objective"]:
+    better = solve_pmlem(replace(objective, posed=replace(objective.posed, operator=occluded)), settings)
+    objectives = better[0].record.objective, first.objective
+    assert objectives[0] is not None
+    assert objectives[1] is not None
+    if objectives[0] >= objectives[1]:
         return _without_occlusion(joint, "it explains the images no better")
-    return [_of_what_is_there(one, chosen) for one in better]
+    return [_of_opaque_part(one, first) for one in better]
 
 
-def _of_what_is_there(one: Solution, record: dict[str, Any]) -> Solution:
-    """Return a plane as `α f`, with α beside it."""
+def _of_opaque_part(one: Solution, first: SolveRecord) -> Solution:
+    """Return a plane as `α f` with α beside it, its weight recorded as chosen in the first run."""
     alpha = opacity(one.plane)
     plane = alpha * one.plane
-    return Solution(
-        plane, one.record | record | {"mean_e": mean_e(plane), "occlusion": True}, one.beside | {"opacity": alpha}
+    record = structs.replace(
+        one.record,
+        penalty_weight_chosen=first.penalty_weight_chosen,
+        penalty_weight_curve=first.penalty_weight_curve,
+        passes_before=first.passes_before,
+        mean_e=mean_e(plane),
+        occlusion=True,
     )
+    return Solution(plane, record, one.sidecars | {"opacity": alpha})
 
 
-def _without_occlusion(joint: list[Solution], why: str) -> list[Solution]:
-    """Return the planes as they are, and say so."""
-    inform(f"occlusion is left out: {why}; the planes are those of joint")
-    return [replace(one, record=one.record | {"occlusion": False, "occlusion_left_out": why}) for one in joint]
+def _without_occlusion(joint: list[Solution], reason: str) -> list[Solution]:
+    """Return the planes unchanged, and inform the user."""
+    inform(f"occlusion is left out: {reason}; the planes are those of joint")
+    return [
+        replace(one, record=structs.replace(one.record, occlusion=False, occlusion_left_out=reason)) for one in joint
+    ]

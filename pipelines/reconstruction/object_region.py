@@ -1,4 +1,4 @@
-"""Where the objects are in the reference view: as a set states it, or segmented on a view in plenty of light."""
+"""The object region of the reference view: as a set states it, or segmented on a view in plenty of light."""
 
 from pathlib import Path
 
@@ -7,23 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
-# Beside a set's images, where it is known: the object region of the reference view.
+# Mask of the objects in the reference view, beside a set's images if it is known.
 OBJECT_REGION = "object_region.png"
 
 type Region = NDArray[np.bool_]
 
 
-def object_region(loaded: LoadedSet, path: Path | None = None) -> tuple[Region | None, str]:
-    """Return the object region (row, column) of the reference view, None where nobody knows it, and its words.
+def object_region(loaded: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
+    """Return the object region (row, column) of the reference view, None if it is not known, and its name.
 
     Parameters
     ----------
-    loaded : LoadedSet
+    loaded : ElementalSet
         The set.
     path : Path, optional
-        A mask to take instead of the set's own.
+        Mask to use instead of the set's own.
     """
     path = path or loaded.folder / OBJECT_REGION
     if path.is_file():
@@ -33,10 +33,10 @@ def object_region(loaded: LoadedSet, path: Path | None = None) -> tuple[Region |
     return (None, "whole view") if region is None else (region, "object region of the bright view")
 
 
-def bright_electrons(loaded: LoadedSet) -> NDArray[np.float32] | None:
-    """Return the reference view in plenty of light (row, column), above the dark; None where there is none.
+def bright_electrons(loaded: ElementalSet) -> NDArray[np.float32] | None:
+    """Return the electrons of the reference view in plenty of light (row, column), above dark; None if there is none.
 
-    Of a colour camera it is the mean of the colours about each pixel: where an object is, and no more.
+    A colour camera gives the mean of the colours around each pixel, enough to tell where objects are.
     """
     if loaded.bright_view is None:
         return None
@@ -49,10 +49,10 @@ def bright_electrons(loaded: LoadedSet) -> NDArray[np.float32] | None:
 
 
 def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
-    """Return where there is an object (row, column): above Li's threshold; None where all is of one brightness.
+    """Return the object region (row, column): above Li's threshold; None if the brightness is uniform.
 
-    Li's threshold minimises the cross entropy of an image and its two levels, which counts a difference relative to the
-    brightness as counts of photons ask for. Otsu's, which counts its square, leaves the darker parts of objects out.
+    Li's threshold minimises the cross entropy between an image and its two levels, which weights a difference relative
+    to the brightness, as suits photon counts. Otsu's weights its square, and misses the darker parts of objects.
     """
     from skimage.filters import threshold_li  # loading it takes a while
 

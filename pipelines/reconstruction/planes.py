@@ -1,11 +1,12 @@
-"""One plane of one channel: run a method on it, watch it, and say how it went."""
+"""One colour of one plane: run a method on it and record how it went."""
 
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from msgspec import structs
 
+from faintfield.pipelines.formats.results.records import Certificate, Method, PenaltyRecord, SolveRecord, WeightScore
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
 from faintfield.recon.likelihood.selection import select_likelihood
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -29,25 +30,27 @@ from faintfield.recon.solver.problem import SceneProblem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import standard_deviation
 
-type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
+# Largest number of passes over the data. MLEM is stopped early on purpose: further passes fit the noise.
+_MAX_PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
 
-# Methods that find all planes together, by `pipelines.reconstruction.joint`.
-TOGETHER: tuple[Method, ...] = ("joint", "occlusion")
-
-# Passes over the data that are made at most. MLEM is stopped early on purpose: carried on, it fits the noise.
-_PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
-
-# An iteration whose plane changes by less than this per pass has settled.
+# A one-step-late iteration has settled when a pass changes the plane by less than this, relative to the plane.
 _SETTLED = 1e-3
 
-# PMLEM is carried on until its plane is this close to the optimum, in root mean square relative to the plane.
+# PMLEM stops when its plane is this close to the optimum: root mean square, relative to the plane.
 _TOLERANCE = 0.01
 
-# Standard deviations are estimated by draws, the same every time.
+# Seed of the draws by which standard deviations are estimated: the same result every time.
 _SEED = 1
 
 # ε of eq. (3) relative to the square of the image's scale; the paper asks for less than 1 %.
 _EPSILON_OF_SCALE = 0.005
+
+# What bounds the distance to the optimum, in words, by method.
+_PMLEM_CERTIFICATE = (
+    "bound on the relative distance to the optimum, from its optimality conditions in the metric of the data; "
+    "see docs/physics.md"
+)
+_ONE_STEP_LATE_CERTIFICATE = "relative change of the last pass; one-step-late iterations prove no optimum"
 
 
 @dataclass(frozen=True)
@@ -57,15 +60,15 @@ class Settings:
     Attributes
     ----------
     penalty_weight : float, optional
-        β; chosen from the data when None: by held-out views for PMLEM, from the noise level for one-step-late.
+        β; chosen from the data if None: by held-out views for PMLEM, from the noise level for one-step-late.
     passes : int, optional
-        At most this many passes over the data; the method's own limit when None.
+        Largest number of passes over the data; the method's own limit if None.
     likelihood : str
-        How pixels are judged; "auto" chooses by their read noise.
+        Model of the pixels; "auto" chooses by their read noise.
     penalty : str
-        What PMLEM holds against a plane; one-step-late knows the smoothed total variation of eq. (3) only.
+        Penalty of PMLEM; one-step-late always takes the smoothed total variation of eq. (3).
     uncertainty : bool
-        Whether the standard deviation of PMLEM's planes is asked for.
+        Estimate the standard deviation of the samples of PMLEM's planes.
     """
 
     penalty_weight: float | None = None
@@ -77,25 +80,25 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """A plane of one channel.
+    """One colour of a plane.
 
     Attributes
     ----------
     plane : float array (row, column)
         In expected electrons.
-    record : dict
-        How it came about.
-    beside : dict of str to float array (row, column)
+    record : SolveRecord
+        How it was solved.
+    sidecars : dict of str to float array (row, column)
         What else is known of each sample: `sigma`, its standard deviation in electrons; `opacity`, 0 to 1.
     """
 
     plane: Image
-    record: dict[str, Any]
-    beside: dict[str, Image] = field(default_factory=dict)
+    record: SolveRecord
+    sidecars: dict[str, Image] = field(default_factory=dict)
 
 
 def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:
-    """Reconstruct one plane of one channel.
+    """Reconstruct one plane of one colour.
 
     Raises
     ------
@@ -104,28 +107,32 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
     """
     if method == "backprojection":
         plane = back_projection(operator, images)
-        return Solution(plane, _record(plane, None, "none: a mean of the views", 1))
+        chosen = "none: a mean of the views"
+        return Solution(
+            plane, SolveRecord(penalty_weight=None, penalty_weight_chosen=chosen, passes=1, mean_e=mean_e(plane))
+        )
     if method == "pmlem":
-        return certified(Objective.of(SceneProblem(operator, images), settings), settings)[0]
+        return solve_pmlem(Objective.of(SceneProblem(operator, images), settings), settings)[0]
     start = smooth_start(operator, images)
-    images = replace(images, likelihood=select_likelihood(images, settings.likelihood, _level_e(operator, start)))
-    return _one_step_late(operator, images, start, method, settings)
+    level_e = float(start[well_seen_samples(operator.sensitivity())].mean(dtype=np.float64))
+    images = replace(images, likelihood=select_likelihood(images, settings.likelihood, level_e))
+    return _solve_one_step_late(operator, images, start, method, settings)
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What PMLEM minimises, but for the penalty's weight.
+    """What PMLEM minimises, except for the penalty's weight.
 
     Attributes
     ----------
     posed : SceneProblem
-        The operator, and the images with the likelihood they are judged by.
+        The operator, and the images with their likelihood.
     penalty : Penalty
-        What is held against planes.
+        Penalty of a plane.
     start : float array
         Where to begin.
     level_e : float
-        Mean light of what the views see.
+        Mean light of the samples that the views see, in electrons.
     """
 
     posed: SceneProblem
@@ -135,7 +142,7 @@ class Objective:
 
     @classmethod
     def of(cls, posed: SceneProblem, settings: Settings) -> "Objective":
-        """Choose likelihood and penalty as asked for, by the level of light and noise."""
+        """Choose likelihood and penalty according to the settings, the light and the noise."""
         start = posed.start()
         level_e = posed.level_e(start)
         likelihood = select_likelihood(posed.images, settings.likelihood, level_e)
@@ -147,10 +154,10 @@ class Objective:
         return cls(posed, Penalty.for_noise(settings.penalty, noise_e), start, level_e)
 
 
-def certified(objective: Objective, settings: Settings) -> list[Solution]:
-    """Run PMLEM to its certificate, and return the planes; the record of each is that of the one iteration."""
+def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
+    """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
     posed, penalty, level_e = objective.posed, objective.penalty, objective.level_e
-    choice = _chosen(posed, objective.start, penalty, settings)
+    choice = _choose_weight(posed, objective.start, penalty, settings)
     iterates = pmlem(
         posed.fit(level_e),
         choice.start,
@@ -159,59 +166,64 @@ def certified(objective: Objective, settings: Settings) -> list[Solution]:
         tolerance=_TOLERANCE,
         dual=choice.dual,
     )
-    limit = settings.passes or _PASSES["pmlem"]
-    for done, iterate in enumerate(iterates, 1):
-        if iterate.certificate.distance <= _TOLERANCE or max(done, iterate.passes) >= limit:
+    limit = settings.passes or _MAX_PASSES["pmlem"]
+    for count, iterate in enumerate(iterates, 1):
+        if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= limit:
             break
-    record = _record(iterate.plane, choice.weight, choice.how, iterate.passes, None, iterate.objective)
-    record |= {
-        "passes_before": 1 + choice.passes,
-        "penalty_weight_curve": choice.curve,
-        "penalty": asdict(penalty),
-        "likelihood": posed.images.likelihood.name,
-        "certificate": _certificate(iterate),
-    }
+    record = SolveRecord(
+        penalty_weight=choice.weight,
+        penalty_weight_chosen=choice.chosen,
+        passes=iterate.passes,
+        objective=iterate.objective,
+        certificate=_certificate(iterate),
+        mean_e=mean_e(iterate.plane),
+        passes_before=1 + choice.passes,
+        penalty_weight_curve=choice.curve,
+        penalty=PenaltyRecord(penalty.name, penalty.smoothing_e),
+        likelihood=posed.images.likelihood.name,
+    )
     planes = posed.planes_of(iterate.plane)
-    beside: list[dict[str, Image]] = [{} for _ in planes]
-    if settings.uncertainty:
-        generator = np.random.default_rng(_SEED)
-        for known, plane, metric in zip(beside, planes, posed.metrics(level_e, iterate.plane), strict=True):
-            known["sigma"] = standard_deviation(plane, metric, choice.weight, penalty, generator)
-    return [
-        Solution(plane, record | {"mean_e": mean_e(plane)}, known) for plane, known in zip(planes, beside, strict=True)
+    solutions = [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
+    if not settings.uncertainty:
+        return solutions
+    generator = np.random.default_rng(_SEED)
+    metrics = posed.metrics(level_e, iterate.plane)
+    sigmas = [
+        standard_deviation(p, metric, choice.weight, penalty, generator)
+        for p, metric in zip(planes, metrics, strict=True)
     ]
+    return [replace(one, sidecars={"sigma": sigma}) for one, sigma in zip(solutions, sigmas, strict=True)]
 
 
-def _certificate(iterate: PmlemIterate) -> dict[str, Any]:
-    """Return what reconstruction.json says of the distance to the optimum."""
+def _certificate(iterate: PmlemIterate) -> Certificate:
+    """Return the distance of an iterate to the optimum."""
     certificate = iterate.certificate
-    return {
-        "kind": "bound on the relative distance to the optimum, from its optimality conditions in the metric of the "
-        "data; see docs/physics.md",
-        "value": float(certificate.distance),
-        "stationarity": float(certificate.stationarity),
-        "slack": float(certificate.slack),
-        "tolerance": _TOLERANCE,
-        "reached": bool(certificate.distance <= _TOLERANCE),
-        "passes": iterate.passes,
-        "inner_steps": iterate.inner_steps,
-    }
+    return Certificate(
+        kind=_PMLEM_CERTIFICATE,
+        value=float(certificate.distance),
+        stationarity=float(certificate.stationarity),
+        slack=float(certificate.slack),
+        tolerance=_TOLERANCE,
+        reached=bool(certificate.distance <= _TOLERANCE),
+        passes=iterate.passes,
+        inner_steps=iterate.inner_steps,
+    )
 
 
 @dataclass(frozen=True)
 class _Choice:
-    """A penalty weight, how it was found, and where a reconstruction with it may start."""
+    """A penalty weight, how it was chosen, and where a reconstruction with it may start."""
 
     weight: float
-    how: str
+    chosen: str
     start: Image
     dual: DualField
     passes: float = 0.0
-    curve: list[dict[str, float]] | None = None
+    curve: list[WeightScore] | None = None
 
 
-def _chosen(posed: SceneProblem, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
-    """Return the penalty weight for PMLEM."""
+def _choose_weight(posed: SceneProblem, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
+    """Return the penalty weight for PMLEM: as given, or else by cross-validation."""
     if settings.penalty == "none":
         return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
@@ -220,44 +232,45 @@ def _chosen(posed: SceneProblem, start: Image, penalty: Penalty, settings: Setti
     if len(posed.views) < MIN_VIEWS:
         return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
     found = cross_validated_weight(posed, guess, penalty)
-    curve = [{"weight": tried.weight, "held_out": tried.loss} for tried in found.candidates]
+    curve = [WeightScore(tried.weight, tried.loss) for tried in found.candidates]
     nearest = np.maximum(found.solution.plane, 1e-3 * start)
     return _Choice(found.weight, "predicts held-out views best", nearest, found.solution.dual, found.passes, curve)
 
 
-def _level_e(operator: PlaneOperator, start: Image) -> float:
-    """Return the mean light of what the views see."""
-    return float(start[well_seen_samples(operator.sensitivity())].mean(dtype=np.float64))
-
-
-def _one_step_late(
+def _solve_one_step_late(
     operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, settings: Settings
 ) -> Solution:
     """Run MLEM or one-step-late PMLEM as published."""
     epsilon = _EPSILON_OF_SCALE * float(np.quantile(start, 0.99)) ** 2
-    weight, chosen = _penalty_weight(operator, images, start, method, settings)
+    weight, chosen = _one_step_late_weight(operator, images, start, method, settings)
     steps: list[IterationStep] = []
-    limit = settings.passes or _PASSES[method]
+    limit = settings.passes or _MAX_PASSES[method]
     for iterate in pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon):
         steps.append(iterate.step)
         if len(steps) >= limit or settled(steps, _SETTLED):
             break
     plane = iterate.plane
-    objective = operator.negative_log_likelihood(plane, images) + weight * total_variation(plane, epsilon)
-    record = _record(plane, weight, chosen, len(steps), epsilon, objective)
-    record["likelihood"] = images.likelihood.name
-    record["certificate"] = {
-        "kind": "relative change of the last pass; one-step-late iterations prove no optimum",
-        "relative_change": steps[-1].relative_change,
-        "settled": settled(steps, _SETTLED),
-        "oscillates": oscillates(steps, _SETTLED),
-        "kept_at_start": int(np.count_nonzero(~updated_samples(operator.sensitivity(), weight))),
-    }
+    record = SolveRecord(
+        penalty_weight=weight,
+        penalty_weight_chosen=chosen,
+        epsilon_e2=epsilon,
+        passes=len(steps),
+        objective=operator.negative_log_likelihood(plane, images) + weight * total_variation(plane, epsilon),
+        certificate=Certificate(
+            kind=_ONE_STEP_LATE_CERTIFICATE,
+            relative_change=steps[-1].relative_change,
+            settled=settled(steps, _SETTLED),
+            oscillates=oscillates(steps, _SETTLED),
+            kept_at_start=int(np.count_nonzero(~updated_samples(operator.sensitivity(), weight))),
+        ),
+        mean_e=mean_e(plane),
+        likelihood=images.likelihood.name,
+    )
     return Solution(plane, record)
 
 
-def _penalty_weight(
-    operator: PlaneOperator, images: ElementalImages, start: NDArray[np.floating], method: Method, settings: Settings
+def _one_step_late_weight(
+    operator: PlaneOperator, images: ElementalImages, start: Image, method: Method, settings: Settings
 ) -> tuple[float, str]:
     """Return β and how it was chosen."""
     if method == "mlem":
@@ -265,26 +278,6 @@ def _penalty_weight(
     if settings.penalty_weight is not None:
         return settings.penalty_weight, "given"
     return universal_penalty_weight(operator, images, start), "from the noise level"
-
-
-def _record(
-    plane: NDArray[np.floating],
-    weight: float | None,
-    chosen: str,
-    passes: int,
-    epsilon: float | None = None,
-    objective: float | None = None,
-) -> dict[str, Any]:
-    """Return what reconstruction.json says of a plane's making, whatever the method."""
-    return {
-        "penalty_weight": weight,
-        "penalty_weight_chosen": chosen,
-        "epsilon_e2": epsilon,
-        "passes": passes,
-        "objective": objective,
-        "certificate": None,
-        "mean_e": mean_e(plane),
-    }
 
 
 def mean_e(plane: Image) -> float:

@@ -1,22 +1,31 @@
-"""Planes of all colours, depths and methods: the tasks they fall into, each done once, wherever it is done."""
+"""Planes of all colours, depths and methods: the tasks they consist of, each done once, in whatever process."""
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from msgspec import UNSET, structs
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.formats.large_arrays import memory_or_file
-from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, words_of
-from faintfield.pipelines.formats.results.plane_files import PlaneFiles
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, OperatorFactory, channel_layouts, load_channel
+from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of, words_of
+from faintfield.pipelines.formats.results.plane_files import Origin, PlaneFiles
+from faintfield.pipelines.formats.results.records import (
+    JOINT_METHODS,
+    FocusCurve,
+    FocusPoint,
+    Method,
+    PlaneFileRecord,
+    PlaneRecord,
+)
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.joint import solve_together
-from faintfield.pipelines.reconstruction.planes import TOGETHER, Method, Settings, Solution, solve
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.planes import Settings, Solution, solve
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
@@ -26,9 +35,9 @@ from faintfield.recon.operator.plane_operator import PlaneOperator
 
 @dataclass(frozen=True)
 class PlaneTask:
-    """One colour of one plane, by the methods by which it is not there yet: paths and options, no pixels.
+    """One colour of one plane by the methods that still lack it; holds paths and options, no pixels.
 
-    By methods that find all planes together, one colour of all planes.
+    For methods that reconstruct all planes together: one colour of all planes.
 
     Attributes
     ----------
@@ -39,9 +48,9 @@ class PlaneTask:
     files : tuple of PlaneFiles
         Where the result of each method and plane goes.
     settings : Settings
-        Of the methods.
+        Settings of the methods.
     with_focus : bool
-        Whether the power of detail is wanted, too.
+        Measure the power of detail, too.
     """
 
     layout: ChannelLayout
@@ -52,38 +61,38 @@ class PlaneTask:
 
 
 class Channel:
-    """One colour of a set, read: what all of its tasks share."""
+    """One colour of a set in memory: what all of its tasks share."""
 
-    def __init__(self, loaded: LoadedSet, layout: ChannelLayout, images: ElementalImages) -> None:
+    def __init__(self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
         self._loaded = loaded
         self._images = images
         self._phases = len(layout.lattices)
         self._factory = OperatorFactory(loaded, layout, images)
 
     def do(self, task: PlaneTask) -> list[str]:
-        """Reconstruct what a task asks for, save it, and return what there is to say of it.
+        """Reconstruct and save what a task asks for, and return messages for the user.
 
         Raises
         ------
         GeometryMismatch, NotConverged
             Of the task's depth, or method.
         """
-        words: list[str] = []
-        focus: dict[Place, dict[str, Any] | None] = dict.fromkeys(task.grids)
+        messages: list[str] = []
+        focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
             operator = self._operator(place, grid)
-            words += self._blind_views(operator, place)
+            messages += self._blind_views(operator, place)
             if task.with_focus:
-                focus[place] = focus_measure(operator, self._images, self._halves())._asdict()
+                focus[place] = FocusPoint(*focus_measure(operator, self._images, self._halves()))
             for files in task.files:
-                if files.method not in TOGETHER and files.place == place:
+                if files.method not in JOINT_METHODS and files.place == place:
                     self._save(task, files, solve(operator, self._images, files.method, task.settings), focus[place])
-        together = [method for method in TOGETHER if any(files.method == method for files in task.files)]
-        solved = solve_together(self._factory, self._images, task.grids, together, task.settings) if together else {}
+        joint = [method for method in JOINT_METHODS if any(files.method == method for files in task.files)]
+        solved = solve_together(self._factory, self._images, task.grids, joint, task.settings) if joint else {}
         for files in task.files:
-            if files.method in together:
+            if files.method in joint:
                 self._save(task, files, solved[files.method][files.place], focus[files.place])
-        return words
+        return messages
 
     def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         try:
@@ -91,37 +100,39 @@ class Channel:
         except GeometryMismatch as failure:
             raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
 
-    def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: dict[str, Any] | None) -> None:
-        """Save one plane of this colour with its entry."""
-        grid = task.grids[files.place]
-        record = {
-            **_where(files.place),
-            "method": files.method,
-            "channel": task.layout.name,
-            "file": files.path.name,
-            **asdict(grid),
-            **solution.record,
-            "flux_e": float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(files.place, grid),
-        }
-        arrays = {"plane": solution.plane, **solution.beside}
-        files.save_part(task.layout.name, arrays, {"record": record, "focus": focus})
+    def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
+        """Save one plane of this colour with its record."""
+        place, grid = files.place, task.grids[files.place]
+        tilted = place if isinstance(place, TiltedPlane) else None
+        record = PlaneRecord(
+            name=tilted.name if tilted else UNSET,
+            depth_mm=depth_of(place),
+            rt_ref_plane=tilted.rt_ref_plane if tilted else UNSET,
+            method=files.method,
+            channel=task.layout.name,
+            file=files.path.name,
+            shape=grid.shape,
+            pitch_mm=grid.pitch_mm,
+            origin_mm=grid.origin_mm,
+            **structs.asdict(solution.record),
+            flux_e=float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(place, grid),
+        )
+        files.save_part(task.layout.name, {"plane": solution.plane, **solution.sidecars}, record, focus)
 
     def _samples_per_px(self, place: Place, grid: PlaneGrid) -> float:
-        """Return how many pixels of the reference view a sample takes, on the axis."""
-        depth_mm, foreshortened = (
-            (place.depth_mm, abs(place.normal[2])) if isinstance(place, TiltedPlane) else (place, 1.0)
-        )
-        return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_mm) ** 2 * foreshortened)
+        """Return how many pixels of the reference view a sample covers, on the axis."""
+        cosine = abs(place.normal[2]) if isinstance(place, TiltedPlane) else 1.0
+        return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)) ** 2 * cosine)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the views of either colour of a checkerboard of nodes; of either parity where nodes are not stated."""
+        """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
         views = self._loaded.settings.view
         odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
         odd = np.repeat(odd, self._phases)
         return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
 
     def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
-        """Return words on views that see nothing of a plane: a pose may be wrong."""
+        """Return a message on views that see nothing of a plane: a pose may be wrong."""
         blind = {int(view) // self._phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
         if not blind:
             return []
@@ -131,16 +142,16 @@ class Channel:
         ]
 
 
-# Who does the tasks of a set and a folder, in any order; yields each when it is saved, with what there is to say of it.
-type Crew = Callable[[LoadedSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]
+# Does the tasks of a set in any order, with a folder for temporary files; yields each when saved, with its messages.
+type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]
 
 
-def one_by_one(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
-    """Do tasks in this process, by all its threads, one colour at a time; it is in a file where memory is short."""
+def run_serially(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+    """Do tasks in this process with all its threads, one colour at a time, from a file if memory is short."""
     layout: ChannelLayout | None = None
     for task in tasks:
         if task.layout is not layout:
-            channel = None  # the channel before goes before the next is read
+            channel = None  # frees the previous channel before the next is read
             channel = Channel(loaded, task.layout, load_channel(loaded, task.layout, memory_or_file(out)))
             layout = task.layout
         assert channel is not None
@@ -148,30 +159,30 @@ def one_by_one(loaded: LoadedSet, out: Path, tasks: Sequence[PlaneTask]) -> Gene
 
 
 class Sweep:
-    """The planes of one call: those that are not there yet are made, and written as soon as all their colours are.
+    """The planes of one call: those missing are made, and each is written as soon as all its colours are there.
 
     Parameters
     ----------
-    loaded : LoadedSet
+    loaded : ElementalSet
         The set.
     grids : dict of Place to PlaneGrid
         The samples of each plane.
     files : sequence of PlaneFiles
-        Of each method and plane.
-    origins : dict of Method to dict
+        One per method and plane.
+    origins : dict of Method to Provenance
         The provenance of all planes of a method together.
     settings : Settings
-        Of the methods.
+        Settings of the methods.
     with_focus : bool
-        Whether a curve of focus against depth is wanted.
+        Make a curve of focus against depth.
     """
 
     def __init__(
         self,
-        loaded: LoadedSet,
+        loaded: ElementalSet,
         grids: dict[Place, PlaneGrid],
         files: Sequence[PlaneFiles],
-        origins: dict[Method, dict[str, Any]],
+        origins: dict[Method, Origin],
         settings: Settings,
         *,
         with_focus: bool,
@@ -183,7 +194,7 @@ class Sweep:
         self.origins = origins
         self._settings = settings
         self._with_focus = with_focus
-        self._finished: dict[tuple[Method, Place], dict[str, Any]] = {}
+        self._finished: dict[tuple[Method, Place], PlaneFileRecord] = {}
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
@@ -191,37 +202,37 @@ class Sweep:
         files = len(self.origins) * (2 if self._settings.uncertainty else 1) + ("occlusion" in self.origins)
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
-    def run(self, crew: Crew, out: Path) -> None:
-        """Have the tasks done that are not, and finish each plane at once."""
+    def run(self, runner: Runner, out: Path) -> None:
+        """Run the missing tasks, and write each plane at once."""
         for files in self._files:
             if record := files.finished():
                 self._finished[files.method, files.place] = record
         if self._finished:
             inform(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
         tasks = self._tasks()
-        self._finish_whole(self._files)
-        with closing(crew(self._loaded, out, tasks)) as done:
-            for task, words in progress(done, "reconstructing planes", len(tasks)):
-                for line in words:
-                    inform(line)
-                self._finish_whole(task.files)
+        self._write_complete(self._files)
+        with closing(runner(self._loaded, out, tasks)) as done:
+            for task, messages in progress(done, "reconstructing planes", len(tasks)):
+                for message in messages:
+                    inform(message)
+                self._write_complete(task.files)
 
     def _tasks(self) -> list[PlaneTask]:
-        """Return what is to be done, one channel after the other."""
+        """Return the missing tasks, one channel after the other."""
         wanted = [files for files in self._files if (files.method, files.place) not in self._finished]
         missing = [files.missing() for files in wanted]
         tasks = []
         for layout in self._layouts:
             left = [files for files, channels in zip(wanted, missing, strict=True) if layout.name in channels]
-            alone = [files for files in left if files.method not in TOGETHER]
+            single = [files for files in left if files.method not in JOINT_METHODS]
             for place, grid in self._grids.items():
-                of_plane = tuple(files for files in alone if files.place == place)
+                of_plane = tuple(files for files in single if files.place == place)
                 tasks.append(PlaneTask(layout, {place: grid}, of_plane, self._settings, self._with_focus))
-            together = tuple(files for files in left if files.method in TOGETHER)
-            tasks.append(PlaneTask(layout, self._grids, together, self._settings, self._with_focus))
+            joint = tuple(files for files in left if files.method in JOINT_METHODS)
+            tasks.append(PlaneTask(layout, self._grids, joint, self._settings, self._with_focus))
         return [task for task in tasks if task.files]
 
-    def _finish_whole(self, candidates: Sequence[PlaneFiles]) -> None:
+    def _write_complete(self, candidates: Sequence[PlaneFiles]) -> None:
         """Write the planes whose colours are complete."""
         for files in candidates:
             key = (files.method, files.place)
@@ -229,11 +240,11 @@ class Sweep:
                 self._finished[key] = files.finish(self._grids[files.place].pitch_mm)
 
     @property
-    def records(self) -> list[dict[str, Any]]:
-        """The entries of reconstruction.json: by channel, plane, method."""
+    def records(self) -> list[PlaneRecord]:
+        """The records of all planes: by channel, plane, method."""
         methods = list(dict.fromkeys(files.method for files in self._files))
         return [
-            self._finished[method, place]["planes"][index]
+            self._finished[method, place].planes[index]
             for index in range(len(self._layouts))
             for place in self._grids
             for method in methods
@@ -241,34 +252,29 @@ class Sweep:
 
     @property
     def written(self) -> dict[tuple[Method, float], Path]:
-        """The files of the planes that have a depth."""
+        """The files of the planes of constant depth."""
         return {
             (files.method, files.place): files.path for files in self._files if not isinstance(files.place, TiltedPlane)
         }
 
-    def focus(self) -> dict[str, Any] | None:
-        """Return the focus curve of a sweep and the depths it marks, None without a sweep."""
+    def focus(self) -> FocusCurve | None:
+        """Return the focus curve of a sweep and the depths of its peaks, None if not asked for."""
         if not self._with_focus:
             return None
         method = self._files[0].method
         depths = [place for place in self._grids if not isinstance(place, TiltedPlane)]
-        curve = [_sum(self._finished[method, depth]["focus"]) for depth in depths]
-        return {
-            "depth_mm": depths,
-            "detail_e2": [point.detail_e2 for point in curve],
-            "sigma_e2": [point.sigma_e2 for point in curve],
-            "sharp_mm": sharp_depths_mm(depths, curve),
-        }
+        curve = [_sum(self._finished[method, depth].focus) for depth in depths]
+        return FocusCurve(
+            depth_mm=depths,
+            detail_e2=[point.detail_e2 for point in curve],
+            sigma_e2=[point.sigma_e2 for point in curve],
+            sharp_mm=sharp_depths_mm(depths, curve),
+        )
 
 
-def _where(place: Place) -> dict[str, Any]:
-    """Return what reconstruction.json says of where a plane is."""
-    if isinstance(place, TiltedPlane):
-        return {"name": place.name, "depth_mm": place.depth_mm, "rt_ref_plane": list(place.rt_ref_plane)}
-    return {"depth_mm": place}
-
-
-def _sum(of_channels: Sequence[dict[str, float]]) -> FocusMeasure:
-    """Return what all channels together say of a depth."""
-    detail_e2 = sum(focus["detail_e2"] for focus in of_channels)
-    return FocusMeasure(detail_e2, float(np.linalg.norm([focus["sigma_e2"] for focus in of_channels])))
+def _sum(points: Sequence[FocusPoint | None]) -> FocusMeasure:
+    """Return the focus of all channels together at one depth."""
+    known = [point for point in points if point is not None]
+    return FocusMeasure(
+        sum(point.detail_e2 for point in known), float(np.linalg.norm([point.sigma_e2 for point in known]))
+    )

@@ -1,4 +1,4 @@
-"""A board set of the simulated world: boards standing in the scene, photographed from every node."""
+"""Board sets of the simulated world: boards standing in the scene, photographed from every node."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,15 +16,18 @@ from faintfield.rig.simulation.boards import SimulatedBoard, printed_board, six_
 from faintfield.rig.simulation.experiment import SimulatedExperiment
 from faintfield.rig.simulation.scene import TexturedPlane, render
 
+# Reflectance of ink and of paper.
 _BLACK, _WHITE = 0.05, 0.9
+
+# White paper around the squares.
 _MARGIN_MM = 12.0
 
-# The lens's blur at the detector; it also keeps the print's sharp edges from aliasing.
+# Standard deviation of the lens's blur at the detector, px; it also keeps sharp edges from aliasing.
 _BLUR_PX = 0.6
 
 
 def board_picture(board: Board, pitch_mm: float) -> NDArray[np.float32]:
-    """Return the print of a board with a white margin, (row, column) of reflectance, by the area that is black."""
+    """Return the reflectance (row, column) of a printed board with a white margin, averaged over each sample."""
     margin = round(_MARGIN_MM / pitch_mm)
     height, width = (round(count * board.square_mm / pitch_mm) + 2 * margin for count in (board.rows, board.columns))
     ink = np.zeros((height, width), np.float32)
@@ -36,7 +39,7 @@ def board_picture(board: Board, pitch_mm: float) -> NDArray[np.float32]:
 def standing_board(
     board: Board, standing: SimulatedBoard, experiment: SimulatedExperiment, samples_per_px: float = 2.0
 ) -> TexturedPlane:
-    """Return a print of a board in the simulated scene, as blurred as the lens makes it."""
+    """Return a printed board in the simulated scene, blurred by the lens."""
     px_mm = float(standing.rt_ref_board[5]) / experiment.optics.fx_px
     pitch_mm = px_mm / samples_per_px
     picture = cv2.GaussianBlur(board_picture(board, pitch_mm), (0, 0), _BLUR_PX * samples_per_px)
@@ -53,24 +56,24 @@ def simulate_board_set(
     *,
     white_e: float = 9000.0,
 ) -> None:
-    """Photograph boards standing at six places, one board and place after another, from every node.
+    """Write photographs of boards that stand at six places, one after another, from every node.
 
-    The gantry is taken to come back to each node exactly: sweeps differ in the board alone and are therefore one.
+    The gantry is assumed to return to each node exactly, so that all sweeps share their poses.
 
     Parameters
     ----------
     out : Path
         Folder to write, which exists.
     experiment : SimulatedExperiment
-        Camera and grid.
+        The camera and its grid.
     poses_rt_cam_ref : array (view, 6)
         Where the camera really is.
     boards : sequence of Board
-        One per place; those of one shape.
+        One per place, all of one shape.
     generator : Generator
-        Of the sensor's noise.
+        Source of the sensor's noise.
     white_e : float
-        Electrons per pixel from white paper on the axis.
+        Electrons per pixel of white paper on the axis.
     """
     rows, columns = boards[0].corner_shape
     places = six_boards(rows, columns, boards[0].square_mm)

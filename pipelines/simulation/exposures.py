@@ -1,4 +1,4 @@
-"""Light exposed by a simulated sensor: the frames of a set, its noise reference, and the noise that the set states."""
+"""Frames of a set exposed by a simulated sensor, and the noise that the set states."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
 from faintfield.rig.simulation.sensor import SimulatedSensor
 
 
 def stated_noise(sensor: SimulatedSensor) -> Noise:
-    """Return the `[noise]` table of a set that a sensor took."""
+    """Return the `[noise]` table of a set taken with a sensor."""
     return Noise(
         gain_dn_per_e=sensor.gain_dn_per_e,
         read_noise_e=sensor.read_noise_e,
@@ -31,12 +32,12 @@ def write_exposures(
     exposure_s: float,
     generator: np.random.Generator,
 ) -> None:
-    """Expose every view and write it under its name, and once nothing as the noise reference.
+    """Expose every view and write it under its name; an exposure without light is the noise reference.
 
     Parameters
     ----------
     signal_e : iterable of array (row, column)
-        Expected electrons that the light of each view sets free.
+        Expected photoelectrons of each view.
     """
     for name, view_e in zip(names, signal_e, strict=True):
         write_frame(folder / name, sensor.expose(view_e / sensor.quantum_efficiency, exposure_s, generator))

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
@@ -54,5 +54,5 @@ def test_the_settings_file_of_the_readme_is_one() -> None:
     blocks = _blocks("README.md", "toml")
     assert blocks
     for _, content in blocks:
-        settings = msgspec.toml.decode(content, type=ElementalSet)
+        settings = msgspec.toml.decode(content, type=ElementalSetFile)
         assert settings.view[settings.reference_view].rt_cam_ref == (0.0,) * 6

@@ -10,7 +10,8 @@ from faintfield.calib.board import Board
 from faintfield.pipelines.commands.geometry import geometry
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.simulate import simulate
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, write_set
+from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile, write_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.simulation.boards import simulate_board_set
 from faintfield.rig.simulation.experiment import paper_experiment
@@ -38,11 +39,14 @@ def test_measured_poses_are_as_good_as_true_ones_and_nominal_ones_are_not(tmp_pa
 
 def mean_square_error(scene: Path, out: Path, measured_in: Path | None, poses: str) -> float:
     result = reconstruct(scene, out=out, depth_mm=[500.0], method=["pmlem-osl"], geometry=measured_in)
-    (row,) = result["metrics"]["planes"]
-    assert row["poses"] == poses
-    return float(row["mse_bright"])
+    assert result.metrics is not None
+    (row,) = result.metrics.planes
+    assert row.poses == poses
+    return row.mse_bright
 
 
-def with_poses(settings: ElementalSet, poses: list[tuple[float, float, float, float, float, float]]) -> ElementalSet:
+def with_poses(
+    settings: ElementalSetFile, poses: list[tuple[float, float, float, float, float, float]]
+) -> ElementalSetFile:
     views = [msgspec.structs.replace(view, rt_cam_ref=pose) for view, pose in zip(settings.view, poses, strict=True)]
     return msgspec.structs.replace(settings, view=views)

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.channels import (
-    OperatorFactory,
-    channel_layouts,
-    default_pitch_px,
-    load_channel,
-    plane_grid,
-)
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.initialization import back_projection
@@ -39,7 +35,7 @@ def _back_projected(folder: Path, depth_mm: float = 100.0) -> NDArray[np.floatin
     loaded = load_set(folder)
     (layout,) = channel_layouts(loaded)
     images = load_channel(loaded, layout)
-    operator = OperatorFactory(loaded, layout, images).at_depth(depth_mm, plane_grid(loaded, depth_mm))
+    operator = OperatorFactory(loaded, layout, images).at(depth_mm, plane_grid(loaded, depth_mm))
     return back_projection(operator, images)
 
 
@@ -281,6 +277,6 @@ def test_a_bin_with_a_pixel_that_never_counts_does_not_count(make_set: SetMaker)
     images = load_channel(loaded, layout).binned(4)
     factory = OperatorFactory(loaded, layout, images, bins=4)
     grid = plane_grid(loaded, 100.0).binned(4)
-    seen = factory.at_depth(100.0, grid).forward(np.ones(grid.shape, np.float32), [0])[0]
+    seen = factory.at(100.0, grid).forward(np.ones(grid.shape, np.float32), [0])[0]
     assert seen[1, 2] == 0
     assert np.count_nonzero(seen) == seen.size - 1

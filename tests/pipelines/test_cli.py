@@ -49,7 +49,7 @@ def test_the_help_names_every_command(faintfield: Command) -> None:
         assert f" {name} " in said
 
 
-def test_the_version_is_told(faintfield: Command) -> None:
+def test_the_version_is_printed(faintfield: Command) -> None:
     ended = faintfield("--version")
     assert (ended.returncode, ended.stdout) == (0, "0.1.0\n")
 
@@ -181,7 +181,7 @@ def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatc
     assert len(ended.stderr.splitlines()) == 1
 
 
-def test_a_bug_is_not_dressed_up_as_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_is_not_reported_as_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError
 

@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.pipelines.commands.imports.colmap import export_colmap, import_colmap
+from faintfield.pipelines.commands.exports.colmap import export_colmap
+from faintfield.pipelines.commands.imports.colmap import import_colmap
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
 from faintfield.pipelines.formats.exchange.imported_set import relative

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, Noise, View, load_set, write_set
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
 
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
@@ -34,7 +35,7 @@ FITTED = {
 
 
 @st.composite
-def elemental_sets(draw: st.DrawFn) -> ElementalSet:
+def elemental_sets(draw: st.DrawFn) -> ElementalSetFile:
     images = draw(st.lists(names, min_size=1, max_size=4, unique=True))
     nodes = draw(st.none() | st.permutations([(0, 0), (0, 1), (1, 0), (2, 7)]))
     reference = draw(st.integers(0, len(images) - 1))
@@ -63,11 +64,11 @@ def elemental_sets(draw: st.DrawFn) -> ElementalSet:
         draw(st.floats(1e-3, 1)),
         draw(st.none() | positive),
     )
-    return ElementalSet(1, draw(positive), reference, camera, noise, views)
+    return ElementalSetFile(1, draw(positive), reference, camera, noise, views)
 
 
 @given(elemental_sets())
-def test_a_set_that_is_written_is_read_back_as_it_was(settings: ElementalSet) -> None:
+def test_a_set_that_is_written_is_read_back_as_it_was(settings: ElementalSetFile) -> None:
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         for view in settings.view:
@@ -320,7 +321,7 @@ class TestNoiseJson:
 
 def _rectified_set(
     pitch_mm: float, fx_px: float, aligned_px: float, nodes: Sequence[tuple[int, int]], *, with_nodes: bool = True
-) -> ElementalSet:
+) -> ElementalSetFile:
     """A grid whose pictures were moved by `aligned_px` from node to node; the first node is the reference."""
     row_0, column_0 = nodes[0]
     views = [
@@ -334,10 +335,10 @@ def _rectified_set(
         for row, column in nodes
     ]
     camera = Camera((40, 30), fx_px, fx_px, 20.0, 15.0)
-    return ElementalSet(1, 1.0, 0, camera, Noise(1.0, 0.0), views)
+    return ElementalSetFile(1, 1.0, 0, camera, Noise(1.0, 0.0), views)
 
 
-def _loaded(settings: ElementalSet, folder: Path) -> Any:
+def _loaded(settings: ElementalSetFile, folder: Path) -> Any:
     for view in settings.view:
         (folder / view.image).touch()
     write_set(folder, settings)

@@ -82,8 +82,8 @@ def test_planes_of_one_pitch_are_in_millimetres(scene: Path, tmp_path: Path, don
 def test_large_colour_planes_are_there_at_several_resolutions(
     tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("faintfield.pipelines.commands.exports.zarr._COARSEST_PX", 30)
-    monkeypatch.setattr("faintfield.pipelines.commands.exports.zarr._CHUNK_PX", 40)
+    monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._COARSEST_PX", 30)
+    monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._CHUNK_PX", 40)
     done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 20)
     out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
     done("reconstruct", tmp_path / "set", "--out", out, "--depth-mm", 500, "--method", "backprojection")

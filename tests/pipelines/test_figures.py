@@ -3,6 +3,7 @@
 import csv
 import json
 import statistics
+import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -15,8 +16,9 @@ import pytest
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.paper import figure4
-from faintfield.pipelines.paper.figure4 import SNRS, Error, Stage, curves, is_monotone, over_best, staged
+from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, is_monotone, mean_curves, over_best, stage_object
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, FigureMethod
+from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.objects import shaded_ball, star_chart
@@ -45,8 +47,8 @@ def errors(made: Path) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def star() -> Stage:
-    return staged(star_chart(0.0, 0.0, 600.0).grey(), (120, 90))
+def star() -> StagedObject:
+    return stage_object(star_chart(0.0, 0.0, 600.0).grey(), (120, 90))
 
 
 def test_figure_4_has_every_object_snr_method_and_draw(errors: list[dict[str, Any]]) -> None:
@@ -151,7 +153,18 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, faintfield: Co
     assert "OutputExists" in ended.stderr
 
 
-def test_exposures_have_the_snr_they_are_named_by(star: Stage) -> None:
+def test_without_scikit_image_the_extra_is_named_before_any_work(
+    tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "skimage.restoration", None)
+    ended = faintfield("figures", tmp_path / "out")
+    assert ended.returncode == 1
+    assert "MissingPackage: scikit-image is not installed" in ended.stderr
+    assert "pip install 'faintfield[figures]'" in ended.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_exposures_have_the_snr_they_are_named_by(star: StagedObject) -> None:
     view = star.experiment.reference_view
     signal = star.light[view][star.region]
     for snr, images, scale_e in star.exposures(seed=3):
@@ -162,7 +175,7 @@ def test_exposures_have_the_snr_they_are_named_by(star: Stage) -> None:
         assert images.electrons.sum(dtype=np.float64) == pytest.approx(expected, abs=4 * deviation)
 
 
-def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: Stage) -> None:
+def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: StagedObject) -> None:
     frames = [images.electrons for _, images, _ in star.exposures(seed=3)]
     for darker, brighter in pairwise(frames):
         more = brighter - darker
@@ -172,7 +185,7 @@ def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: Stage) -
     assert np.corrcoef(frames[0].ravel(), other.ravel())[0, 1] < 0.2
 
 
-def test_the_best_weight_is_the_best(star: Stage) -> None:
+def test_the_best_weight_is_the_best(star: StagedObject) -> None:
     _, images, scale_e = next(star.exposures(seed=1))
     tv = next(method for method in METHODS if method.name == "tv")
     tried = [star.errors(tv.plane(star.operator, images, weight), scale_e)[0] for weight in tv.weights]
@@ -180,17 +193,17 @@ def test_the_best_weight_is_the_best(star: Stage) -> None:
 
 
 def test_a_method_without_noise_has_no_error_but_that_of_sampling() -> None:
-    ball = staged(shaded_ball(0.0, 0.0, 600.0).grey(), (120, 90))
+    ball = stage_object(shaded_ball(0.0, 0.0, 600.0).grey(), (120, 90))
     assert ball.errors(ball.bright * np.float32(2.0), 2.0)[0] == pytest.approx(0.0, abs=1e-12)
     assert ball.errors(ball.bright, 1.0)[1] < 2e-3
 
 
 def test_a_point_is_the_mean_of_its_draws_with_its_standard_error() -> None:
-    draws = [Error("star", 0.16, "tv", mse, seed, 2 * mse, None) for seed, mse in enumerate((0.01, 0.02, 0.06))]
-    (point,) = curves(draws)
-    assert (point["mse"], point["mse_texture"]) == pytest.approx((0.03, 0.06))
-    assert point["standard_error"] == pytest.approx(statistics.stdev((0.01, 0.02, 0.06)) / 3**0.5)
-    assert curves(draws[:1])[0]["standard_error"] is None
+    draws = [ErrorPoint("star", 0.16, "tv", mse, seed, 2 * mse, None) for seed, mse in enumerate((0.01, 0.02, 0.06))]
+    (point,) = mean_curves(draws)
+    assert (point.mse, point.mse_texture) == pytest.approx((0.03, 0.06))
+    assert point.standard_error == pytest.approx(statistics.stdev((0.01, 0.02, 0.06)) / 3**0.5)
+    assert mean_curves(draws[:1])[0].standard_error is None
 
 
 @pytest.mark.parametrize(
@@ -198,14 +211,14 @@ def test_a_point_is_the_mean_of_its_draws_with_its_standard_error() -> None:
 )
 def test_monotone_means_that_every_step_is_down(errors: tuple[float, ...], falls: bool) -> None:
     points = [
-        {"object": name, "method": "tv", "snr": snr, "mse": mse}
+        CurvePoint(name, "tv", snr, draws=1, mse=mse, standard_error=None, mse_texture=mse)
         for name, curve in (("star", (3.0, 2.0, 1.0)), ("ball", errors))
         for snr, mse in zip((0.16, 0.17, 0.18), curve, strict=True)
     ]
     assert is_monotone(points, "tv") == falls
 
 
-def test_a_plane_covers_its_object_with_a_margin(star: Stage) -> None:
+def test_a_plane_covers_its_object_with_a_margin(star: StagedObject) -> None:
     shown = np.zeros_like(star.region)
     shown[star.window] = True
     assert shown[star.region].all()
@@ -223,13 +236,13 @@ def test_slow_methods_have_fewer_draws(monkeypatch: pytest.MonkeyPatch) -> None:
         FigureMethod("always", "always", back_projection),
     ]
     monkeypatch.setattr(figure4, "METHODS", quick)
-    points = curves(figure4.measure((40, 30), seeds=3))
-    assert {(point["method"], point["draws"]) for point in points} == {("once", 1), ("always", 3)}
+    points = mean_curves(figure4.measure_errors((40, 30), seeds=3))
+    assert {(point.method, point.draws) for point in points} == {("once", 1), ("always", 3)}
 
 
 def test_the_ratio_to_the_best_is_the_worst_along_a_curve() -> None:
     points = [
-        {"object": name, "method": method, "snr": snr, "mse": mse}
+        CurvePoint(name, method, snr, draws=1, mse=mse, standard_error=None, mse_texture=mse)
         for name, method, errors in (
             ("star", "ours", (2.2, 1.5)),
             ("star", "best", (2.0, 1.0)),

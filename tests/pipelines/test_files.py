@@ -9,13 +9,13 @@ import pytest
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
 from faintfield.pipelines.formats.files import (
-    alone_in,
-    building_folder,
+    exclusive,
     require_room,
     sha256,
     write_json,
     write_whole,
     writing,
+    writing_folder,
 )
 
 
@@ -24,7 +24,7 @@ def _everything_below(folder: Path) -> set[str]:
 
 
 class _Stop(BaseException):
-    """Something that no one expects."""
+    """An exception that no code expects."""
 
 
 @pytest.mark.parametrize("content", ["words – with a dash\n", b"\0\xff bytes"])
@@ -35,11 +35,11 @@ def test_what_is_written_is_there_and_nothing_else(content: str | bytes, tmp_pat
     assert _everything_below(tmp_path) == {"new", "new/folder", "new/folder/file"}
 
 
-def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None:
+def test_new_files_have_the_permissions_of_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_json(tmp_path / "file", [1])
-        with building_folder(tmp_path / "folder"):
+        with writing_folder(tmp_path / "folder"):
             pass
         assert os.umask(0o027) == 0o027
     finally:
@@ -48,7 +48,7 @@ def test_new_files_are_as_open_as_the_umask_lets_them_be(tmp_path: Path) -> None
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
 
 
-def test_a_file_takes_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_gets_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
 
     def watched[**P, R](name: str, step: Callable[P, R]) -> Callable[P, R]:
@@ -65,7 +65,7 @@ def test_a_file_takes_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monke
 
 
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
-def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseException], tmp_path: Path) -> None:
+def test_an_interrupted_write_keeps_the_earlier_file(failure: type[BaseException], tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("before")
 
@@ -82,9 +82,9 @@ def test_a_file_whose_writing_stops_leaves_what_stood_there(failure: type[BaseEx
 
 
 @pytest.mark.parametrize("failure", [ValueError, _Stop, KeyboardInterrupt])
-def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], tmp_path: Path) -> None:
+def test_an_interrupted_folder_does_not_appear(failure: type[BaseException], tmp_path: Path) -> None:
     def stop_half_way() -> None:
-        with building_folder(tmp_path / "out") as folder:
+        with writing_folder(tmp_path / "out") as folder:
             (folder / "part").touch()
             assert not (tmp_path / "out").exists()
             raise failure
@@ -94,9 +94,9 @@ def test_a_folder_whose_building_stops_never_was(failure: type[BaseException], t
     assert _everything_below(tmp_path) == set()
 
 
-def test_a_folder_that_is_built_takes_its_name_at_the_end(tmp_path: Path) -> None:
+def test_a_folder_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
-    with building_folder(tmp_path / "out") as folder:
+    with writing_folder(tmp_path / "out") as folder:
         (folder / "part").touch()
         assert not any((tmp_path / "out").iterdir())
     assert _everything_below(tmp_path) == {"out", "out/part"}
@@ -109,7 +109,7 @@ def test_a_folder_is_replaced_whole_or_not_at_all(stops: bool, tmp_path: Path) -
     (out / "deep" / "old").touch()
     (out / "mark").touch()
     try:
-        with building_folder(out, replace_if="mark") as folder:
+        with writing_folder(out, replace_if="mark") as folder:
             (folder / "new").touch()
             if stops:
                 raise _Stop
@@ -135,12 +135,12 @@ def _with_a_file(out: Path) -> None:
         (Path.touch, {"replace_if": "elemental.toml"}, "is a file"),
     ],
 )
-def test_what_others_put_there_is_left_alone(
+def test_files_of_others_are_left_alone(
     prepare: Callable[[Path], object], earlier: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     prepare(tmp_path / "out")
     before = _everything_below(tmp_path)
-    with pytest.raises(OutputExists, match=words), building_folder(tmp_path / "out", **earlier):
+    with pytest.raises(OutputExists, match=words), writing_folder(tmp_path / "out", **earlier):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == before
 
@@ -150,7 +150,7 @@ def test_a_folder_of_nothing_but_such_names_is_replaced(tmp_path: Path) -> None:
     out.mkdir()
     for name in ("cameras.txt", "a.model", "b.model"):
         (out / name).touch()
-    with building_folder(out, replace_only=["*.model", "cameras.txt"]) as folder:
+    with writing_folder(out, replace_only=["*.model", "cameras.txt"]) as folder:
         (folder / "c.model").touch()
     assert _everything_below(tmp_path) == {"out", "out/c.model"}
 
@@ -161,7 +161,7 @@ def test_a_link_to_what_is_read_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "out" / "link").symlink_to(tmp_path / "elsewhere")
     with (
         pytest.raises(OutputExists, match="link, which is read"),
-        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
+        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
     ):
         pytest.fail("nothing must be built")
 
@@ -172,7 +172,7 @@ def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path
     (tmp_path / "out" / "mark").touch()
     with (
         pytest.raises(OutputExists, match="which is read"),
-        building_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
+        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
     ):
         pytest.fail("nothing must be built")
     assert _everything_below(tmp_path) == {"out", "out/deep", "out/mark"}
@@ -181,13 +181,13 @@ def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path
 def test_the_working_folder_can_be_filled_when_it_is_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    with building_folder(Path()) as folder:
+    with writing_folder(Path()) as folder:
         (folder / "part").touch()
     assert _everything_below(tmp_path) == {"here", "here/part"}
 
 
-@pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: building_folder(path).__enter__()])
-def test_a_place_that_cannot_be_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
+@pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: writing_folder(path).__enter__()])
+def test_an_impossible_place_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(CannotWrite, match=r"file.*; name a place that can be written") as refused:
         write(tmp_path / "file" / "out")
@@ -205,19 +205,19 @@ def test_every_failure_of_writing_is_an_input_error() -> None:
     assert issubclass(CannotWrite, InputError)
 
 
-def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
+def test_the_hash_is_that_of_the_standard(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
+def test_a_second_writer_of_a_folder_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "results"
-    with alone_in(folder):
-        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), alone_in(folder):
+    with exclusive(folder):
+        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), exclusive(folder):
             pass
         assert folder.is_dir()
     assert not folder.exists()  # nothing was put into it
-    with alone_in(folder):
+    with exclusive(folder):
         (folder / "plane.tiff").touch()
     assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
 

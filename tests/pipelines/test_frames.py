@@ -47,7 +47,7 @@ def _pixels(dtype: type[np.unsignedinteger], *shape: int) -> NDArray[np.unsigned
 @pytest.mark.parametrize("shape", [(40, 50), (40, 50, 3)], ids=["grey", "RGB"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("kind", LOSSLESS)
-def test_lossless_files_give_every_pixel_back_in_their_own_type(
+def test_lossless_files_keep_every_pixel_and_its_type(
     kind: str, dtype: type[np.unsignedinteger], shape: tuple[int, ...], tmp_path: Path
 ) -> None:
     suffix, write = LOSSLESS[kind]
@@ -160,7 +160,7 @@ def test_text_with_the_name_of_a_picture_is_refused(suffix: str, tmp_path: Path)
         read_frame(path)
 
 
-def test_a_stack_of_pictures_is_no_frame(tmp_path: Path) -> None:
+def test_a_stack_of_pictures_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "stack.tiff", _pixels(np.uint16, 5, 40, 50), photometric="minisblack")
     with pytest.raises(UnreadableImage, match=r"array of shape \(5, 40, 50\); one grey or RGB picture is wanted"):
         read_frame(tmp_path / "stack.tiff")

@@ -58,7 +58,7 @@ def test_a_bug_leaves_its_traceback_and_a_warning_its_words(tmp_path: Path, monk
     assert log.read_text().splitlines()[-1] == "ZeroDivisionError: a bug"
 
 
-def test_the_log_is_let_go_in_the_end(tmp_path: Path, faintfield: Command) -> None:
+def test_the_log_is_closed_in_the_end(tmp_path: Path, faintfield: Command) -> None:
     before = list(logging.getLogger().handlers)
     assert faintfield("--log", tmp_path / "day.log", "verify", tmp_path).returncode == 1
     assert logging.getLogger().handlers == before

@@ -15,7 +15,9 @@ from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.channels import OperatorFactory, channel_layouts, load_channel, plane_grid
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.grids import plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.solver.penalties import total_variation
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -117,7 +119,7 @@ def test_the_objective_is_the_likelihood_with_the_penalty(method: str, results: 
     factory = OperatorFactory(loaded, layout, images)
     for plane in _record(results / method)["planes"]:
         pixels = tifffile.imread(results / method / plane["file"])
-        operator = factory.at_depth(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
+        operator = factory.at(plane["depth_mm"], plane_grid(loaded, plane["depth_mm"]))
         likelihood = operator.negative_log_likelihood(pixels, images)
         penalty = plane["penalty_weight"] * total_variation(pixels, plane["epsilon_e2"])
         assert plane["objective"] == pytest.approx(likelihood + penalty, rel=1e-9)

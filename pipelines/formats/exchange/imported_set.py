@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, WrongBitDepth, WrongSize
-from faintfield.pipelines.formats.files import building_folder, sha256, write_json
+from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_set import FILE_NAME, Camera, ElementalSet, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,13 @@ def write_imported_set(
         saturation_dn=first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max),
     )
     inputs = [*models, *(image.path for image in images)]
-    with building_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
+    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
         views = [
             _view(_copy(image.path, folder, first), image, images[reference])
             for image in progress(images, "copying pictures")
         ]
         camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-        write_set(folder, ElementalSet(1, exposure_s, reference, camera, noise, views))
+        write_set(folder, ElementalSetFile(1, exposure_s, reference, camera, noise, views))
         hashes = {path.name: sha256(path) for path in inputs}
         write_json(folder / "provenance.json", provenance(command, options, hashes))
 

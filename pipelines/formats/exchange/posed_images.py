@@ -13,7 +13,8 @@ from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet, Noise
+from faintfield.pipelines.formats.sets.elemental_file import Noise
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 
 def import_posed(
@@ -64,7 +65,7 @@ def import_posed(
     return {"out": str(out), "views": len(images), "reference": images[index].path.name}
 
 
-def lens_of_each_view(loaded: LoadedSet) -> list[Lens]:
+def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
     """Return the lens of each view: the camera's, with the principal point of the view."""
     return [replace(loaded.lens, cx_px=cx_px, cy_px=cy_px) for cx_px, cy_px in loaded.principal_points_px().tolist()]
 

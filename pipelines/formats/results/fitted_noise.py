@@ -1,9 +1,5 @@
-"""The result of `faintfield noise` as a reconstruction takes it: the model with its maps, the mask, the response.
+"""The result of `faintfield noise` as a reconstruction takes it: the model with its maps, the mask, the response."""
 
-Reading it needs none of the fitting, which is heavy to load.
-"""
-
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +11,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
-
-NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS, Measured, NoiseRecord, read_noise
 
 _NUMBERS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
 
@@ -53,8 +48,10 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     ValueError
         A number is out of its range.
     """
-    values, stated, hot, mosaic = _read_numbers(path)
+    record = read_noise(path)
+    values = _numbers(path, record)
     shape = size_px[::-1]
+    hot = np.array(record.hot_pixels, int).reshape(-1, 2)
     outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
     if len(outside):
         raise BadValue(
@@ -67,42 +64,34 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     unusable |= maps.pop("mask", False)
     response = maps.pop("relative_response", None)
     if response is not None:
-        # A pixel without a response to speak of is masked already; the operator takes no negative ones
+        # Pixels with no response are masked already; the operator takes no negative one
         response = np.where(unusable, 1, np.maximum(response, 0)).astype(np.float32)
-    return FittedNoise(NoiseModel(**(values | maps), **stated), unusable, response, mosaic)
+    stated = {name: _value(getattr(record, name)) for name in ("quantum_efficiency", "saturation_dn")}
+    model = NoiseModel(**(values | maps), **{name: value for name, value in stated.items() if value is not None})
+    return FittedNoise(model, unusable, response, record.mosaic or None)
 
 
-def _read_numbers(
-    path: Path,
-) -> tuple[dict[str, float], dict[str, float], NDArray[np.intp], tuple[str, ...] | None]:
-    """Return the numbers that a reconstruction needs, those stated beside them, the hot pixels, and the mosaic."""
-    try:
-        fitted = json.loads(path.read_text())
-        values = {name: fitted[name]["value"] for name in _NUMBERS}
-        _assume_no_dark_current(path, fitted, values)
-        missing = [name for name in _NUMBERS if values[name] is None]
-        hot = np.array(fitted.get("hot_pixels") or np.empty((0, 2)), int).reshape(-1, 2)
-        mosaic = tuple(str(row) for row in fitted.get("mosaic") or ()) or None
-        optional = {key: fitted.get(key) for key in ("quantum_efficiency", "saturation_dn")}
-        stated = {key: part["value"] if isinstance(part, dict) else part for key, part in optional.items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure!r}); run that again") from failure
-    if missing:
-        why = fitted[missing[0]].get("why", "no reason stated")
-        raise BadValue(f"{path}: {missing[0]} is not known ({why}); record what it names, or state [noise] yourself")
+def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
+    """Return the numbers that a reconstruction needs; an unknown dark current counts as none."""
+    values: dict[str, float] = {}
+    for name in _NUMBERS:
+        measured: Measured = getattr(record, name)
+        why = measured.why or "no reason stated"
+        if measured.value is not None:
+            values[name] = measured.value
+        elif name == "dark_current_e_per_s":
+            inform(f"{path}: {name} is not known ({why}); 0 is taken, which is right for short exposures only")
+            values[name] = 0.0
+        else:
+            raise BadValue(f"{path}: {name} is not known ({why}); record what it names, or state [noise] yourself")
     # An estimate near zero may fall below it; a dark current cannot.
     values["dark_current_e_per_s"] = max(values["dark_current_e_per_s"], 0.0)
-    return values, {key: value for key, value in stated.items() if value is not None}, hot, mosaic
+    return values
 
 
-def _assume_no_dark_current(path: Path, fitted: dict[str, Any], values: dict[str, float]) -> None:
-    """Take a dark current that the frames could not tell for none, as the calibration's own noise model does."""
-    if values["dark_current_e_per_s"] is None:
-        why = fitted["dark_current_e_per_s"].get("why", "no reason stated")
-        inform(
-            f"{path}: dark_current_e_per_s is not known ({why}); 0 is taken, which is right for short exposures only"
-        )
-        values["dark_current_e_per_s"] = 0.0
+def _value(stated: Measured | float | None) -> float | None:
+    """Return a number that may be written with or without its error."""
+    return stated.value if isinstance(stated, Measured) else stated
 
 
 def _read_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Any]:

@@ -1,119 +1,167 @@
-"""What `faintfield noise` writes: numbers as `noise.json` and maps as `noise_maps.npz`; docs/noise.md says of what."""
+"""The record of a sensor's noise, `noise.json`, and its maps per pixel: one type for writer, readers and tests.
 
-from collections.abc import Sequence
-from dataclasses import asdict
+Keys stand in the file in the order of the fields; docs/noise.md explains the quantities.
+"""
+
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, Struct, UnsetType
 from numpy.typing import NDArray
 
-from faintfield.calib.noise import Estimate, NoiseCalibration
-from faintfield.pipelines.calibration.noise_frames import Readout
-from faintfield.pipelines.formats.files import writing
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole, writing
 
+NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
 STANDARD = "EMVA 1288 release 4.0"
 
-# By the name of each map in the file: fill for pixels that were not calibrated, which are masked anyway.
-_MAPS = {
-    "offset_dn": 0.0,
-    "offset_variance_dn2": 0.0,
-    "dark_current_e_per_s": 0.0,
-    "dark_current_variance_e2_per_s2": 0.0,
-    "read_noise_e": 1.0,
-    "relative_response": 1.0,
-    "vignetting": 1.0,
-}
+
+class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One frame, as noise.toml and noise.json name it; a raw file's exposure may come from its EXIF instead."""
+
+    file: str
+    kind: Literal["dark", "flat"]
+    exposure_s: float | None = None
+    temperature_c: float | None = None
+    level: int = 0
+    photons: float | None = None
 
 
-def result_of(readout: Readout, calibrations: Sequence[NoiseCalibration]) -> dict[str, Any]:
-    """Return the numbers of `noise.json`: of the sensor, and of each plane where there are several.
+class Measured(Struct, frozen=True, omit_defaults=True):
+    """A measured number with its standard error and 95 % interval, or the reason why there is none."""
+
+    value: float | None
+    se: float | None = None
+    ci95: tuple[float, float] | None = None
+    why: str | None = None
+
+
+_NOT_STATED = Measured(None, why="not stated")
+
+
+class Quantities(Struct, frozen=True, kw_only=True):
+    """What is measured of a sensor, or of one phase of its colour filter mosaic.
+
+    A reconstruction needs the first four. Only noise.json files that were written by hand lack any of the others.
+    """
+
+    offset_dn: Measured
+    gain_dn_per_e: Measured
+    read_noise_e: Measured
+    dark_current_e_per_s: Measured
+    read_noise_dn: Measured = _NOT_STATED
+    dark_signal_dn_per_s: Measured = _NOT_STATED
+    dsnu_dn: Measured = _NOT_STATED
+    dsnu_e: Measured = _NOT_STATED
+    dcnu_e_per_s: Measured = _NOT_STATED
+    frame_jitter_dn: Measured = _NOT_STATED
+    row_noise_dn: Measured = _NOT_STATED
+    column_noise_dn: Measured = _NOT_STATED
+    dsnu_row_dn: Measured = _NOT_STATED
+    dsnu_column_dn: Measured = _NOT_STATED
+    prnu: Measured = _NOT_STATED
+    nonlinearity_per_dn: Measured = _NOT_STATED
+    quantum_efficiency: Measured | float | None = _NOT_STATED
+
+
+class PhaseRecord(Quantities, frozen=True):
+    """One phase of the mosaic: where its first pixel is, its filter, and its quantities."""
+
+    phase: tuple[int, int]
+    colour: str
+    likelihood: str
+    masked_black_dn: float | None
+
+
+class CovarianceRecord(Struct, frozen=True):
+    """The covariance of the quantities named."""
+
+    names: list[str]
+    matrix: list[list[float]]
+
+
+class TemperatureRange(Struct, frozen=True):
+    """The temperature of the frames in °C."""
+
+    mean: float
+    min: float
+    max: float
+
+
+class NoiseProvenance(Struct, frozen=True):
+    """What a noise calibration was made by and from; see `formats.provenance`."""
+
+    command: str
+    options: dict[str, Any]
+    inputs: dict[str, str]
+    versions: dict[str, str]
+
+
+# A class of its own because msgspec puts keyword-only fields after all others: these two come before the quantities.
+class _StandardQuantities(Quantities, frozen=True):
+    format: Literal[1] = 1
+    standard: str = STANDARD
+
+
+class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
+    """`noise.json`: the sensor's quantities (the mean over phases where there is a mosaic) and how they were measured.
+
+    Pixels are (row, column). `mosaic` and `planes`, one entry per phase, are left out without colour filters.
+    """
+
+    covariance: CovarianceRecord = CovarianceRecord([], [])
+    likelihood: str = ""
+    saturation_dn: Measured | float | None = None
+    size_px: tuple[int, int] | None = None
+    mosaic: tuple[str, ...] | UnsetType | None = UNSET
+    planes: list[PhaseRecord] | UnsetType = UNSET
+    hot_pixels: list[tuple[int, int]] = []
+    noisy_pixels: list[tuple[int, int]] = []
+    dead_pixels: list[tuple[int, int]] = []
+    temperature_c: TemperatureRange | None = None
+    frames: list[NoiseFrame] = []
+    warnings: list[str] = []
+    maps: str = NOISE_MAPS
+    maps_sha256: str = ""
+    provenance: NoiseProvenance | None = None
+
+
+def read_noise(path: Path) -> NoiseRecord:
+    """Read noise.json.
+
+    Raises
+    ------
+    BadValue
+        The file is not a result of `faintfield noise`.
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=NoiseRecord)
+    except (msgspec.MsgspecError, ValueError, OSError) as failure:
+        raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure}); run that again") from failure
+
+
+def write_noise(
+    out: Path, record: NoiseRecord, maps: Mapping[str, NDArray[Any]], pages: Mapping[str, bytes]
+) -> NoiseRecord:
+    """Write noise.json, its maps and its pages of plots, and return the record with the hash of the maps.
+
+    noise.json is written last: where it stands, everything that it names stands too.
 
     Parameters
     ----------
-    readout : Readout
-        Where each plane's pixels lie.
-    calibrations : sequence of NoiseCalibration
-        One per plane.
+    maps : mapping of str to array (row, column)
+        By the name in noise_maps.npz.
+    pages : mapping of str to bytes
+        PNG by file name.
     """
-    result: dict[str, Any] = {"format": 1, "standard": STANDARD}
-    result |= {name: _as_json(_mean([c.estimates[name] for c in calibrations])) for name in calibrations[0].estimates}
-    result["covariance"] = _covariance(calibrations)
-    result["likelihood"] = " / ".join(dict.fromkeys(str(c.likelihood) for c in calibrations))
-    result["saturation_dn"] = readout.saturation_dn
-    result["size_px"] = list(readout.size_px)
-    if readout.mosaic is not None:
-        result["mosaic"] = list(readout.mosaic)
-        result["planes"] = [
-            {
-                "phase": list(plane.phase),
-                "colour": plane.colour,
-                "likelihood": str(c.likelihood),
-                "masked_black_dn": float(np.mean(plane.black_dn)) if plane.black_dn else None,
-            }
-            | {name: _as_json(estimate) for name, estimate in c.estimates.items()}
-            for plane, c in zip(readout.planes, calibrations, strict=True)
-        ]
-    for kind in ("hot", "noisy", "dead"):
-        found = _assembled(readout, [getattr(c, kind) for c in calibrations], fill=False)
-        result[f"{kind}_pixels"] = np.argwhere(found).tolist()
-    return result
-
-
-def maps_of(readout: Readout, calibrations: Sequence[NoiseCalibration]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `noise_maps.npz` (row, column): float32 by the names in `NoiseMaps`, and the bool `mask`."""
-    maps = {"mask": _assembled(readout, [c.maps.unusable for c in calibrations], fill=True)}
-    for name, fill in _MAPS.items():
-        parts = [getattr(c.maps, name) for c in calibrations]
-        if all(part is not None for part in parts):
-            maps[name] = _assembled(readout, parts, fill)
-    gains = [c.estimates["gain_dn_per_e"].value for c in calibrations]
-    if len(gains) > 1 and None not in gains:
-        shape = calibrations[0].maps.offset_dn.shape
-        maps["gain_dn_per_e"] = _assembled(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
-    return maps
-
-
-def write_maps(path: Path, maps: dict[str, NDArray[Any]]) -> None:
-    """Write the maps, whole or not at all."""
-    with writing(path) as file:
-        np.savez_compressed(file, allow_pickle=False, **maps)
-
-
-def _assembled(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
-    """Return the planes' arrays interleaved to the size of a frame."""
-    width, height = readout.size_px
-    whole = np.full((height, width), fill, parts[0].dtype)
-    region = whole[readout.rows, readout.columns]
-    for plane, part in zip(readout.planes, parts, strict=True):
-        plane.of(region)[...] = part
-    return whole
-
-
-def _mean(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean over planes, or the reason why one of them has no value."""
-    if len(estimates) == 1:
-        return estimates[0]
-    unknown = next((estimate for estimate in estimates if estimate.value is None), None)
-    if unknown is not None:
-        return unknown
-    count = len(estimates)
-    value = sum(estimate.value or 0.0 for estimate in estimates) / count
-    se = float(np.sqrt(sum((estimate.se or 0.0) ** 2 for estimate in estimates))) / count
-    return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
-
-
-def _as_json(estimate: Estimate) -> dict[str, Any]:
-    """Return the value with its uncertainty, or null with the reason."""
-    if estimate.value is None:
-        return {"value": None, "why": estimate.why}
-    return {key: value for key, value in asdict(estimate).items() if value is not None}
-
-
-def _covariance(calibrations: Sequence[NoiseCalibration]) -> dict[str, Any]:
-    """Return names and matrix; of the planes' mean where there are several."""
-    names = calibrations[0].covariance[0]
-    if any(c.covariance[0] != names for c in calibrations):
-        return {"names": [], "matrix": []}
-    matrix = np.sum([c.covariance[1] for c in calibrations], axis=0) / len(calibrations) ** 2
-    return {"names": list(names), "matrix": matrix.tolist()}
+    remove(out / NOISE_FILE)
+    with writing(out / NOISE_MAPS) as file:
+        np.savez_compressed(file, allow_pickle=False, **dict(maps))
+    for name, page in pages.items():
+        write_whole(out / name, page)
+    record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
+    write_json(out / NOISE_FILE, record)
+    return record

@@ -7,10 +7,21 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from faintfield.pipelines.formats.provenance import Provenance
+
+RECONSTRUCTION_FILE = "reconstruction.json"
+DEPTH_MAP_FILE = "depth_map.json"
+METRICS_FILE = "metrics.json"
+OVERVIEW_FILE = "overview.json"
+REPORT_FILE = "report.html"
+
 type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
 
 # Methods that reconstruct all planes together.
 JOINT_METHODS: tuple[Method, ...] = ("joint", "occlusion")
+
+# Where poses come from: as the set states them, measured, where the stage was told to go, or known to the simulator.
+type Poses = Literal["stated", "measured", "nominal", "true"]
 
 
 class Certificate(Struct, frozen=True, kw_only=True):
@@ -33,6 +44,11 @@ class Certificate(Struct, frozen=True, kw_only=True):
     oscillates: bool | UnsetType = UNSET
     kept_at_start: int | UnsetType = UNSET
 
+    @property
+    def is_bound(self) -> bool:
+        """Whether `value` bounds the distance to the optimum."""
+        return self.value is not UNSET
+
 
 class WeightScore(Struct, frozen=True):
     """A penalty weight that was tried: the negative log-likelihood of the held-out views."""
@@ -46,6 +62,24 @@ class PenaltyRecord(Struct, frozen=True):
 
     name: str
     smoothing_e: float
+
+
+class SolveRecord(Struct, frozen=True, kw_only=True):
+    """How one colour of a plane was solved: the middle part of `PlaneRecord`."""
+
+    penalty_weight: float | None
+    penalty_weight_chosen: str
+    epsilon_e2: float | None = None
+    passes: int
+    objective: float | None = None
+    certificate: Certificate | None = None
+    mean_e: float
+    passes_before: float | UnsetType = UNSET
+    penalty_weight_curve: list[WeightScore] | UnsetType | None = UNSET
+    penalty: PenaltyRecord | UnsetType = UNSET
+    likelihood: str | UnsetType = UNSET
+    occlusion: bool | UnsetType = UNSET
+    occlusion_left_out: str | UnsetType = UNSET
 
 
 class PlaneRecord(Struct, frozen=True, kw_only=True):
@@ -134,47 +168,35 @@ class ReconstructionOptions(Struct, frozen=True):
     focus: bool
     depth_map: Literal["mm", "px"] | None
     plane_pose: dict[str, list[float]]
-    poses: str
+    poses: Poses
 
 
-class PlaneFileRecord(Struct, frozen=True, kw_only=True):
+class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
     """The record beside a plane (`plane_00500.0.json`), which vouches for its files."""
 
-    format: Literal[1] = 1
+    format: Literal[1]
     planes: list[PlaneRecord]
     focus: list[FocusPoint | None]
     sha256: dict[str, str]
-    command: str
-    options: ReconstructionOptions
-    inputs: dict[str, str]
-    versions: dict[str, str]
 
 
-class DepthMapFileRecord(Struct, frozen=True, kw_only=True):
+class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
     """`depth_map.json`, which vouches for the maps beside it."""
 
-    format: Literal[1] = 1
+    format: Literal[1]
     depth_map: DepthMapRecord
     sha256: dict[str, str]
-    command: str
-    options: ReconstructionOptions
-    inputs: dict[str, str]
-    versions: dict[str, str]
 
 
-class ReconstructionRecord(Struct, frozen=True, kw_only=True):
+class ReconstructionRecord(Provenance[ReconstructionOptions], frozen=True):
     """`reconstruction.json`: all planes of one method, and how they were made."""
 
-    format: Literal[1] = 1
+    format: Literal[1]
     planes: Annotated[list[PlaneRecord], Meta(min_length=1)]
     focus: FocusCurve | None
     best_focus: BestFocusRecord | None
     depth_map: DepthMapRecord | None
     wall_time_s: float
-    command: str
-    options: ReconstructionOptions
-    inputs: dict[str, str]
-    versions: dict[str, str]
 
 
 class PlaneErrors(Struct, frozen=True):
@@ -182,7 +204,7 @@ class PlaneErrors(Struct, frozen=True):
 
     depth_mm: float
     method: Method
-    poses: str
+    poses: Poses
     object: str
     mse_bright: float
     mse_texture: float
@@ -232,8 +254,22 @@ class Metrics(Struct, frozen=True, kw_only=True):
     photons_per_px: PhotonsRecord
 
 
-class BrightnessRecord(Struct, frozen=True):
-    """The SNR and photon figures of a set's reference view; see `reconstruction.brightness`."""
+class Brightness(Struct, frozen=True):
+    """The SNR and photon figures of a set's reference view.
+
+    Attributes
+    ----------
+    region, noise_from : str
+        What was measured, and what it was compared with.
+    snr : float, optional
+        Eq. (4), a ratio of powers; None if the noise model states no read noise to compare with.
+    electrons_linear, electrons_from_moments : float, optional
+        Electrons per pixel by eq. (7), and of a uniform object with this SNR; None if the SNR is not positive.
+    mean_signal_e : float
+        Mean electrons per pixel above the dark level.
+    photons_linear, photons_from_moments : float, optional
+        The same in photons; None if the quantum efficiency is not known.
+    """
 
     region: str
     noise_from: str
@@ -251,7 +287,7 @@ class Overview(Struct, frozen=True):
     set: str
     views: int
     grid: tuple[int, int] | None
-    poses: str
+    poses: Poses
     size_px: tuple[int, int]
     exposure_s: float
     frames_per_view: int
@@ -260,4 +296,4 @@ class Overview(Struct, frozen=True):
     quantum_efficiency: float | None
     dark_e: float
     grey_scale_dn: tuple[float, float]
-    brightness: BrightnessRecord
+    brightness: Brightness

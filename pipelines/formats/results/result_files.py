@@ -1,166 +1,47 @@
-"""What a report needs of the files beside planes, read such that a damaged one is told from a whole one."""
+"""Finding and reading the JSON files of results, with a named failure for a damaged one."""
 
 from pathlib import Path
-from typing import Annotated, Any
 
 import msgspec
 
-from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.reconstruction.brightness import Brightness
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, ReconstructionRecord
+
+# Folders of results lie at most this far below the folder that is shown.
+_MAX_LEVELS_BELOW = 3
 
 
-class Record(msgspec.Struct):
-    """What the page needs of a plane's entry in reconstruction.json."""
-
-    file: str
-    depth_mm: float
-    method: str
-    channel: str
-    pitch_mm: float
-    penalty_weight: float | None
-    penalty_weight_chosen: str
-    passes: int
-    flux_e: float
-    certificate: dict[str, Any] | None
-    sigma_file: str | None = None
-    opacity_file: str | None = None
+def files_below(directory: Path, name: str) -> list[Path]:
+    """Return the files of a name in a folder and down to three folders below it, in order."""
+    levels = range(_MAX_LEVELS_BELOW + 1)
+    return sorted({path for level in levels for path in directory.glob("*/" * level + name)})
 
 
-class Focus(msgspec.Struct):
-    """A focus curve and the depths it marks."""
-
-    depth_mm: list[float]
-    detail_e2: list[float]
-    sharp_mm: list[float]
-
-
-class DepthMap(msgspec.Struct):
-    """What the page needs of a sweep's depth map."""
-
-    file: str
-    confidence: str
-    all_in_focus: str
-    unit: str
-    bins_px: int
-    sure_above: float
-    sure_share: float
-
-
-class Result(msgspec.Struct):
-    """What the page needs of reconstruction.json."""
-
-    planes: Annotated[list[Record], msgspec.Meta(min_length=1)]
-    options: dict[str, Any]
-    versions: dict[str, str]
-    inputs: dict[str, str]
-    wall_time_s: float
-    focus: Focus | None = None
-    depth_map: DepthMap | None = None
-
-
-class ErrorRow(msgspec.Struct):
-    """What the page needs of a row of metrics.json."""
-
-    depth_mm: float
-    object: str
-    method: str
-    poses: str
-    mse_bright: float
-    mse_texture: float
-    psnr_db: float | None
-    mse_plane: float | None = None
-
-
-class Errors(msgspec.Struct):
-    """What the page needs of metrics.json."""
-
-    planes: list[ErrorRow]
-
-
-class Overview(msgspec.Struct):
-    """What the page needs of overview.json."""
-
-    set: str
-    views: int
-    size_px: tuple[int, int]
-    exposure_s: float
-    read_noise_e: float
-    brightness: Brightness
-
-
-class Measured(msgspec.Struct):
-    """A number of noise.json."""
-
-    value: float | None
-    why: str | None = None
-    ci95: tuple[float, float] | None = None
-
-
-class Noise(msgspec.Struct):
-    """What the page needs of noise.json."""
-
-    offset_dn: Measured
-    gain_dn_per_e: Measured
-    read_noise_e: Measured
-    dark_current_e_per_s: Measured
-    likelihood: str
-    frames: list[dict[str, Any]]
-    temperature_c: dict[str, float] | None = None
-
-
-class StageFigure(msgspec.Struct):
-    """A number of the `stage` of geometry.json."""
-
-    value: float | None
-    sigma: float | None
-
-
-class Stage(msgspec.Struct):
-    """What the page needs of the `stage` of geometry.json."""
-
-    pitch_x_mm: StageFigure
-    pitch_y_mm: StageFigure
-    scale_x: StageFigure
-    scale_y: StageFigure
-    squareness_rad: StageFigure
-    backlash_x_mm: StageFigure
-    backlash_y_mm: StageFigure
-    tilt_rad: StageFigure
-    node_residual_rms_mm: StageFigure
-    residuals_mm: list[tuple[float, float, float]] | None
-
-
-class Node(msgspec.Struct):
-    """What the page needs of a node of geometry.json."""
-
-    node: tuple[int, int]
-    sigma_mm: float
-    sigma_rad: float
-
-
-class Geometry(msgspec.Struct):
-    """What the page needs of geometry.json."""
-
-    nodes: Annotated[list[Node], msgspec.Meta(min_length=1)]
-    reference_node: tuple[int, int]
-    stage: Stage
-    transfer_sigma_px: dict[str, float]
-    rms_inlier_px: float
-    corners: int
-    outliers: int
-
-
-def read_result(path: Path, kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Read a JSON file whole, after checking that it holds what `kind` names.
+def read_result[Record](path: Path, kind: type[Record]) -> Record:
+    """Read a JSON file as one of the types of `formats.results.records`.
 
     Raises
     ------
     BadValue
-        It does not.
+        The file is not of this type.
     """
     try:
-        content: dict[str, Any] = msgspec.json.decode(path.read_bytes())
-        msgspec.convert(content, kind)
+        return msgspec.json.decode(path.read_bytes(), type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, OSError) as failure:
         raise BadValue(f"{path}: is not a result that can be shown ({failure}); reconstruct again") from failure
-    return content
+
+
+def results_below(directory: Path) -> dict[Path, ReconstructionRecord]:
+    """Return each reconstruction.json in a folder and below it, by its folder.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is none, or one that cannot be read.
+    """
+    if not directory.is_dir():
+        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
+    paths = files_below(directory, RECONSTRUCTION_FILE)
+    if not paths:
+        raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
+    return {path.parent: read_result(path, ReconstructionRecord) for path in paths}

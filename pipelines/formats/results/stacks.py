@@ -1,4 +1,4 @@
-"""Planes as stacks: what one scale and one spacing say of many depths, and the ImageJ hyperstack that states them."""
+"""Planes as stacks: their common scale and spacing, and the ImageJ hyperstack that states both."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -7,32 +7,34 @@ from typing import Any
 
 import numpy as np
 import tifffile
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import writing
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import PlaneRecord
 
 STACK_FILE = "stack.tiff"
 
-# Of a step: depths are rounded when they are asked for.
+# Tolerance of equal steps, relative to a step: depths are rounded when they are given.
 _EQUAL_STEPS = 1e-3
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What one sample of a stack is, across and in depth.
+    """The spacing of the samples of a stack, across and in depth.
 
     Attributes
     ----------
     across : float
         Distance of neighbouring samples, in `unit`.
     unit : str
-        "mm" where all planes have one pitch. By default a plane's pitch grows with its depth, and its samples are one
-        angle apart: then "mrad", thousandths of x/z, which is right at every depth where no length is.
+        "mm" if all planes have the same pitch. By default the pitch of a plane grows with its depth, and its samples
+        are a constant angle apart: then "mrad", thousandths of x/z, which is the same at every depth.
     origin : (float, float)
         x, y of the first sample, in `unit`.
     step_mm : float, optional
-        From one depth to the next; None where the steps differ.
+        From one depth to the next; None if the steps differ.
     """
 
     across: float
@@ -41,52 +43,76 @@ class Scale:
     step_mm: float | None
 
 
-def stack_scale(records: Sequence[dict[str, Any]]) -> Scale:
-    """Return the scale of planes by their entries in reconstruction.json, in the order of their depths."""
-    depths = np.array([record["depth_mm"] for record in records])
-    pitches = np.array([record["pitch_mm"] for record in records])
+def stack_scale(records: Sequence[PlaneRecord]) -> Scale:
+    """Return the scale of planes, given their records in the order of their depths."""
+    depths = np.array([record.depth_mm for record in records])
+    pitches = np.array([record.pitch_mm for record in records])
     first = records[0]
-    if np.allclose(pitches, pitches[0], rtol=1e-9):
-        across, unit, origin = float(pitches[0]), "mm", first["origin_mm"]
-    else:
-        per_mrad = 1e3 / first["depth_mm"]
-        across, unit = float(np.mean(pitches / depths)) * 1e3, "mrad"
-        origin = [start * per_mrad for start in first["origin_mm"]]
     steps = np.diff(depths)
-    even = len(steps) > 0 and bool(np.ptp(steps) <= _EQUAL_STEPS * np.abs(steps).max())
-    return Scale(across, unit, (float(origin[0]), float(origin[1])), float(steps.mean()) if even else None)
+    equal = len(steps) > 0 and bool(np.ptp(steps) <= _EQUAL_STEPS * np.abs(steps).max())
+    step_mm = float(steps.mean()) if equal else None
+    if np.allclose(pitches, pitches[0], rtol=1e-9):
+        return Scale(float(pitches[0]), "mm", first.origin_mm, step_mm)
+    per_mrad = 1e3 / first.depth_mm
+    x, y = (start * per_mrad for start in first.origin_mm)
+    return Scale(float(np.mean(pitches / depths)) * 1e3, "mrad", (x, y), step_mm)
 
 
-def at_depths(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the entries of planes across the camera's axis: those given by a pose have no one depth."""
-    return [record for record in records if "rt_ref_plane" not in record]
+def at_depths(records: Sequence[PlaneRecord]) -> list[PlaneRecord]:
+    """Return the records of planes perpendicular to the camera's axis; those given by a pose have no single depth."""
+    return [record for record in records if record.rt_ref_plane is UNSET]
 
 
-def planes_in_order(records: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return one entry per plane that has one depth, the nearest first; a colour plane has several."""
-    by_file = {record["file"]: record for record in at_depths(records)}
-    return sorted(by_file.values(), key=lambda record: float(record["depth_mm"]))
+def planes_in_order(records: Sequence[PlaneRecord]) -> list[PlaneRecord]:
+    """Return one record per plane of constant depth, the nearest first; a colour plane has several records."""
+    by_file = {record.file: record for record in at_depths(records)}
+    return sorted(by_file.values(), key=lambda record: record.depth_mm)
 
 
-def write_stack(folder: Path, records: Sequence[dict[str, Any]]) -> Path | None:
+def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
     """Write the planes of a folder as one ImageJ hyperstack, and return its path.
 
-    Axes are depth, colour (where there is one), row, column; the calibration makes ImageJ show x, y and depth as they
-    are, and each slice is labelled with its depth and pitch. None for planes of different shapes, which fit no stack.
+    Axes are depth, colour (if any), row, column; the calibration makes ImageJ show x, y and depth in their units, and
+    each slice is labelled with its depth and pitch. Planes of different shapes do not fit into a stack: None.
 
     Parameters
     ----------
     folder : Path
-        Where the planes lie, and the stack will.
-    records : sequence of dict
+        Folder of the planes; the stack is written there, too.
+    records : sequence of PlaneRecord
         The `planes` of reconstruction.json, of one method.
     """
     planes = planes_in_order(records)
-    if len({tuple(record["shape"]) for record in planes}) > 1:
+    if len({record.shape for record in planes}) > 1:
         return None
     scale = stack_scale(planes)
     colours = max(len(at_depths(records)) // len(planes), 1)
-    labels = [f"{record['depth_mm']:g} mm, {record['pitch_mm']:.4g} mm/px" for record in planes]
+    path = folder / STACK_FILE
+    with writing(path) as file:
+        tifffile.imwrite(
+            file,
+            _slices(folder, planes),
+            shape=(len(planes), colours, *planes[0].shape),
+            dtype=np.float32,
+            imagej=True,
+            byteorder="<",
+            photometric="minisblack",
+            resolution=(1 / scale.across, 1 / scale.across),
+            metadata=_imagej_metadata(planes, scale, colours),
+        )
+    return path
+
+
+def _slices(folder: Path, planes: Sequence[PlaneRecord]) -> Iterator[NDArray[np.float32]]:
+    """Yield each colour of each plane (row, column), one plane in memory at a time."""
+    for record in planes:
+        pixels = np.asarray(read_frame(folder / Path(record.file).name).pixels_dn, np.float32)
+        yield from [pixels] if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+
+
+def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int) -> dict[str, Any]:
+    """Return the calibration of a stack in the words of ImageJ; origins are in samples there."""
+    labels = [f"{record.depth_mm:g} mm, {record.pitch_mm:.4g} mm/px" for record in planes]
     metadata: dict[str, Any] = {
         "axes": "ZCYX",
         "unit": scale.unit,
@@ -96,27 +122,7 @@ def write_stack(folder: Path, records: Sequence[dict[str, Any]]) -> Path | None:
         "Labels": [label for label in labels for _ in range(colours)],
     }
     if scale.step_mm is not None:
-        metadata |= {"spacing": scale.step_mm, "zorigin": -planes[0]["depth_mm"] / scale.step_mm}
+        metadata |= {"spacing": scale.step_mm, "zorigin": -planes[0].depth_mm / scale.step_mm}
     if colours > 1:
         metadata["mode"] = "composite"
-    path = folder / STACK_FILE
-    with writing(path) as file:
-        tifffile.imwrite(
-            file,
-            _slices(folder, planes),
-            shape=(len(planes), colours, *planes[0]["shape"]),
-            dtype=np.float32,
-            imagej=True,
-            byteorder="<",
-            photometric="minisblack",
-            resolution=(1 / scale.across, 1 / scale.across),
-            metadata=metadata,
-        )
-    return path
-
-
-def _slices(folder: Path, planes: Sequence[dict[str, Any]]) -> Iterator[NDArray[np.float32]]:
-    """Yield each colour of each plane (row, column), so that only one plane is in memory."""
-    for record in planes:
-        pixels = np.asarray(read_frame(folder / Path(record["file"]).name).pixels_dn, np.float32)
-        yield from [pixels] if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
+    return metadata

@@ -1,10 +1,9 @@
-"""The elemental set: a folder of images with `elemental.toml`, the way in for anyone's images and poses."""
+"""The elemental set: checked images and poses, whatever files they come from."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -12,108 +11,65 @@ from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import Map, NoiseModel
-from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_MAPS, FittedNoise, read_fitted_noise
-from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+from faintfield.pipelines.formats.results.fitted_noise import FittedNoise, read_fitted_noise
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS
+from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.sets.elemental_file import (
+    FILE_NAME,
+    ElementalSetFile,
+    Noise,
+    named_files,
+    read_set_file,
+)
 
-FILE_NAME = "elemental.toml"
-
-# Beside a set's images, where it is known: an exposure of nothing.
+# Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
-
-# How far the reference view's pose may be from zero: less than any calibration can tell.
-_ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
-
-
-class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[camera]` table. `mosaic` and `flat` extend the format for colour filters and vignetting."""
-
-    size_px: tuple[int, int]
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...] = ()
-    mosaic: tuple[str, ...] | None = None
-    flat: str | None = None
-
-
-class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated."""
-
-    gain_dn_per_e: float
-    read_noise_e: float
-    offset_dn: float | None = None
-    dark_current_e_per_s: float = 0.0
-    quantum_efficiency: float | None = None
-    saturation_dn: float | None = None
-
-
-class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first."""
-
-    image: str
-    rt_cam_ref: tuple[float, float, float, float, float, float]
-    node: tuple[int, int] | None = None
-    cx_px: float | None = None
-    cy_px: float | None = None
-    repeats: tuple[str, ...] = ()
-
-
-class ElementalSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together."""
-
-    format: Literal[1]
-    exposure_s: float
-    reference_view: int
-    camera: Camera
-    noise: Noise | str
-    view: list[View]
 
 
 @dataclass(frozen=True)
-class LoadedSet:
+class ElementalSet:
     """An elemental set that has been checked: everything but the pixels.
 
     Attributes
     ----------
     folder : Path
-        Where it lies; every path in it is relative to this.
-    settings : ElementalSet
+        Its folder; paths in the set are relative to it.
+    settings : ElementalSetFile
         What `elemental.toml` says.
     lens : Lens
-        Of the camera.
+        Lens of the camera.
     noise : NoiseModel
-        Offset NaN-free; zero where each raw file brings its own (`offset_from_files`).
+        Noise model of the camera; its offset is zero if each raw file brings its own (`offset_from_files`).
     offset_from_files : bool
-        The offset is each raw file's masked black level.
+        The offset of each raw file is the black level of its masked pixels.
     flat : float array (row, column), optional
         Relative response.
     unusable : bool array (row, column)
-        Pixels that never count (hot, dead).
+        Pixels that are left out (hot, dead).
     measured_in : Path, optional
-        The geometry.json that the lens was taken from; None where it is the set's own.
+        The geometry.json of the lens; None if the lens is the set's own.
     poses : str
         Where the poses come from: "stated" in the set, "measured", "nominal" or "true".
     described_in : str
         The file that says what the images are.
     noise_reference : tuple of Path
-        Exposures of nothing, where there are any.
+        Exposures without light, if there are any.
     bright_view : (Path, float), optional
-        The reference view in plenty of light and its exposure in s, where there is one.
+        The reference view in plenty of light and its exposure in s, if there is one.
     """
 
     folder: Path
-    settings: ElementalSet
+    settings: ElementalSetFile
     lens: Lens
     noise: NoiseModel
     offset_from_files: bool
     flat: NDArray[np.float32] | None
     unusable: NDArray[np.bool_]
     measured_in: Path | None = None
-    poses: Literal["stated", "measured", "nominal", "true"] = "stated"
+    poses: Poses = "stated"
     described_in: str = FILE_NAME
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None
@@ -130,25 +86,25 @@ class LoadedSet:
 
     @property
     def image_paths(self) -> list[Path]:
-        """Where the images lie: of each view the first frame."""
+        """Path of the first frame of each view."""
         return [self.folder / view.image for view in self.settings.view]
 
     @property
     def frames_per_view(self) -> int:
-        """How many frames are added up to a view."""
+        """Number of frames that are added up to a view."""
         return 1 + len(self.settings.view[0].repeats)
 
     def frame_paths(self, view: int) -> list[Path]:
-        """Return where all frames of a view lie."""
+        """Return the paths of all frames of a view."""
         entry = self.settings.view[view]
         return [self.folder / name for name in (entry.image, *entry.repeats)]
 
     def background_e(self, noise: NoiseModel) -> Map:
-        """Return the dark electrons expected in all frames of a view, by the noise model of the set or a part of it."""
+        """Return the dark electrons expected in all frames of a view, by the noise model of all pixels or a part."""
         return noise.background_e(self.settings.exposure_s)
 
     def read_variance_e2(self, noise: NoiseModel) -> Map:
-        """Return the variance that reading adds to a view: once per frame."""
+        """Return the variance in e⁻² that reading adds to a view, once per frame."""
         return self.frames_per_view * noise.read_variance_e2()
 
     def principal_points_px(self) -> NDArray[np.float64]:
@@ -164,8 +120,9 @@ class LoadedSet:
     def depth_of_disparity(self, disparity_px: float) -> float:
         """Return the depth at which a point moves by `disparity_px` from one node to the next, right or down.
 
-        A camera moved by B along its row images a point at depth z moved by −fx B / z, plus what rectification moved
-        the principal point; with nodes and poses known this is one equation for 1/z, solved over all views.
+        If the camera moves by B along its rows, the image of a point at depth z moves by −fx B / z, plus the shift of
+        the principal point by rectification. With known nodes and poses this is an equation for 1/z, solved by least
+        squares over all views.
 
         Raises
         ------
@@ -193,12 +150,12 @@ class LoadedSet:
 
     @staticmethod
     def _disparity_at_infinity_px(steps: NDArray[np.float64], shift_px: NDArray[np.float64]) -> float:
-        """Return by how much infinitely far points move between neighbouring nodes."""
+        """Return the movement of infinitely far points between neighbouring nodes."""
         return float(np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30))
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
-        for name in [self.described_in, *_named_files(self.settings)]:
+        for name in [self.described_in, *named_files(self.settings)]:
             yield name, sha256(self.folder / name)
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
@@ -208,28 +165,23 @@ class LoadedSet:
             yield self.measured_in.name, sha256(self.measured_in)
 
 
-def load_set(folder: Path) -> LoadedSet:
+def load_set(folder: Path) -> ElementalSet:
     """Read and check `elemental.toml` and the files it names, except the images' pixels.
 
     Raises
     ------
     InputError
-        A file is missing, a key unknown, or a value cannot be; the message names it.
+        A file is missing, a key is unknown, or a value is impossible; the message names it.
     """
     path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
     folder = path.parent
-    settings = read_toml(path, ElementalSet)
-    _check_numbers(path, settings)
-    _check_views(path, settings)
-    for name in _named_files(settings):
-        if not inside(folder, name, f"{path}: file").is_file():
-            raise MissingFile(f"{path}: {name} is named but missing in {folder}; put it there or remove its entry")
+    settings = read_set_file(path)
     camera = settings.camera
-    with _complaints_about(path, "camera"):
+    with _naming(path, "camera"):
         lens = Lens(camera.size_px, camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.distortion)
-    with _complaints_about(path, "noise"):
+    with _naming(path, "noise"):
         noise = _noise(folder, settings)
-    return LoadedSet(
+    return ElementalSet(
         folder,
         settings,
         lens,
@@ -242,68 +194,15 @@ def load_set(folder: Path) -> LoadedSet:
 
 
 @contextmanager
-def _complaints_about(path: Path, table: str) -> Iterator[None]:
-    """Say of a value that cannot be in which file and table it stands."""
+def _naming(path: Path, table: str) -> Iterator[None]:
+    """Name the file and the table of a value that is refused."""
     try:
         yield
     except ValueError as failure:
         raise BadValue(f"{path}: {table}: {failure}; correct it") from failure
 
 
-def write_set(folder: Path, settings: ElementalSet) -> None:
-    """Write `elemental.toml`; the images come first, so that a folder with this file is whole."""
-    write_toml(folder / FILE_NAME, settings)
-
-
-def _named_files(settings: ElementalSet) -> list[str]:
-    """Return the names of the files that `elemental.toml` names."""
-    optional = [settings.camera.flat, settings.noise if isinstance(settings.noise, str) else None]
-    images = [name for view in settings.view for name in (view.image, *view.repeats)]
-    return [*(name for name in optional if name is not None), *images]
-
-
-def _check_numbers(path: Path, settings: ElementalSet) -> None:
-    """Refuse exposures that cannot be, and mosaics that are no mosaics."""
-    if settings.exposure_s <= 0:
-        raise BadValue(f"{path}: exposure_s = {settings.exposure_s}; it must be positive: give the exposure in seconds")
-    mosaic = settings.camera.mosaic
-    if mosaic is None:
-        return
-    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1 or set("".join(mosaic)) - set("RGB"):
-        raise BadValue(
-            f"{path}: camera.mosaic = {list(mosaic)}; give rows of equal length of the letters R, G and B, such as "
-            '["RG", "GB"]'
-        )
-
-
-def _check_views(path: Path, settings: ElementalSet) -> None:
-    """Refuse a set without views, without its reference, or with a view named twice."""
-    count = len(settings.view)
-    if not 0 <= settings.reference_view < count:
-        raise BadValue(
-            f"{path}: reference_view = {settings.reference_view}, but there are {count} views; give 0…{count - 1}"
-        )
-    reference = np.array(settings.view[settings.reference_view].rt_cam_ref)
-    if (np.abs(reference) > _ZERO_POSE).any():
-        raise BadValue(
-            f"{path}: view[{settings.reference_view}] is the reference but its pose is {reference.tolist()}; "
-            "poses are relative to the reference view, whose own is zero"
-        )
-    _refuse_repeated(path, "image", [name for view in settings.view for name in (view.image, *view.repeats)])
-    counts = {1 + len(view.repeats) for view in settings.view}
-    if len(counts) > 1:
-        raise BadValue(f"{path}: views have {min(counts)} to {max(counts)} frames; give all of them as many repeats")
-    _refuse_repeated(path, "node", [list(view.node) for view in settings.view if view.node is not None])
-
-
-def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
-    """Refuse a name that more than one view has."""
-    for index, name in enumerate(names):
-        if name in names[:index]:
-            raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
-
-
-def _noise(folder: Path, settings: ElementalSet) -> FittedNoise:
+def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:
     """Return the noise model that the `[noise]` table states, or that `faintfield noise` fitted."""
     camera = settings.camera
     if isinstance(settings.noise, str):
@@ -323,18 +222,3 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
             f"got {flat.shape[::-1]}, least {np.nanmin(flat)}"
         )
     return flat
-
-
-def phase_of(value: Map | None, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]) -> Any:
-    """Return the part of a map (or the one number, or None) that lies on one phase of a mosaic."""
-    if value is None or np.ndim(value) == 0:
-        return value
-    return np.asarray(value)[first[0] :: period[0], first[1] :: period[1]][: shape[0], : shape[1]]
-
-
-def noise_of_phase(
-    noise: NoiseModel, first: tuple[int, int], period: tuple[int, int], shape: tuple[int, int]
-) -> NoiseModel:
-    """Return the noise model of one phase of a mosaic."""
-    maps = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
-    return replace(noise, **{name: phase_of(getattr(noise, name), first, period, shape) for name in maps})

@@ -1,4 +1,4 @@
-"""What only a simulator knows of a set, and how far a reconstruction is from it."""
+"""The ground truth of a simulated set, and its object at a depth."""
 
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import Poses
 
 TRUTH_FILE = "truth.json"
 
-# Planes this close to an object's depth are compared with it.
+# A plane within this distance of an object's depth is compared with it.
 _SAME_DEPTH_MM = 0.05
 
 
@@ -26,14 +27,14 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole of `truth.json`; file names are relative to the set."""
+    """`truth.json`; file names are relative to the set."""
 
     snr: float
     photons_linear: float
     photons_from_moments: float
     photons_on_object: float
     noise_free: str
-    poses: str
+    poses: Poses
     true_rt_cam_ref: list[tuple[float, float, float, float, float, float]]
     planes: list[TruePlane]
 
@@ -50,7 +51,7 @@ def read_truth(folder: Path) -> Truth | None:
 
 
 def true_plane(truth: Truth | None, depth_mm: float) -> TruePlane | None:
-    """Return the object that stands at a depth, None where there is none."""
+    """Return the object that stands at a depth, None if there is none."""
     planes = [] if truth is None else truth.planes
     return next((plane for plane in planes if abs(plane.depth_mm - depth_mm) < _SAME_DEPTH_MM), None)
 

@@ -1,85 +1,16 @@
-"""A set whose lens and poses are those that were measured, not those that the stage was told.
-
-Reading what was measured needs none of the calibration, which is heavy to load.
-"""
+"""A set with the lens and the poses that `faintfield geometry` measured, instead of those stated or told the stage."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from faintfield.calib.lens import Lens
-from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.sets.elemental_set import LoadedSet
-
-GEOMETRY_FILE = "geometry.json"
-COVARIANCE_FILE = "geometry_covariance.npz"
-CORNERS_FILE = "geometry_corners.npz"
-GEOMETRY_PAGE = "geometry.html"
-CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, read_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 
-def files_beside(content: dict[str, Any]) -> list[str]:
-    """Return the names of the files that lie beside a geometry.json, from what it says."""
-    cameras = [CAMERA_FILE.format(*entry["node"]) for entry in content["nodes"]]
-    return [COVARIANCE_FILE, CORNERS_FILE, GEOMETRY_PAGE, *cameras]
-
-
-class LensEntry(msgspec.Struct, frozen=True):
-    """The `lens` of geometry.json."""
-
-    model: str
-    fx_px: float
-    fy_px: float
-    cx_px: float
-    cy_px: float
-    distortion: tuple[float, ...]
-
-
-class NodeEntry(msgspec.Struct, frozen=True):
-    """One of the `nodes` of geometry.json."""
-
-    node: tuple[int, int]
-    rt_cam_ref: tuple[float, float, float, float, float, float]
-    sigma_mm: float
-    sigma_rad: float
-
-
-class GeometryFile(msgspec.Struct, frozen=True):
-    """What others read of geometry.json; the rest of it is for people."""
-
-    lens: LensEntry
-    size_px: tuple[int, int]
-    nodes: list[NodeEntry]
-    reference_node: tuple[int, int]
-
-    def camera_lens(self) -> Lens:
-        """Return the lens."""
-        lens = self.lens
-        return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-
-
-def read_geometry(path: Path) -> GeometryFile:
-    """Read geometry.json, or that of a folder.
-
-    Raises
-    ------
-    MissingFile, BadValue
-        There is none, or it is no result of `faintfield geometry`.
-    """
-    path = path / GEOMETRY_FILE if path.is_dir() else path
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
-    try:
-        geometry = msgspec.json.decode(path.read_bytes(), type=GeometryFile)
-        geometry.camera_lens()
-    except (msgspec.DecodeError, ValueError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield geometry` ({failure}); run that again") from failure
-    return geometry
-
-
-def with_measured_geometry(loaded: LoadedSet, path: Path) -> LoadedSet:
+def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
     """Return a set with the lens of a geometry.json and each view at its node's measured pose.
 
     Raises

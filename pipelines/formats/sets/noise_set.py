@@ -1,4 +1,4 @@
-"""The noise set: a folder of dark and flat frames with `noise.toml`, when they were not taken by `capture`."""
+"""The noise set: a folder of dark and flat frames with `noise.toml`, or those frames of a session."""
 
 from pathlib import Path
 from typing import Literal
@@ -9,6 +9,7 @@ import numpy as np
 from faintfield.calib.noise import Conditions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
+from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 
@@ -22,19 +23,8 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     columns: tuple[int, int]
 
 
-class NoiseFrame(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One `[[frame]]`; a raw file's exposure may come from its EXIF instead."""
-
-    file: str
-    kind: Literal["dark", "flat"]
-    exposure_s: float | None = None
-    temperature_c: float | None = None
-    level: int = 0
-    photons: float | None = None
-
-
 class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `noise.toml`. `saturation_dn`, `mosaic` and `region` are for what image files do not say."""
+    """`noise.toml`; `saturation_dn`, `mosaic` and `region` state what the image files do not."""
 
     format: Literal[1]
     frame: list[NoiseFrame]
@@ -125,8 +115,8 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
     return dict(sorted(groups.items(), key=lambda item: (item[0].kind, item[0].exposure_s, item[0].level)))
 
 
-def temperature_notes(settings: NoiseSet) -> tuple[dict[str, float] | None, list[str]]:
-    """Return the range of temperatures, None without any, and what is doubtful about them."""
+def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list[str]]:
+    """Return the range of the frames' temperatures, None without any, and warnings about it."""
     missing = [frame.file for frame in settings.frame if frame.temperature_c is None]
     known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
     warnings = []
@@ -142,11 +132,11 @@ def temperature_notes(settings: NoiseSet) -> tuple[dict[str, float] | None, list
             f"the temperature ran from {min(known):g} to {max(known):g} °C, which moves the dark current by "
             f"{10 * np.ptp(known):.0f} %; let the camera settle before recording"
         )
-    return {"mean": float(np.mean(known)), "min": min(known), "max": max(known)}, warnings
+    return TemperatureRange(float(np.mean(known)), min(known), max(known)), warnings
 
 
 def _check_numbers(path: Path, frame: NoiseFrame) -> None:
-    """Refuse exposures, temperatures and photons that cannot be."""
+    """Refuse impossible exposures, temperatures and photons."""
     for key, value in (("exposure_s", frame.exposure_s), ("photons", frame.photons)):
         if value is not None and value < 0:
             raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must not be negative")

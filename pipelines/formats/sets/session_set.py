@@ -1,4 +1,4 @@
-"""The frames of one kind of a session as an elemental set: what a reconstruction takes, in the session's own files."""
+"""The frames of one kind of a session as an elemental set, in the session's own files."""
 
 from pathlib import Path
 from typing import Literal
@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.results.fitted_noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
-from faintfield.pipelines.formats.sets.elemental_set import Camera, ElementalSet, LoadedSet, View, load_set
-from faintfield.pipelines.formats.sets.measured_poses import GEOMETRY_FILE, read_geometry, with_measured_geometry
+from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
 from faintfield.rig.plan import CapturePlan, StepKind, Stop
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 from faintfield.rig.session.frames import planned_frames
@@ -24,17 +27,17 @@ type SceneKind = Literal["dark_scene", "bright"]
 _CALLED: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 
 
-def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
-    """Return a session's views of the scene, in electrons by its noise.json, from where its geometry.json says.
+def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
+    """Return a session's views of the scene, with the noise of its noise.json and the poses of its geometry.json.
 
-    All frames of a node are one view: they are added up, whatever their exposures.
+    All frames of a node are added up to one view, whatever their exposures.
 
     Parameters
     ----------
     folder : Path
-        Of the session.
+        Folder of the session.
     kind : str
-        Which set.
+        The dark scene, or the bright one.
     geometry : Path, optional
         Another geometry.json than the session's own, or its folder.
 
@@ -46,13 +49,13 @@ def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | 
     return with_measured_geometry(nominal_session(folder, kind, geometry), geometry or folder)
 
 
-def load_set_or_session(folder: Path) -> LoadedSet:
+def load_set_or_session(folder: Path) -> ElementalSet:
     """Return an elemental set, or the dark scene of a session."""
     return load_session(folder) if has_session(folder) else load_set(folder)
 
 
-def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> LoadedSet:
-    """Return the same with the measured lens, but the camera where the stage was told to take it."""
+def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
+    """Return a session's views with the measured lens, but with the poses that the stage was told."""
     plan = read_plan(folder).plan
     exposure_s, frames = _frames_of_views(folder, plan, kind)
     measured_in = geometry or folder / GEOMETRY_FILE
@@ -66,9 +69,9 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
     views = [_view(stop, plan.centre, names) for stop, names in frames]
     reference = [view.node for view in views].index(plan.centre.node)
-    return LoadedSet(
+    return ElementalSet(
         folder,
-        ElementalSet(1, exposure_s, reference, camera, NOISE_FILE, views),
+        ElementalSetFile(1, exposure_s, reference, camera, NOISE_FILE, views),
         lens,
         noise.model,
         offset_from_files=False,
@@ -117,7 +120,7 @@ def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
 
 
 def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:
-    """Return the response (row, column) relative to pixels about the lens's axis, in whose electrons planes are."""
+    """Return the response (row, column) relative to the pixels around the lens's axis, to which planes refer."""
     near = max(lens.size_px) // 20 + 1
     row, column = round(lens.cy_px), round(lens.cx_px)
     window = (slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near))
@@ -127,6 +130,6 @@ def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_]
 
 
 def _view(stop: Stop, centre: Stop, names: list[str]) -> View:
-    """Return the view of a node, with the pose of a camera that the stage takes where it is told."""
+    """Return the view of a node, with the pose that the stage was told."""
     right_mm, down_mm = stop.target.x_mm - centre.target.x_mm, stop.target.y_mm - centre.target.y_mm
     return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]))

@@ -18,14 +18,14 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from faintfield.calib.geometry.bundle import Problem, solve
+from faintfield.calib.geometry.bundle import BundleProblem, solve
 from faintfield.calib.geometry.observations import gather
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
 from faintfield.calib.lens import Lens
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from tests.calib.geometry.simulated import BOARDS, NOISE_PX, OPTICS, Simulated, centres_mm, simulated
 
-LENIENT = GeometrySettings(most_transfer_sigma_px=20.0, most_holdout_ratio=10.0)
+LENIENT = GeometrySettings(max_transfer_sigma_px=20.0, max_holdout_ratio=10.0)
 TRUE_LENS = Lens(OPTICS.size_px, OPTICS.fx_px, OPTICS.fy_px, OPTICS.cx_px, OPTICS.cy_px, OPTICS.distortion)
 
 
@@ -116,7 +116,7 @@ def test_a_solution_does_not_depend_on_the_order_of_what_is_given() -> None:
 def test_the_optimizer_stays_where_the_solution_is() -> None:
     given = simulated(4)
     shapes = {name: board.corner_shape for name, board in BOARDS.items()}
-    problem = Problem(gather(given.observations, shapes, given.reference), OPTICS.size_px, 40.0, "opencv5", True)
+    problem = BundleProblem(gather(given.observations, shapes, given.reference), OPTICS.size_px, 40.0, "opencv5", True)
     bundle = solve(problem)
     before = bundle.residuals()
     mrcal.optimize(**bundle.inputs)
@@ -196,7 +196,7 @@ def test_a_plane_that_other_views_do_not_see_is_refused(depth_mm: float) -> None
 def test_few_nodes_are_named_where_the_transfer_is_not_known() -> None:
     few = [one for one in simulated(9, standing=six_boards(6, 8, 40.0)[:2]).observations if one.node[0] <= 1]
     with pytest.raises(NotIdentifiable, match=r"6 node\(s\) only: take at least 9"):
-        calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1), GeometrySettings(most_transfer_sigma_px=0.1))
+        calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1), GeometrySettings(max_transfer_sigma_px=0.1))
 
 
 def test_without_the_reference_node_nothing_is_solved() -> None:
@@ -264,11 +264,11 @@ def test_a_shaken_view_is_named_and_does_not_pull() -> None:
         for one in given.observations
     ]
     geometry = calibrated(replace(given, observations=shaken))
-    (doubt,) = geometry.doubts
-    assert "at node (0, 0), board 'board-1' (" in doubt
-    assert "node (0, 0), board 'board-2'" not in doubt
+    (warning,) = geometry.warnings
+    assert "at node (0, 0), board 'board-1' (" in warning
+    assert "node (0, 0), board 'board-2'" not in warning
     assert np.abs(centres_mm(geometry.rt_cam_ref) - centres_mm(given.poses)).max() < 0.5
-    assert calibrated(given).doubts == []
+    assert calibrated(given).warnings == []
 
 
 def test_one_view_of_another_node_is_named() -> None:

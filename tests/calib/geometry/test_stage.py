@@ -103,7 +103,7 @@ def test_nodes_on_a_line_say_nothing_of_the_stage(measured: RigGeometry) -> None
 def test_swapped_nodes_are_named(measured: RigGeometry) -> None:
     poses = faulty(measured).rt_cam_ref.copy()
     poses[[3, 21]] = poses[[21, 3]]
-    first, second = stage_report(replace(measured, rt_cam_ref=poses), {}, 50.0).doubts
+    first, second = stage_report(replace(measured, rt_cam_ref=poses), {}, 50.0).warnings
     assert "node (0, 3) lies 223" in first
     assert "where node (4, 1) belongs: check the node of its images" in first
     assert "node (4, 1) lies 223" in second
@@ -113,13 +113,13 @@ def test_swapped_nodes_are_named(measured: RigGeometry) -> None:
 def test_lost_steps_are_named(measured: RigGeometry) -> None:
     poses = faulty(measured).rt_cam_ref.copy()
     poses[7, 3] += 20.0
-    (doubt,) = stage_report(replace(measured, rt_cam_ref=poses), {}, 50.0).doubts
-    assert "node (1, 2) lies 20.0 mm from its place: check" in doubt
+    (warning,) = stage_report(replace(measured, rt_cam_ref=poses), {}, 50.0).warnings
+    assert "node (1, 2) lies 20.0 mm from its place: check" in warning
 
 
 def test_squares_of_another_size_show_in_the_distance_of_the_nodes(measured: RigGeometry) -> None:
-    assert stage_report(faulty(measured), {}, 50.0).doubts == []  # 0.2 % is a stage
-    doubts = stage_report(faulty(measured), {}, 51.0).doubts
-    assert len(doubts) == 2
-    assert "along x the nodes lie 1.8% closer together than pitch_mm says: measure square_mm" in doubts[0]
-    assert "along y" in doubts[1]
+    assert stage_report(faulty(measured), {}, 50.0).warnings == []  # 0.2 % is a stage
+    warnings = stage_report(faulty(measured), {}, 51.0).warnings
+    assert len(warnings) == 2
+    assert "along x the nodes lie 1.8% closer together than pitch_mm says: measure square_mm" in warnings[0]
+    assert "along y" in warnings[1]

@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.selection import Likelihood
+from faintfield.calib.noise.selection import NoiseLikelihood
 from tests.calib.noise.darkroom import Chip, Frames, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
@@ -245,7 +245,7 @@ def test_noise_that_changed_between_series_is_noticed() -> None:
 def test_a_plain_sensor_raises_no_doubts() -> None:
     result = calibrate(take(*specimen(12, shape=(128, 128), jitter_dn=0.5, banding_dn=1.0, dcnu=0.1)))
     assert result.warnings == ()
-    assert result.likelihood is Likelihood.GAUSSIAN
+    assert result.likelihood is NoiseLikelihood.GAUSSIAN
     for name, truth in [("frame_jitter_dn", 0.5), ("row_noise_dn", 1.0), ("dsnu_dn", 3.0), ("dcnu_e_per_s", 0.02)]:
         assert value(result, name) == pytest.approx(truth, rel=0.3), name
 

@@ -10,7 +10,7 @@ from scipy import stats
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.exact import PARAMETERS, Counts, exact_likelihood
 from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, DARK_NODES, mass_function
-from faintfield.calib.noise.selection import Likelihood
+from faintfield.calib.noise.selection import NoiseLikelihood
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
@@ -103,7 +103,7 @@ def test_below_an_electron_of_read_noise_the_exact_mass_function_reaches_the_bou
     errors: dict[str, list[float]] = {name: [] for name in truth}
     for seed in range(repeats):
         result = calibrate(take(seed, shape=shape, read_noise_e=0.3))
-        assert result.likelihood is Likelihood.EXACT
+        assert result.likelihood is NoiseLikelihood.EXACT
         for name, value in truth.items():
             found = result.estimates[name].value
             assert found is not None
@@ -131,7 +131,7 @@ def test_values_cut_off_at_black_leave_no_bias() -> None:
     errors: dict[str, list[float]] = {name: [] for name in truth}
     for seed in range(24):
         result = calibrate(take(seed, offset_dn=3.0))
-        assert result.likelihood is Likelihood.CENSORED
+        assert result.likelihood is NoiseLikelihood.CENSORED
         for name, value in truth.items():
             found = result.estimates[name].value
             assert found is not None
@@ -149,7 +149,7 @@ def test_values_cut_off_give_no_maps_and_a_warning() -> None:
 
 def test_banding_that_blurs_single_electrons_keeps_the_gaussian() -> None:
     result = calibrate(take(3, read_noise_e=0.3, banding_dn=0.5, jitter_dn=0.3))
-    assert result.likelihood is Likelihood.GAUSSIAN
+    assert result.likelihood is NoiseLikelihood.GAUSSIAN
     for name, truth in (("gain_dn_per_e", 2.0), ("read_noise_e", 0.3)):
         assert result.estimates[name].value == pytest.approx(truth, rel=0.05)
 

@@ -1,0 +1,228 @@
+"""Where the camera was, from a board set: corners found, lens and poses solved; the record and files of the result."""
+
+import io
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.detection import BoardCorners, detect_all
+from faintfield.calib.errors import TooFewViews
+from faintfield.calib.geometry import (
+    BoardObservation,
+    GeometrySettings,
+    RigGeometry,
+    Target,
+    calibrate_geometry,
+    rms_over_views,
+    transfer_sigma_at,
+)
+from faintfield.calib.geometry.stage import StageEstimate, StageReport, approach_directions, stage_report
+from faintfield.pipelines.console import inform, progress
+from faintfield.pipelines.errors import WrongSize
+from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.geometry import (
+    CAMERA_FILE,
+    CORNERS_FILE,
+    COVARIANCE_FILE,
+    BoardRecord,
+    GeometryOptions,
+    GeometryRecord,
+    LensRecord,
+    NodeRecord,
+    RepeatabilityRecord,
+    StageFigure,
+    StageRecord,
+)
+from faintfield.pipelines.formats.sets.board_set import BoardSet, BoardView
+
+# A message about missed boards names this many nodes; more would not fit one line.
+_MAX_NODES_NAMED = 8
+
+
+@dataclass(frozen=True)
+class MeasuredGeometry:
+    """What a board set says of the camera and its stage.
+
+    Attributes
+    ----------
+    board_set : BoardSet
+        The images.
+    settings : GeometrySettings
+        Lens model and limits.
+    observations : list of BoardObservation
+        All corners that were found.
+    rig : RigGeometry
+        Lens and poses.
+    stage : StageReport
+        What the poses say of the stage.
+    """
+
+    board_set: BoardSet
+    settings: GeometrySettings
+    observations: list[BoardObservation]
+    rig: RigGeometry
+    stage: StageReport
+
+
+def measure_geometry(board_set: BoardSet, settings: GeometrySettings) -> MeasuredGeometry:
+    """Find the boards in all images of a set, and solve for the lens and the camera's poses.
+
+    Raises
+    ------
+    InputError, CalibrationError
+        An image cannot be used, or the corners do not determine the geometry; the message says what to add.
+    """
+    observations, size_px = _observe(board_set)
+    rig = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
+    visits = [] if board_set.one_sided else [(view.node, view.sweep) for view in board_set.views]
+    stage = stage_report(rig, approach_directions(visits), board_set.pitch_mm)
+    return MeasuredGeometry(board_set, settings, observations, rig, stage)
+
+
+def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> GeometryRecord:
+    """Return the record of a measured geometry."""
+    rig, repeatability = measured.rig, measured.rig.repeatability
+    nodes = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
+    inputs = dict(measured.board_set.input_hashes())
+    return GeometryRecord(
+        lens=_lens_record(rig),
+        size_px=rig.lens.size_px,
+        reference_node=rig.nodes[rig.reference],
+        nodes=[NodeRecord(*of_node) for of_node in nodes],
+        rms_inlier_px=rig.rms_inlier_px,
+        rms_mrcal_px=rig.rms_mrcal_px,
+        corner_sigma_px=rig.sigma_px,
+        corners=rig.corners,
+        outliers=rig.outliers,
+        holdout_ratio=rig.holdout_ratio,
+        warnings=rig.warnings,
+        transfer_sigma_px={
+            f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in measured.settings.depths_mm
+        },
+        repeatability=None if repeatability is None else RepeatabilityRecord(**asdict(repeatability)),
+        boards=_board_records(measured),
+        stage=_stage_record(measured.stage),
+        **msgspec.structs.asdict(provenance("geometry", options, inputs)),
+    )
+
+
+def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
+    """Return the files beside geometry.json by name: covariance, corners, and a camera model for each node.
+
+    The covariance is of fx, fy, cx, cy, the distortion, then rt_cam_ref of every node. The corners are those of the
+    boards whose pose was solved.
+    """
+    rig = measured.rig
+    solved = {board.target for board in rig.boards}
+    files: dict[str, bytes | str] = {
+        COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.intrinsics),
+        CORNERS_FILE: _corners_npz([seen for seen in measured.observations if seen.target in solved]),
+    }
+    for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True):
+        files[CAMERA_FILE.format(*node)] = camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
+    return files
+
+
+def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, int]]:
+    """Find the boards in all views; return their corners and the size of the images."""
+    boards, views = list(board_set.boards.values()), board_set.views
+    sizes_px: list[tuple[int, int]] = []
+    images = _images(views, sizes_px)
+    found = progress(detect_all(images, boards, os.cpu_count() or 1), "looking for boards", len(views))
+    per_view = list(zip(views, found, strict=True))
+    _inform_of_found(per_view)
+    observations = [
+        BoardObservation(view.node, Target(seen.board, view.sweep), seen.corners, seen.pixels, seen.sigma_px)
+        for view, boards_seen in per_view
+        for seen in boards_seen
+        if len(seen.corners)
+    ]
+    if not observations:
+        markers = sum(board.markers for _, seen in per_view for board in seen)
+        raise TooFewViews(
+            f"{board_set.source}: {markers} markers of the boards and no corner between them in {len(views)} "
+            f"views; compare [[board]] ({'columns, rows' if markers else 'dictionary'}, first_marker_id) with the print"
+            ", or expose longer"
+        )
+    return observations, sizes_px[0]
+
+
+def _images(views: Sequence[BoardView], sizes_px: list[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
+    """Yield the image of each view, its size added to `sizes_px`; one of another size than the first is refused."""
+    for view in views:
+        image = view.image()
+        height, width = image.shape
+        sizes_px.append((width, height))
+        if sizes_px[0] != (width, height):
+            raise WrongSize(
+                f"{view.paths[0]}: is {width} x {height} px, the first image {sizes_px[0][0]} x {sizes_px[0][1]} px; "
+                "all images of one camera have one size; take it again, or leave it out"
+            )
+        yield image
+
+
+def _inform_of_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> None:
+    """Name views without boards, and prints in the older layout."""
+    empty = [view.node for view, seen in per_view if not any(len(board.corners) for board in seen)]
+    if empty:
+        names = ", ".join(str(list(node)) for node in empty[:_MAX_NODES_NAMED])
+        more = " …" if empty[_MAX_NODES_NAMED:] else ""
+        inform(f"no board was found in {len(empty)} of {len(per_view)} views (nodes {names}{more})")
+    legacy = sorted({board.board for _, seen in per_view for board in seen if board.legacy})
+    if legacy:
+        inform(f"printed in OpenCV's older layout, which begins with a white square: {', '.join(legacy)}")
+
+
+def _lens_record(rig: RigGeometry) -> LensRecord:
+    """Return the lens with the standard deviation of each number."""
+    lens, sigma = rig.lens, np.sqrt(np.diag(rig.covariance)[: len(rig.intrinsics)])
+    return LensRecord(
+        rig.lens_model, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion), tuple(sigma.tolist())
+    )
+
+
+def _board_records(measured: MeasuredGeometry) -> list[BoardRecord]:
+    """Return each board with what is printed on it, so that the stored corners can be solved again."""
+    warp_x_mm, warp_y_mm = measured.rig.warp_mm.tolist()
+    return [
+        BoardRecord(
+            **asdict(measured.board_set.boards[pose.target.board]),
+            sweep=pose.target.sweep,
+            rt_ref_board=tuple(pose.rt_ref_board.tolist()),
+            warp_mm=(warp_x_mm, warp_y_mm),
+        )
+        for pose in measured.rig.boards
+    ]
+
+
+def _stage_record(stage: StageReport) -> StageRecord:
+    """Return the figures of the stage as they stand in geometry.json."""
+    figures: dict[str, Any] = {
+        name: StageFigure(**asdict(value)) for name, value in vars(stage).items() if isinstance(value, StageEstimate)
+    }
+    return StageRecord(**figures, residuals_mm=stage.residuals_mm, warnings=stage.warnings)
+
+
+def _corners_npz(observations: Sequence[BoardObservation]) -> bytes:
+    """Return all corners, one row per corner."""
+    counts = [len(seen.corners) for seen in observations]
+    return _npz(
+        pixels=np.concatenate([seen.pixels for seen in observations]),
+        sigma_px=np.concatenate([seen.sigma_px for seen in observations]),
+        corner=np.concatenate([seen.corners for seen in observations]),
+        node=np.repeat([seen.node for seen in observations], counts, axis=0),
+        sweep=np.repeat([seen.target.sweep for seen in observations], counts),
+        board=np.repeat([seen.target.board for seen in observations], counts),
+    )
+
+
+def _npz(**arrays: Any) -> bytes:
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()

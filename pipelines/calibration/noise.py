@@ -1,0 +1,201 @@
+"""A sensor's noise from a noise set: each phase of its mosaic calibrated, as the record and the maps of the result."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.errors import CalibrationError
+from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
+from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.noise import (
+    CovarianceRecord,
+    Measured,
+    NoiseProvenance,
+    NoiseRecord,
+    PhaseRecord,
+)
+from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, temperature_notes
+from faintfield.rig.session.session import PLAN
+
+# Black levels of masked pixels and of covered ones differ by less in a sound camera.
+_BLACK_TOLERANCE_DN = 2.0
+
+# Maps by their name in the file, with the fill for pixels that were not calibrated; these are masked anyway.
+_MAPS = {
+    "offset_dn": 0.0,
+    "offset_variance_dn2": 0.0,
+    "dark_current_e_per_s": 0.0,
+    "dark_current_variance_e2_per_s2": 0.0,
+    "read_noise_e": 1.0,
+    "relative_response": 1.0,
+    "vignetting": 1.0,
+}
+
+
+@dataclass(frozen=True)
+class SensorCalibration:
+    """The calibration of a sensor.
+
+    Attributes
+    ----------
+    folder : Path
+        Of the noise set.
+    settings : NoiseSet
+        The frames that were used.
+    readout : Readout
+        The layout of the frames.
+    phases : list of NoiseCalibration
+        One per phase of the mosaic, in the order of `readout.phases`.
+    """
+
+    folder: Path
+    settings: NoiseSet
+    readout: Readout
+    phases: list[NoiseCalibration]
+
+
+def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
+    """Read the frames of a noise set and calibrate every phase of the mosaic.
+
+    Raises
+    ------
+    InputError, CalibrationError
+        A frame cannot be used, or the frames do not determine the noise; the message says what to record.
+    """
+    readout = read_series(folder, settings)
+    phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
+    return SensorCalibration(folder, settings, readout, phases)
+
+
+def noise_record(sensor: SensorCalibration) -> NoiseRecord:
+    """Return the record of a calibration, without the hash of its maps."""
+    readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
+    mosaic: dict[str, Any] = {}
+    if readout.mosaic is not None:
+        records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
+        mosaic = {"mosaic": readout.mosaic, "planes": records}
+    bad_pixels: dict[str, Any] = {
+        f"{kind}_pixels": np.argwhere(_assembled(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
+        for kind in ("hot", "noisy", "dead")
+    }
+    temperature_c, warnings = temperature_notes(settings)
+    warnings += [warning for calibration in phases for warning in calibration.warnings]
+    return NoiseRecord(
+        **_quantities({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
+        covariance=_covariance(phases),
+        likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
+        saturation_dn=readout.saturation_dn,
+        size_px=readout.size_px,
+        **mosaic,
+        **bad_pixels,
+        temperature_c=temperature_c,
+        frames=settings.frame,
+        warnings=list(dict.fromkeys(warnings)),
+        provenance=NoiseProvenance(
+            **msgspec.structs.asdict(provenance("noise", {}, _input_hashes(sensor.folder, settings)))
+        ),
+    )
+
+
+def noise_maps(sensor: SensorCalibration) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `noise_maps.npz` (row, column): float32 by the names in `NoiseMaps`, and the bool `mask`."""
+    readout, phases = sensor.readout, sensor.phases
+    maps = {"mask": _assembled(readout, [c.maps.unusable for c in phases], fill=True)}
+    for name, fill in _MAPS.items():
+        parts = [getattr(c.maps, name) for c in phases]
+        if all(part is not None for part in parts):
+            maps[name] = _assembled(readout, parts, fill)
+    gains = [c.estimates["gain_dn_per_e"].value for c in phases]
+    if len(gains) > 1 and None not in gains:
+        shape = phases[0].maps.offset_dn.shape
+        maps["gain_dn_per_e"] = _assembled(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
+    return maps
+
+
+def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:
+    """Calibrate one phase of the mosaic; its name goes into its warnings and failures."""
+    prefix = f"plane {phase.name}: " if phase.name else ""
+    try:
+        calibration = calibrate(phase.series, saturation_dn)
+    except CalibrationError as failure:
+        raise type(failure)(f"{prefix}{failure}") from failure
+    warnings = [*calibration.warnings, *_black_level_warnings(phase, calibration)]
+    return replace(calibration, warnings=tuple(prefix + warning for warning in warnings))
+
+
+def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> list[str]:
+    """Return a warning where masked pixels and covered ones disagree on the black level."""
+    offset = calibration.estimates["offset_dn"]
+    if not phase.black_dn or offset.value is None:
+        return []
+    black_dn = sum(phase.black_dn) / len(phase.black_dn)
+    if abs(offset.value - black_dn) <= _BLACK_TOLERANCE_DN + 3 * (offset.se or 0.0):
+        return []
+    return [
+        f"the darks' offset is {offset.value:.1f} DN, the black level that the files bring {black_dn:.1f} DN (at most "
+        f"{_BLACK_TOLERANCE_DN:g} DN apart is usual); the lens was not quite covered, or the amplifier glows"
+    ]
+
+
+def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRecord:
+    """Return the entry of one phase in noise.json."""
+    return PhaseRecord(
+        phase=phase.phase,
+        colour=phase.colour,
+        likelihood=str(calibration.likelihood),
+        masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
+        **_quantities(calibration.estimates),
+    )
+
+
+def _assembled(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
+    """Return the phases' arrays interleaved to the size of a frame."""
+    width, height = readout.size_px
+    whole = np.full((height, width), fill, parts[0].dtype)
+    region = whole[readout.rows, readout.columns]
+    for phase, part in zip(readout.phases, parts, strict=True):
+        phase.of(region)[...] = part
+    return whole
+
+
+def _mean(estimates: Sequence[Estimate]) -> Estimate:
+    """Return the mean over phases, or the reason why one of them has no value."""
+    if len(estimates) == 1:
+        return estimates[0]
+    unknown = next((estimate for estimate in estimates if estimate.value is None), None)
+    if unknown is not None:
+        return unknown
+    count = len(estimates)
+    value = sum(estimate.value or 0.0 for estimate in estimates) / count
+    se = float(np.sqrt(sum((estimate.se or 0.0) ** 2 for estimate in estimates))) / count
+    return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
+
+
+def _quantities(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Return estimates as noise.json has them: with their uncertainty, or with the reason why there is no value."""
+    return {
+        name: Measured(None, why=it.why) if it.value is None else Measured(**asdict(it))
+        for name, it in estimates.items()
+    }
+
+
+def _covariance(calibrations: Sequence[NoiseCalibration]) -> CovarianceRecord:
+    """Return names and matrix; of the phases' mean where there are several."""
+    names = calibrations[0].covariance[0]
+    if any(c.covariance[0] != names for c in calibrations):
+        return CovarianceRecord([], [])
+    matrix = np.sum([c.covariance[1] for c in calibrations], axis=0) / len(calibrations) ** 2
+    return CovarianceRecord(list(names), matrix.tolist())
+
+
+def _input_hashes(folder: Path, settings: NoiseSet) -> dict[str, str]:
+    """Return the SHA-256 of the set's description and of its frames, by name."""
+    described_in = FILE_NAME if (folder / FILE_NAME).is_file() else PLAN
+    return {name: sha256(folder / name) for name in [described_in, *(frame.file for frame in settings.frame)]}

@@ -1,0 +1,39 @@
+"""`faintfield export mrcal`: lens and poses of a set as .cameramodel files."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
+from faintfield.pipelines.formats.exchange.posed_images import lens_of_each_view
+from faintfield.pipelines.formats.files import write_whole, writing_folder
+from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+
+
+def export_mrcal(
+    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
+) -> dict[str, Any]:
+    """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
+
+    Parameters
+    ----------
+    elemental_set
+        A session whose noise and geometry were measured, or a folder with elemental.toml.
+    out
+        Folder to write.
+    overwrite
+        Replace earlier models in OUT, a folder that holds nothing else.
+    """
+    loaded = load_set_or_session(elemental_set)
+    models: dict[str, str] = {}
+    for view, lens, pose in zip(loaded.settings.view, lens_of_each_view(loaded), loaded.poses_rt_cam_ref, strict=True):
+        name = Path(view.image).with_suffix(SUFFIX).name
+        if name in models:
+            raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
+        models[name] = camera_model_text(lens, lens_model_of(lens), pose)
+    with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
+        for name, text in models.items():
+            write_whole(folder / name, text)
+    return {"out": str(out), "views": len(models)}

@@ -1,0 +1,104 @@
+"""mrcal's camera models, `.cameramodel` files: a lens and a pose each, lengths in metres as mrcal's tools have them."""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from faintfield.calib.lens import Lens
+from faintfield.calib.mrcal_loader import load_mrcal
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage
+from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
+
+SUFFIX = ".cameramodel"
+
+# mrcal's name of each lens model, and how many distortion coefficients it has.
+_LENS_MODELS = {
+    "pinhole": ("LENSMODEL_PINHOLE", 0),
+    "opencv4": ("LENSMODEL_OPENCV4", 4),
+    "opencv5": ("LENSMODEL_OPENCV5", 5),
+    "opencv8": ("LENSMODEL_OPENCV8", 8),
+}
+
+
+def lens_model_of(lens: Lens) -> str:
+    """Return the smallest lens model that holds the distortion of a lens."""
+    return next(name for name, (_, count) in _LENS_MODELS.items() if count >= len(lens.distortion))
+
+
+def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str:
+    """Return a camera as the text of a .cameramodel file.
+
+    Parameters
+    ----------
+    lens : Lens
+        Its distortion is filled with zeros to the length that the model has.
+    lens_model : str
+        "pinhole", "opencv4", "opencv5" or "opencv8".
+    rt_cam_ref : array (6,)
+        Rodrigues rad and mm.
+    """
+    name, count = _LENS_MODELS[lens_model]
+    distortion = [*lens.distortion, *[0.0] * (count - len(lens.distortion))]
+    model = load_mrcal().cameramodel(
+        intrinsics=(name, np.array([lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *distortion])),
+        imagersize=np.array(lens.size_px, np.int32),
+        rt_cam_ref=np.array(rt_cam_ref, np.float64) * [1, 1, 1, 1e-3, 1e-3, 1e-3],
+    )
+    text = io.StringIO()
+    model.write(text)
+    return text.getvalue()
+
+
+def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:
+    """Return the images of the camera models in a folder, each with its lens and pose, by the model's file.
+
+    Parameters
+    ----------
+    folder : Path
+        Holds one .cameramodel file per image.
+    images : Path
+        Holds an image of the same name for each.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There are no models, a model has no image, or a model cannot be read.
+    """
+    paths = sorted(folder.glob(f"*{SUFFIX}"))
+    if not paths:
+        raise MissingFile(f"{folder}: holds no {SUFFIX} files; name the folder that holds one per image")
+    return {path: _read(path, images) for path in paths}
+
+
+def _read(path: Path, images: Path) -> PosedImage:
+    """Return the image of a camera model with its lens and pose."""
+    mrcal = load_mrcal()
+    try:
+        model = mrcal.cameramodel(str(path))
+    except Exception as failure:  # mrcal raises exceptions of many types
+        raise BadValue(
+            f"{path}: is not a camera model that can be read ({failure}); write it with mrcal again".replace("\n", " ")
+        ) from failure
+    name, numbers = model.intrinsics()
+    known = sorted(name for name, _ in _LENS_MODELS.values())
+    if name not in known:
+        raise BadValue(f"{path}: its lens is {name}; convert it with mrcal-convert-lensmodel to one of {known}")
+    fx_px, fy_px, cx_px, cy_px, *distortion = numbers.tolist()
+    width, height = model.imagersize().tolist()
+    try:
+        lens = Lens((width, height), fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+    except ValueError as failure:
+        raise BadValue(f"{path}: {failure}; calibrate again") from failure
+    return PosedImage(_image_of(path, images), lens, model.rt_cam_ref())
+
+
+def _image_of(path: Path, folder: Path) -> Path:
+    """Return the image that has the name of a camera model."""
+    for suffix in sorted(IMAGE_SUFFIXES):
+        image = folder / f"{path.stem}{suffix}"
+        if image.is_file():
+            return image
+    raise MissingFile(f"{folder}: holds no image named {path.stem}; put it there, or name its folder with --images")

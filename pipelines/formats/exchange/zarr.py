@@ -1,0 +1,193 @@
+"""Planes of a sweep as OME-Zarr 0.5, chunked and at several resolutions, for stacks too large for memory."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.console import progress
+from faintfield.pipelines.errors import BadValue, MissingPackage
+from faintfield.pipelines.formats.files import writing_folder
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import PlaneRecord
+from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
+
+# Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
+_COARSEST_PX = 512
+
+_CHUNK_PX = 512
+
+# Patterns of what the folder of an export holds: its metadata, and one array for each resolution.
+_HELD = ("zarr.json", "[0-9]", "[0-9][0-9]")
+
+
+@dataclass(frozen=True)
+class PlaneStack:
+    """Planes of one folder that fit one stack, the nearest first.
+
+    Attributes
+    ----------
+    folder : Path
+        Where they lie.
+    planes : sequence of PlaneRecord
+        Their entries in reconstruction.json, one per plane.
+    shape : (int, int, int, int)
+        Colours, planes, rows, columns.
+    scale : Scale
+        Of the samples.
+    """
+
+    folder: Path
+    planes: Sequence[PlaneRecord]
+    shape: tuple[int, int, int, int]
+    scale: Scale
+
+    @property
+    def levels(self) -> int:
+        """How many resolutions the planes are kept in."""
+        levels, longest = 1, max(self.shape[2:])
+        while longest > _COARSEST_PX and min(self.shape[2:]) >> levels:
+            levels, longest = levels + 1, longest // 2
+        return levels
+
+
+def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
+    """Return the planes of a folder as one stack.
+
+    Parameters
+    ----------
+    folder : Path
+        Where they lie.
+    records : sequence of PlaneRecord
+        The `planes` of its reconstruction.json.
+
+    Raises
+    ------
+    BadValue
+        No plane has a depth, or they differ in size, or their depths are not in equal steps.
+    """
+    planes = planes_in_order(records)
+    if not planes:
+        raise BadValue(f"{folder}: holds planes given by a pose only; a stack is of depths: reconstruct some")
+    shapes = sorted({record.shape for record in planes})
+    if len(shapes) > 1:
+        raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
+    scale = stack_scale(planes)
+    if scale.step_mm is None and len(planes) > 1:
+        raise BadValue(
+            f"{folder}: the {len(planes)} depths are not in equal steps, and OME-Zarr states only one; "
+            "reconstruct with --sweep-mm"
+        )
+    colours = len(at_depths(records)) // len(planes)
+    return PlaneStack(folder, planes, (colours, len(planes), *shapes[0]), scale)
+
+
+def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = False) -> None:
+    """Write a stack of planes as OME-Zarr.
+
+    Parameters
+    ----------
+    out : Path
+        Folder to write.
+    stack : PlaneStack
+        The planes.
+    name : str
+        The name of the image.
+    overwrite : bool
+        Replace an earlier export in `out`.
+
+    Raises
+    ------
+    MissingPackage
+        zarr or ome-zarr-models is not installed.
+    OutputExists
+        `out` holds something else.
+    """
+    zarr = require_zarr()
+    earlier = _HELD if overwrite and _is_export(out) else ()
+    with writing_folder(out, replace_only=earlier, reads=[stack.folder]) as building:
+        group = zarr.open_group(building, mode="w", zarr_format=3)
+        _write_metadata(group, stack, name)
+        for index, record in enumerate(progress(stack.planes, "writing planes")):
+            plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
+            for level in range(stack.levels):
+                group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
+                plane = _halved(plane)
+
+
+def require_zarr() -> Any:
+    """Return the zarr module, if it and the library of OME-Zarr's metadata are installed; no other format needs them.
+
+    Raises
+    ------
+    MissingPackage
+        One of them is not installed.
+    """
+    try:
+        import ome_zarr_models  # noqa: F401
+        import zarr
+    except ImportError as failure:
+        raise MissingPackage(
+            "zarr or ome-zarr-models is not installed; they are an extra: pip install 'faintfield[zarr]'"
+        ) from failure
+    return zarr
+
+
+def _is_export(folder: Path) -> bool:
+    """Return whether a folder is an earlier export: every Zarr group has a zarr.json, ours says who wrote it."""
+    try:
+        return "faintfield" in json.loads((folder / "zarr.json").read_bytes())["attributes"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+
+
+def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
+    """Make the arrays of all resolutions, and describe their axes."""
+    from ome_zarr_models.v05.axes import Axis
+    from ome_zarr_models.v05.image import ImageAttrs
+    from ome_zarr_models.v05.multiscales import Multiscale
+
+    unit = "millimeter" if stack.scale.unit == "mm" else None
+    axes = (
+        Axis(name="c", type="channel"),
+        Axis(name="z", type="space", unit="millimeter"),
+        Axis(name="y", type="space", unit=unit),
+        Axis(name="x", type="space", unit=unit),
+    )
+    datasets = tuple(_dataset(group, stack, level) for level in range(stack.levels))
+    multiscale = Multiscale(axes=axes, datasets=datasets, name=name)
+    group.attrs["ome"] = ImageAttrs(version="0.5", multiscales=[multiscale]).model_dump(mode="json", exclude_none=True)
+    group.attrs["faintfield"] = {
+        "value": "expected electrons per detector pixel of the reference view",
+        "row_and_column": stack.scale.unit,
+        "planes": msgspec.to_builtins(list(stack.planes)),
+    }
+
+
+def _dataset(group: Any, stack: PlaneStack, level: int) -> Any:
+    """Make the array of one resolution, and return its entry: where its samples lie."""
+    from ome_zarr_models.v05.multiscales import Dataset
+
+    scale, shape, step = stack.scale, stack.shape, 2**level
+    size = (*shape[:2], shape[2] // step, shape[3] // step)
+    chunks = (1, 1, min(_CHUNK_PX, size[2]), min(_CHUNK_PX, size[3]))
+    group.create_array(str(level), shape=size, chunks=chunks, dtype="float32", dimension_names=list("czyx"))
+    x, y = scale.origin
+    across, shift = scale.across * step, scale.across * (step - 1) / 2  # to the middle of the samples merged into one
+    return Dataset.build(
+        path=str(level),
+        scale=(1.0, scale.step_mm or 1.0, across, across),
+        translation=(0.0, stack.planes[0].depth_mm, y + shift, x + shift),
+    )
+
+
+def _halved(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a plane (row, column, colour) with the mean of each two by two samples; an odd last one is left out."""
+    rows, columns = plane.shape[0] // 2, plane.shape[1] // 2
+    blocks = plane[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, -1)
+    return np.asarray(blocks.mean(axis=(1, 3), dtype=np.float32))

@@ -1,0 +1,131 @@
+"""`elemental.toml`, the format in which anyone states images and poses: its tables, read, checked and written."""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+
+FILE_NAME = "elemental.toml"
+
+# Largest pose of the reference view that counts as zero, in rad and mm: less than any calibration resolves.
+_ZERO_POSE = np.array([1e-6] * 3 + [1e-3] * 3)
+
+
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[camera]` table. `mosaic` and `flat` extend the format for colour filters and vignetting."""
+
+    size_px: tuple[int, int]
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: tuple[float, ...] = ()
+    mosaic: tuple[str, ...] | None = None
+    flat: str | None = None
+
+
+class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated."""
+
+    gain_dn_per_e: float
+    read_noise_e: float
+    offset_dn: float | None = None
+    dark_current_e_per_s: float = 0.0
+    quantum_efficiency: float | None = None
+    saturation_dn: float | None = None
+
+
+class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first."""
+
+    image: str
+    rt_cam_ref: tuple[float, float, float, float, float, float]
+    node: tuple[int, int] | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    repeats: tuple[str, ...] = ()
+
+
+class ElementalSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together."""
+
+    format: Literal[1]
+    exposure_s: float
+    reference_view: int
+    camera: Camera
+    noise: Noise | str
+    view: list[View]
+
+
+def read_set_file(path: Path) -> ElementalSetFile:
+    """Read and check `elemental.toml`, and that the files it names are there.
+
+    Raises
+    ------
+    InputError
+        A file is missing, a key is unknown, or a value is impossible; the message names it.
+    """
+    settings = read_toml(path, ElementalSetFile)
+    _check_numbers(path, settings)
+    _check_views(path, settings)
+    for name in named_files(settings):
+        if not inside(path.parent, name, f"{path}: file").is_file():
+            raise MissingFile(f"{path}: {name} is named but missing in {path.parent}; put it there or remove its entry")
+    return settings
+
+
+def write_set(folder: Path, settings: ElementalSetFile) -> None:
+    """Write `elemental.toml`. Write the images first, so that a folder with this file is complete."""
+    write_toml(folder / FILE_NAME, settings)
+
+
+def named_files(settings: ElementalSetFile) -> list[str]:
+    """Return the names of the files that `elemental.toml` names."""
+    optional = [settings.camera.flat, settings.noise if isinstance(settings.noise, str) else None]
+    images = [name for view in settings.view for name in (view.image, *view.repeats)]
+    return [*(name for name in optional if name is not None), *images]
+
+
+def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
+    """Refuse an impossible exposure or mosaic."""
+    if settings.exposure_s <= 0:
+        raise BadValue(f"{path}: exposure_s = {settings.exposure_s}; it must be positive: give the exposure in seconds")
+    mosaic = settings.camera.mosaic
+    if mosaic is None:
+        return
+    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1 or set("".join(mosaic)) - set("RGB"):
+        raise BadValue(
+            f"{path}: camera.mosaic = {list(mosaic)}; give rows of equal length of the letters R, G and B, such as "
+            '["RG", "GB"]'
+        )
+
+
+def _check_views(path: Path, settings: ElementalSetFile) -> None:
+    """Refuse a set without views, without its reference, or with a repeated view."""
+    count = len(settings.view)
+    if not 0 <= settings.reference_view < count:
+        raise BadValue(
+            f"{path}: reference_view = {settings.reference_view}, but there are {count} views; give 0…{count - 1}"
+        )
+    reference = np.array(settings.view[settings.reference_view].rt_cam_ref)
+    if (np.abs(reference) > _ZERO_POSE).any():
+        raise BadValue(
+            f"{path}: view[{settings.reference_view}] is the reference but its pose is {reference.tolist()}; "
+            "poses are relative to the reference view, whose own is zero"
+        )
+    _refuse_repeated(path, "image", [name for view in settings.view for name in (view.image, *view.repeats)])
+    counts = {1 + len(view.repeats) for view in settings.view}
+    if len(counts) > 1:
+        raise BadValue(f"{path}: views have {min(counts)} to {max(counts)} frames; give all of them as many repeats")
+    _refuse_repeated(path, "node", [list(view.node) for view in settings.view if view.node is not None])
+
+
+def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
+    """Refuse a name that several views share."""
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")

@@ -1,0 +1,109 @@
+"""Planes of a folder as layers of napari, in millimetres and on one grey scale."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from faintfield.pipelines.errors import MissingPackage
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import white_level
+from faintfield.pipelines.formats.results.records import PlaneRecord, ReconstructionRecord
+from faintfield.pipelines.formats.results.result_files import results_below
+from faintfield.pipelines.formats.results.stacks import planes_in_order, stack_scale
+from faintfield.pipelines.pages.report_planes import method_title
+
+# Planes at fewer depths than this are a layer each; more, in equal steps, are one layer with a slider.
+_MIN_DEPTHS_OF_A_STACK = 3
+
+
+@dataclass(frozen=True)
+class Layer:
+    """An image layer, by the parameters of `napari.Viewer.add_image`.
+
+    `data` holds one plane (row, column[, colour]) or several (plane, row, column[, colour]).
+    """
+
+    data: NDArray[Any]
+    name: str
+    rgb: bool
+    scale: tuple[float, ...]
+    translate: tuple[float, ...]
+    units: tuple[str, ...]
+    axis_labels: tuple[str, ...]
+
+
+def show_planes(directory: Path) -> list[str]:
+    """Show the planes below a folder in napari until its window is closed, and return the names of the layers.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is no result in the folder, or one that cannot be read.
+    MissingPackage
+        napari is not installed.
+    """
+    by_method = [_layers(directory, folder, result) for folder, result in results_below(directory).items()]
+    try:
+        import napari
+    except ImportError as failure:
+        raise MissingPackage(
+            "napari is not installed; it is an extra: pip install 'faintfield[view]', or pip install 'napari[pyqt6]'"
+        ) from failure
+    # The least noisy method sets the scale, as in the report, so that noise may be clipped and planes are not
+    white = min(max(white_level(layer.data) for layer in layers) for layers in by_method)
+    viewer = napari.Viewer(title=f"faintfield: {directory.resolve().name}")
+    layers = [layer for of_one_method in by_method for layer in of_one_method]
+    for index, layer in enumerate(layers):
+        limits = (0.0, max(white, 1e-6))
+        viewer.add_image(**vars(layer), contrast_limits=limits, colormap="gray", visible=index == 0)
+    napari.run()
+    return [layer.name for layer in layers]
+
+
+def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list[Layer]:
+    """Return the layers of the planes in one folder."""
+    planes = planes_in_order(result.planes)
+    tilted = {record.file: record for record in result.planes if record.rt_ref_plane is not UNSET}.values()
+    method = result.planes[0].method
+    where = folder.relative_to(directory).as_posix()
+    name = method_title(result.planes) + (f", {where}" if where not in (".", method) else "")
+    alone = [_plane_layer(folder, plane, f"{name}, {plane.name}") for plane in tilted]
+    if not planes:
+        return alone
+    step_mm = stack_scale(planes).step_mm
+    one_shape = len({record.shape for record in planes}) == 1
+    if len(planes) < _MIN_DEPTHS_OF_A_STACK or step_mm is None or not one_shape:
+        return [*(_plane_layer(folder, plane, f"{name}, {plane.depth_mm:g} mm") for plane in planes), *alone]
+    return [_stack_layer(folder, planes, name, step_mm), *alone]
+
+
+def _plane_layer(folder: Path, plane: PlaneRecord, name: str) -> Layer:
+    """Return one plane as a layer."""
+    pixels = _pixels(folder, plane)
+    (x_mm, y_mm), pitch_mm = plane.origin_mm, plane.pitch_mm
+    return Layer(pixels, name, pixels.ndim == 3, (pitch_mm, pitch_mm), (y_mm, x_mm), ("mm", "mm"), ("y", "x"))
+
+
+def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float) -> Layer:
+    """Return planes at equal steps of depth as one layer."""
+    pixels = np.stack([_pixels(folder, plane) for plane in planes])
+    scale = stack_scale(planes)
+    return Layer(
+        data=pixels,
+        name=name,
+        rgb=pixels.ndim == 4,
+        scale=(step_mm, scale.across, scale.across),
+        translate=(planes[0].depth_mm, scale.origin[1], scale.origin[0]),
+        units=("mm", scale.unit, scale.unit),
+        axis_labels=("depth", "y", "x"),
+    )
+
+
+def _pixels(folder: Path, plane: PlaneRecord) -> NDArray[Any]:
+    """Return the pixels of a plane (row, column[, colour])."""
+    return read_frame(folder / Path(plane.file).name).pixels_dn

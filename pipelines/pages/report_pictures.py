@@ -1,0 +1,226 @@
+"""The pictures of a report's planes, on one grey scale: the best method, side by side, on sliders; and their sigmas."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrunk, white_level
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
+from faintfield.pipelines.pages.page import data_uri
+from faintfield.pipelines.pages.report_curves import focus_curve, weight_curves
+from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, plane_words
+
+# Largest number of depths side by side; more are shown on a slider only.
+_MAX_ROWS = 6
+
+# Widths of the pictures side by side and on the sliders.
+_GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
+
+
+@dataclass(frozen=True)
+class Row:
+    """The pictures of one plane side by side, one per column as a data URI; None if it was not reconstructed."""
+
+    words: str
+    cells: list[str | None]
+
+
+@dataclass(frozen=True)
+class SigmaPicture:
+    """The standard deviation of a plane as a data URI, and its median."""
+
+    title: str
+    median_e: float
+    src: str
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """The standard deviations of the planes on one scale; `white` is in electrons."""
+
+    white: float
+    pictures: list[SigmaPicture]
+
+
+class Slide(TypedDict):
+    """One picture of the sliders as a data URI, and the samples across the plane; JSON for the page's script."""
+
+    depth_mm: float
+    words: str
+    samples: int
+    src: str
+
+
+class SliderColumn(TypedDict):
+    """The planes of one column, the nearest first."""
+
+    title: str
+    planes: list[Slide]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlaneSections:
+    """What the page shows of the planes; the names are those of the template.
+
+    Attributes
+    ----------
+    best, best_title : Plane, str
+        A plane of the column that the page leads with, and the title of the column.
+    left_out : str, optional
+        Why occlusion was left out, if it was.
+    blurred : bool
+        The best planes contain the blur of other planes.
+    best_planes : list of (str, str)
+        Their names and pictures.
+    certificates : list of (str, Certificate)
+        Bounds on their distance to the optimum.
+    columns, rows : list
+        Titles, and pictures side by side.
+    slider, slider_column, slider_depth : list, int, int
+        The sliders, and what they show first.
+    depths : int
+        Number of planes per column.
+    white : float
+        White of the grey scale, in electrons.
+    sharp_mm : list of float
+        Depths at which the focus curve peaks.
+    """
+
+    best: Plane
+    best_title: str
+    left_out: str | None
+    blurred: bool
+    best_planes: list[tuple[str, str]]
+    weight_curves: str | None
+    certificates: list[tuple[str, Certificate]]
+    columns: list[str]
+    rows: list[Row]
+    slider: list[SliderColumn] | None
+    slider_column: int
+    slider_depth: int
+    sigmas: Sigmas | None
+    depths: int
+    white: float
+    focus_curve: str | None
+    sharp_mm: list[float]
+
+
+def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
+    """Return what the page shows of the planes."""
+    depths = sorted({plane.depth_mm for plane in planes if not plane.name})
+    places = sorted({plane.place for plane in planes})
+    focus = next((result.focus for result in results if result.focus), None)
+    titles, best = column_titles(planes), best_column(planes)
+    columns = list(titles)
+    white = _shared_white(planes, columns)
+    shown = _shown_depths(depths, focus)
+    rows = _side_by_side(planes, columns, shown, white)
+    of_best = [plane for plane in planes if plane.column == best]
+    records = [record for plane in of_best for record in plane.records]
+    place = columns.index(best)
+    return PlaneSections(
+        best=of_best[0],
+        best_title=titles[best],
+        left_out=next((record.occlusion_left_out for record in records if record.occlusion_left_out), None),
+        blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
+        best_planes=[(row.words, picture) for row in rows if (picture := row.cells[place])],
+        weight_curves=weight_curves(of_best),
+        certificates=[
+            (plane_words(*plane.place), record.certificate)
+            for plane in of_best
+            for record in plane.records
+            if record.certificate and record.certificate.is_bound
+        ],
+        columns=list(titles.values()),
+        rows=rows,
+        slider=_slider(planes, titles, white) if len(places) > 1 or len(columns) > 1 else None,
+        slider_column=place,
+        slider_depth=_first_depth([depth for depth, _ in places], focus),
+        sigmas=_sigmas(planes, titles, shown),
+        depths=len(places),
+        white=white,
+        focus_curve=focus_curve(focus) if focus else None,
+        sharp_mm=focus.sharp_mm if focus else [],
+    )
+
+
+def _shared_white(planes: list[Plane], columns: list[str]) -> float:
+    """Return the white of the grey scale, that of the least noisy column: noise may be clipped, planes are not."""
+    brightest = [max(white_level(plane.pixels()) for plane in planes if plane.column == column) for column in columns]
+    positive = [level for level in brightest if level > 0]
+    return min(positive) if positive else 1.0
+
+
+def _shown_depths(depths: list[float], focus: FocusCurve | None) -> list[float]:
+    """Return the depths to show side by side: all if they are few, else those where something is sharp."""
+    if len(depths) <= _MAX_ROWS:
+        return depths
+    sharp = focus.sharp_mm if focus else []
+    marked = {min(depths, key=lambda depth: abs(depth - mark)) for mark in sharp}
+    if not marked:
+        marked = {depths[round(index)] for index in np.linspace(0, len(depths) - 1, 3)}
+    return sorted(marked)[:_MAX_ROWS]
+
+
+def _side_by_side(planes: list[Plane], columns: list[str], depths: list[float], white: float) -> list[Row]:
+    """Return the pictures side by side: a row per depth, and per plane given by a pose; a cell per column."""
+    by_place = {(plane.place, plane.column): plane for plane in planes}
+    rows = []
+    for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
+        found = [by_place.get((place, column)) for column in columns]
+        cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
+        rows.append(Row(plane_words(*place), cells))
+    return rows
+
+
+def _sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) -> Sigmas | None:
+    """Return the standard deviations on one scale of their own, None if they were not asked for."""
+    ordered = sorted(planes, key=lambda plane: plane.depth_mm)
+    known = [(plane, plane.sigma_e()) for plane in ordered if plane.name or plane.depth_mm in depths]
+    found = [(plane, sigma) for plane, sigma in known if sigma is not None]
+    if not found:
+        return None
+    white = max(white_level(sigma) for _, sigma in found)
+    return Sigmas(
+        white,
+        [
+            SigmaPicture(
+                f"{titles[plane.column]}, {plane_words(*plane.place)}",
+                float(np.median(sigma)),
+                _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
+            )
+            for plane, sigma in found
+        ],
+    )
+
+
+def _slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[SliderColumn]:
+    """Return the pictures of the sliders: the planes of each column by depth."""
+    ordered = sorted(planes, key=lambda plane: plane.place)
+    return [
+        {"title": title, "planes": [_slide(plane, white) for plane in ordered if plane.column == column]}
+        for column, title in titles.items()
+    ]
+
+
+def _slide(plane: Plane, white: float) -> Slide:
+    """Return one picture of the sliders."""
+    pixels = plane.pixels()
+    picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
+    words = plane_words(*plane.place)
+    return {"depth_mm": plane.depth_mm, "words": words, "samples": pixels.shape[1], "src": picture}
+
+
+def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
+    """Return the index of the depth that the slider shows first: the peak of the focus curve if there is one."""
+    if focus is None:
+        return 0
+    best = max(zip(focus.detail_e2, focus.depth_mm, strict=True))[1]
+    return min(range(len(depths)), key=lambda index: abs(depths[index] - best))
+
+
+def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
+    return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)

@@ -1,0 +1,180 @@
+"""Figures 2, 3 and 4 of the paper from simulated light, with their numbers: the work of `faintfield figures`."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
+from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
+from faintfield.pipelines.pages.report import write_report
+from faintfield.pipelines.paper.figure4 import is_monotone, mean_curves, measure_errors, over_best
+from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
+from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, tv_denoiser
+from faintfield.pipelines.paper.figure_records import (
+    DarkPlaneRow,
+    DetailRow,
+    Figure2,
+    Figure3,
+    Figure4,
+    Figure4Curves,
+    Row,
+    as_csv,
+)
+from faintfield.pipelines.paper.figures_page import CURVES_FILE, PAGE_FILE, provenance_file, write_page
+from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
+from faintfield.pipelines.reconstruction.request import Request
+from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
+from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
+from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
+from faintfield.recon.smoothing import blurred
+
+type FigureNumber = Literal[2, 3, 4]
+
+_SCENE, _BRIGHT, _DARK = "dark-scene", "bright", "dark"
+
+# Detail is what this blur removes; its standard deviation is 2 samples.
+_DETAIL_BLUR = (1, 1, 1, 1, 2)
+
+
+class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of `faintfield figures`, as its help explains them and each figure's provenance records them."""
+
+    only: list[FigureNumber]
+    snr: float
+    seed: int
+    seeds: int
+    size_px: tuple[int, int]
+
+
+def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figure3 | Figure4]:
+    """Write the figures that are asked for, their numbers and the page, and return the numbers by figure.
+
+    Raises
+    ------
+    OutputExists
+        `out` holds something other than earlier figures.
+    MissingPackage
+        Figure 4 is asked for, and scikit-image is not installed.
+    """
+    check_free(out, replace_if=PAGE_FILE)
+    if 4 in options.only:
+        tv_denoiser()
+    if {2, 3} & set(options.only):
+        inform("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm")
+        scene = SyntheticOptions(snr=options.snr, seed=options.seed, size_px=options.size_px)
+        write_synthetic_set(out / _SCENE, scene, overwrite=True)
+    makers: dict[int, Callable[[Path, FigureOptions], Figure2 | Figure3 | Figure4]]
+    makers = {2: _figure2, 3: _figure3, 4: _figure4}
+    made = {}
+    for number in options.only:
+        started = time.monotonic()
+        remove(out / provenance_file(number))
+        made[f"figure{number}"] = makers[number](out, options)
+        origin = msgspec.structs.asdict(provenance("figures", options, {}))
+        write_json(out / provenance_file(number), origin | {"wall_time_s": time.monotonic() - started})
+        inform(f"figure {number}: {time.monotonic() - started:.1f} s")
+    write_page(out)
+    return made
+
+
+def _figure2(out: Path, _: FigureOptions) -> Figure2:
+    """Back-project the bright set, and measure how much of each object's detail each plane shows."""
+    outcome = _reconstruct(out / _SCENE / NOISE_FREE, out / _BRIGHT, "backprojection")
+    planes = _shown(out / _BRIGHT, outcome.planes)
+    integral = read_frame(out / _BRIGHT / INTEGRAL_IMAGE).pixels_dn
+    rows = [row for plane in planes for row in _detail_rows(out / _SCENE, plane)]
+    numbers = Figure2(rows)
+    _write(out, 2, draw_figure2(integral, planes), rows, numbers)
+    return numbers
+
+
+def _detail_rows(scene: Path, plane: ShownPlane) -> list[DetailRow]:
+    """Return the share of each object's detail that a plane shows.
+
+    Detail d is what a small blur removes. The share is `<d_plane · d_object> / <d_object²>` over the region where the
+    object is visible, so that the detail of other objects does not count.
+    """
+    truth = read_truth(scene)
+    assert truth is not None
+    rows = []
+    for known in truth.planes:
+        texture, region = texture_and_region(scene, known)
+        of_plane, of_object = (_detail(image)[region] for image in (plane.pixels, texture))
+        share = float(np.sum(of_plane * of_object) / np.sum(np.square(of_object)))
+        rows.append(DetailRow(plane.depth_mm, known.name, known.depth_mm, share))
+    return rows
+
+
+def _detail(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what a small blur removes from an image (row, column)."""
+    return np.asarray(image - blurred(image, _DETAIL_BLUR))
+
+
+def _figure3(out: Path, _: FigureOptions) -> Figure3:
+    """Reconstruct the dark set, and measure the errors of its planes."""
+    outcome = _reconstruct(out / _SCENE, out / _DARK, OURS)
+    metrics = outcome.metrics
+    assert metrics is not None
+    assert metrics.snr.measured is not None
+    rows = [
+        DarkPlaneRow(
+            *(errors.depth_mm, errors.object, errors.method, errors.mse_bright, errors.mse_texture, errors.psnr_db),
+            penalty_weight=record.penalty_weight,
+            passes=record.passes,
+        )
+        for errors, record in zip(metrics.planes, outcome.planes, strict=True)
+    ]
+    numbers = Figure3(metrics.snr, metrics.photons_per_px, rows)
+    loaded = load_set(out / _SCENE)
+    dark = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
+    reference = read_frame(out / _SCENE / NOISE_REFERENCE).pixels_dn
+    planes = _shown(out / _DARK, outcome.planes)
+    picture = draw_figure3(dark, reference, grey_scale_dn(dark), metrics.snr.measured, planes)
+    _write(out, 3, picture, rows, numbers)
+    return numbers
+
+
+def _figure4(out: Path, options: FigureOptions) -> Figure4:
+    """Measure the errors of all methods, and whether they fall with the SNR."""
+    errors = measure_errors(options.size_px, options.seeds)
+    points = mean_curves(errors)
+    monotone = {method.name: is_monotone(points, method.name) for method in METHODS}
+    numbers = Figure4(monotone, over_best(points, OURS, BEST), points)
+    curves = Figure4Curves(numbers.monotone, numbers.over_best, numbers.curves, options.size_px)
+    write_json(out / CURVES_FILE, curves)
+    _write(out, 4, draw_figure4(points), errors, errors)
+    return numbers
+
+
+def _reconstruct(elemental_set: Path, out: Path, method: Method) -> Outcome:
+    """Reconstruct both planes of a set, and write the report of them."""
+    with exclusive(out):
+        outcome = reconstruct_set(load_set(elemental_set), out, Request([*DEFAULT_DEPTHS_MM], [method]))
+        write_report(out)
+    return outcome
+
+
+def _shown(folder: Path, records: Sequence[PlaneRecord]) -> list[ShownPlane]:
+    """Return the planes of a folder as they are drawn."""
+    return [
+        ShownPlane(read_frame(folder / plane.file).pixels_dn, plane.depth_mm, plane.pitch_mm, plane.origin_mm)
+        for plane in records
+    ]
+
+
+def _write(out: Path, number: int, picture: bytes, rows: Sequence[Row], numbers: Any) -> None:
+    """Write a figure and its numbers, as CSV and as JSON."""
+    write_whole(out / f"figure{number}.csv", as_csv(rows))
+    write_whole(out / f"figure{number}.png", picture)
+    write_json(out / f"figure{number}.json", numbers)

@@ -1,0 +1,177 @@
+"""Reconstruct the planes of a request; write them, their provenance, their errors and the overview of the set."""
+
+import shutil
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_json
+from faintfield.pipelines.formats.plane_poses import Place
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
+from faintfield.pipelines.formats.results.records import (
+    JOINT_METHODS,
+    METRICS_FILE,
+    RECONSTRUCTION_FILE,
+    REPORT_FILE,
+    BestFocusRecord,
+    DepthMapRecord,
+    FocusCurve,
+    Method,
+    Metrics,
+    PlaneRecord,
+    ReconstructionRecord,
+)
+from faintfield.pipelines.formats.results.stacks import write_stack
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.accuracy import assess
+from faintfield.pipelines.reconstruction.channels import channel_layouts
+from faintfield.pipelines.reconstruction.depth_map import write_depth_map
+from faintfield.pipelines.reconstruction.depths import distinct_depths
+from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid, tilted_grid
+from faintfield.pipelines.reconstruction.overview import write_overview
+from faintfield.pipelines.reconstruction.request import Request, folder_of_method
+from faintfield.pipelines.reconstruction.sweep import Runner, Sweep, run_serially
+from faintfield.recon.operator.grid import PlaneGrid
+
+# Planes whose mean is at most this, in electrons per pixel, count as black.
+_BLACK_E = 1e-5
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What a reconstruction gives: the result of `faintfield reconstruct`, which adds the path of the report."""
+
+    out: str
+    report: str | UnsetType = UNSET
+    planes: list[PlaneRecord]
+    focus: FocusCurve | None
+    best_focus: BestFocusRecord | None
+    depth_map: DepthMapRecord | None
+    metrics: Metrics | None
+
+
+def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
+    """Reconstruct planes of a set, and write them with their provenance and their errors.
+
+    Planes that exist and were made from the same files with the same options are kept. An earlier report is removed,
+    since it shows other planes. The caller has `out` to itself, see `formats.files.exclusive`.
+    """
+    started = time.monotonic()
+    depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
+    request = replace(request, depths_mm=depths, methods=methods)
+    folders = {name: folder_of_method(out, name, methods) for name in methods}
+    sweep = _sweep(loaded, folders, request)
+    _make_planes(sweep, folders, out, runner)
+    write_overview(loaded, out)
+    depth_map = None
+    if request.with_depth_map:
+        depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins, out)
+    metrics = assess(loaded, sweep.written)
+    remove(out / METRICS_FILE)  # of earlier planes
+    if metrics:
+        write_json(out / METRICS_FILE, metrics)
+    remove(out / REPORT_FILE)  # likewise
+    focus, records = sweep.focus(), sweep.records
+    for name, folder in folders.items():
+        result = ReconstructionRecord(
+            1,
+            [record for record in records if record.method == name],
+            focus,
+            request.found,
+            depth_map,
+            time.monotonic() - started,
+            **msgspec.structs.asdict(sweep.origins[name]),
+        )
+        write_json(folder / RECONSTRUCTION_FILE, result)
+        if request.with_focus:
+            write_stack(folder, result.planes)
+        shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
+    _warn(records)
+    return Outcome(
+        out=str(out), planes=records, focus=focus, best_focus=request.found, depth_map=depth_map, metrics=metrics
+    )
+
+
+def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: Runner) -> None:
+    """Write the planes that are missing, having removed the records that vouch for earlier ones."""
+    require_room(out, sweep.needed_bytes())
+    for folder in {out, *folders.values()}:
+        remove_leftovers(folder)
+    for folder in folders.values():
+        remove(folder / RECONSTRUCTION_FILE)
+    try:
+        sweep.run(runner, out)
+    finally:
+        for folder in folders.values():
+            with suppress(OSError):
+                (folder / PARTS).rmdir()  # stays while it holds colours of incomplete planes
+
+
+def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
+    """Return the planes of a request, none of them made yet."""
+    layouts = channel_layouts(loaded)
+    mm_per_depth = default_pitch_px(loaded, layouts) / loaded.settings.camera.fx_px
+    grids: dict[Place, PlaneGrid] = {
+        depth: plane_grid(loaded, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm
+    }
+    for plane in request.tilted:
+        grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
+    inputs = dict(loaded.input_hashes())
+    all_planes = {name: provenance("reconstruct", request.options(name, loaded.poses), inputs) for name in folders}
+    channels = tuple(layout.name for layout in layouts)
+    files = []
+    for place in grids:
+        for name, folder in folders.items():
+            options = request.of_plane(name, place).options(name, loaded.poses)
+            origin = msgspec.structs.replace(all_planes[name], options=options)
+            files.append(PlaneFiles(folder, name, place, channels, origin))
+    return Sweep(loaded, grids, files, all_planes, request.settings, with_focus=request.with_focus)
+
+
+def _warn(records: list[PlaneRecord]) -> None:
+    """Inform the user of planes that may be wrong."""
+    for message in (_unsettled(records), _not_converged(records), _black(records)):
+        if message:
+            inform(message)
+
+
+def _unsettled(records: list[PlaneRecord]) -> str | None:
+    """Return a message on planes whose one-step-late iteration oscillates."""
+    certificates = [one.certificate for one in records if one.certificate and one.certificate.oscillates is not UNSET]
+    swings = [one.relative_change for one in certificates if one.oscillates and one.relative_change is not UNSET]
+    if not swings:
+        return None
+    return (
+        f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
+        f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
+        "--penalty-weight calms it, and leaves more noise."
+    )
+
+
+def _not_converged(records: list[PlaneRecord]) -> str | None:
+    """Return a message on planes whose certificate is above the tolerance."""
+    certificates = [one.certificate for one in records if one.certificate and one.method in ("pmlem", *JOINT_METHODS)]
+    missed = [one.value for one in certificates if not one.reached and one.value is not UNSET]
+    if not missed:
+        return None
+    return (
+        f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
+        f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
+    )
+
+
+def _black(records: list[PlaneRecord]) -> str | None:
+    """Return a message on planes without light, which are right only if there is none."""
+    black = [record for record in records if record.mean_e <= _BLACK_E]
+    if not black:
+        return None
+    return (
+        f"{len(black)} of {len(records)} planes are black ({black[0].method}, {black[0].depth_mm:g} mm for "
+        "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
+        "with dark frames of the same exposure"
+    )

@@ -1,0 +1,146 @@
+"""Steps from a captured session to its results: each is done only if its results are out of date."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile
+from faintfield.pipelines.formats.hashes import Hashes
+from faintfield.pipelines.formats.provenance import Provenance, first_difference, provenance
+from faintfield.pipelines.formats.results.records import REPORT_FILE
+from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
+from faintfield.rig.session.access import taken_frames
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that is made from a session.
+
+    Attributes
+    ----------
+    name : str
+        Name of the command that does it alone.
+    needs : tuple of str
+        Names of the steps whose results it reads.
+    inputs : callable
+        Returns the names of all files that it reads.
+    results : dict of str to mapping or msgspec.Struct
+        The options of each result file, if it is up to date; None if it is enough that the file exists.
+    sidecars : callable
+        Takes a result file's content; returns the names of the files that belong to it, in the same folder.
+    make : callable
+        Does it.
+    """
+
+    name: str
+    needs: tuple[str, ...]
+    inputs: Callable[[], Sequence[str]]
+    results: Mapping[str, object | None]
+    sidecars: Callable[[bytes], Sequence[str]]
+    make: Callable[[], object]
+
+
+class StepOutcome(msgspec.Struct, frozen=True):
+    """A step, whether it was run, and why."""
+
+    step: str
+    ran: bool
+    why: str
+
+
+class RunOutcome(msgspec.Struct, frozen=True):
+    """The result of `faintfield run`."""
+
+    session: str
+    report: str
+    steps: list[StepOutcome]
+    altered_frames: list[str]
+
+
+def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
+    """Do the steps that are out of date, in order, except those that need one that failed.
+
+    Raises
+    ------
+    RigError, CalibrationError, ReconstructionError, InputError
+        The first failure, after all other steps were done.
+    """
+    hashes = Hashes(session)
+    altered = _altered_frames(session, hashes)
+    done: list[StepOutcome] = []
+    failed: dict[str, Exception] = {}
+    for step in steps:
+        if missing := [name for name in step.needs if name in failed]:
+            failed[step.name] = failed[missing[0]]
+            inform(f"{step.name}: left as it is, for it needs {missing[0]}")
+            continue
+        try:
+            reason = _out_of_date(session, step, hashes)
+            inform(f"{step.name}: {reason or 'up to date'}")
+            if reason is not None:
+                step.make()
+        except NAMED_FAILURES as failure:
+            failed[step.name] = failure
+            inform(f"{step.name}: failed: {failure}")
+        else:
+            done.append(StepOutcome(step.name, reason is not None, reason or "up to date"))
+    hashes.save()
+    for first in failed.values():
+        again = f"mend that and run `faintfield run {session}` again; still to be done: {', '.join(failed)}"
+        raise type(first)(f"{first}; {again}") from first
+    return RunOutcome(str(session), str(session / RECONSTRUCTIONS / REPORT_FILE), done, altered)
+
+
+def _altered_frames(session: Path, hashes: Hashes) -> list[str]:
+    """Return the frames that are not as they were captured, and inform the user: results are made from them anyway."""
+    altered = [
+        str(path.relative_to(session))
+        for _, taken, path in taken_frames(session)
+        if path.is_file() and hashes.of(str(path.relative_to(session))) != taken.sha256
+    ]
+    if altered:
+        inform(
+            f"warning: {altered[0]} and {len(altered) - 1} other frames are not what was captured; results are made "
+            f"from them as they are now. Restore them from a copy; `faintfield verify {session}` names the first"
+        )
+    return altered
+
+
+def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
+    """Return why a step has to be done, None if its results are of its inputs, options and versions."""
+    inputs: dict[str, str] = {}
+    for name in step.inputs():
+        if not (session / name).is_file():
+            raise MissingFile(f"{session / name}: is missing; restore it from a copy")
+        inputs[name] = hashes.of(name)
+    for file, options in step.results.items():
+        if not (session / file).is_file():
+            return f"{file} is not there yet"
+        if options is None:
+            continue
+        try:
+            content = (session / file).read_bytes()
+            if difference := first_difference(_provenance_in(content), provenance(step.name, options, inputs)):
+                return f"{file} was made with another {difference}"
+            sidecars = [(session / file).parent / name for name in step.sidecars(content)]
+        except (msgspec.MsgspecError, UnicodeDecodeError, LookupError, TypeError):
+            return f"{file} is damaged"
+        if missing := [path for path in sidecars if not path.is_file()]:
+            return f"{missing[0].relative_to(session)} is missing"
+    return None
+
+
+class _Holder(msgspec.Struct):
+    """A result whose provenance is under a key of its own."""
+
+    provenance: Provenance[dict[str, Any]] | None = None
+
+
+def _provenance_in(content: bytes) -> Provenance[dict[str, Any]]:
+    """Return the provenance of a result file: under a key of its own, or among its other keys."""
+    own = msgspec.json.decode(content, type=_Holder).provenance
+    return own or msgspec.json.decode(content, type=Provenance[dict[str, Any]])

@@ -1,0 +1,163 @@
+"""A dark set made from a bright one: the work of `faintfield darken`."""
+
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.console import progress
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
+from faintfield.pipelines.reconstruction.brightness import brightness
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
+from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
+from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
+from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
+from faintfield.rig.simulation.sensor import SimulatedSensor
+
+_PAPER = SimulatedSensor()
+
+_FLAT = "flat.tiff"
+
+# Stems of files that stand beside the views: no view may have one.
+_TAKEN_STEMS = {Path(NOISE_REFERENCE).stem, Path(_FLAT).stem}
+
+
+class DarkeningOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """Options of `faintfield darken`, as its help explains them and provenance.json records them."""
+
+    snr: float = 0.16
+    seed: int = 1
+    exposure_s: float = 0.1
+    read_noise_e: float = _PAPER.read_noise_e
+    dark_current_e_per_s: float = _PAPER.dark_current_e_per_s
+    quantum_efficiency: float = _PAPER.quantum_efficiency
+
+    @property
+    def sensor(self) -> SimulatedSensor:
+        """The dark camera's sensor."""
+        return SimulatedSensor(
+            read_noise_e=self.read_noise_e,
+            dark_current_e_per_s=self.dark_current_e_per_s,
+            quantum_efficiency=self.quantum_efficiency,
+        )
+
+    @property
+    def dark_e(self) -> float:
+        """Expected dark electrons per pixel and view."""
+        return self.dark_current_e_per_s * self.exposure_s
+
+
+class Darkened(msgspec.Struct, frozen=True):
+    """A dark set that was made, and how dark it is; the result of `faintfield darken`."""
+
+    out: str
+    views: int
+    snr: float
+    snr_measured: float | None
+    photons_on_object: float
+    photons_linear: float
+    photons_from_moments: float
+    scale_e: float
+
+
+def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, overwrite: bool = False) -> Darkened:
+    """Expose every view of a bright set anew with few photons, and write the dark set.
+
+    Raises
+    ------
+    OutputExists
+        `out` holds something other than an earlier set, or `overwrite` is False.
+    BadValue
+        The reference view is black, or the SNR cannot be reached.
+    """
+    layouts = channel_layouts(bright)
+    light = _light(bright, bright.image_paths[bright.reference_view], layouts)
+    region, scale_e = _region_and_scale(bright.folder, light, options)
+    photons = float(light[region].mean()) * scale_e / options.quantum_efficiency
+    with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
+        _write_dark_views(bright, layouts, folder, options, scale_e)
+        write_png(folder / OBJECT_REGION, mask_picture(region))
+        origin = provenance("darken", options, dict(bright.input_hashes()))
+        record = msgspec.structs.asdict(origin) | {"scale_e": scale_e, "photons_on_object": photons}
+        write_json(folder / "provenance.json", record)
+    known = {"quantum_efficiency": options.quantum_efficiency, "read_noise_e": options.read_noise_e}
+    return Darkened(
+        out=str(out),
+        views=len(bright.image_paths),
+        snr=options.snr,
+        snr_measured=brightness(load_set(out)).snr,
+        photons_on_object=photons,
+        photons_linear=photons_from_linear_snr(options.snr, **known),
+        photons_from_moments=photons_from_moments(options.snr, dark_e=options.dark_e, **known),
+        scale_e=scale_e,
+    )
+
+
+def _region_and_scale(
+    folder: Path, light: NDArray[np.floating], options: DarkeningOptions
+) -> tuple[NDArray[np.bool_], float]:
+    """Return the object region (row, column) of the reference view, and the factor that makes its light dark."""
+    region = _object_region(light)
+    if not region.any():
+        raise BadValue(f"{folder}: cannot be darkened: its reference view is black; is it the bright set?")
+    try:
+        return region, signal_scale_for_snr(light[region], options.snr, options.dark_e, options.read_noise_e)
+    except ValueError as failure:
+        raise BadValue(f"{folder}: cannot be darkened: {failure}; is it the bright set?") from failure
+
+
+def _object_region(light: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Return the brighter part (row, column) of a view, separated from the darker by Otsu's threshold."""
+    grey = light if light.ndim == 2 else light.mean(axis=2)
+    top = float(np.quantile(grey, 0.999))
+    levels = np.clip(grey * (255 / top) if top > 0 else grey, 0, 255).astype(np.uint8)
+    threshold, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    return np.asarray(levels > threshold)
+
+
+def _light(bright: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> NDArray[np.float32]:
+    """Return the light of a bright view: its electrons above the dark level, never negative."""
+    frame = checked_frame(bright, path, layouts[0])
+    light = np.zeros(frame.pixels_dn.shape, np.float32)
+    for layout in layouts:
+        for lattice in layout.lattices:
+            noise = lattice_noise(bright, lattice, frame)
+            electrons = noise.electrons(lattice.of(layout.of(frame.pixels_dn)))
+            above = electrons - noise.background_e(bright.settings.exposure_s)
+            lattice.of(layout.of(light))[:] = np.maximum(above, 0)
+    return light
+
+
+def _view_names(bright: ElementalSet) -> list[str]:
+    """Return the file names of the dark views: those of the bright views where that keeps them apart."""
+    stems = [Path(view.image).stem for view in bright.settings.view]
+    if len({*stems, *_TAKEN_STEMS}) < len(stems) + len(_TAKEN_STEMS):
+        stems = [f"view_{index:03d}" for index in range(len(stems))]
+    return [f"{stem}.tiff" for stem in stems]
+
+
+def _write_dark_views(
+    bright: ElementalSet, layouts: list[ChannelLayout], folder: Path, options: DarkeningOptions, scale_e: float
+) -> None:
+    """Expose every view anew and write the set; a mosaic stays a mosaic."""
+    names, sensor, generator = _view_names(bright), options.sensor, np.random.default_rng(options.seed)
+    with closing(progress(bright.image_paths, "exposing views")) as paths:
+        signal_e = (_light(bright, path, layouts) * scale_e for path in paths)
+        write_exposures(folder, names, signal_e, sensor, options.exposure_s, generator)
+    camera = bright.settings.camera
+    if bright.flat is not None:
+        write_plane(folder / _FLAT, bright.flat, pitch_mm=1.0)
+        camera = msgspec.structs.replace(camera, flat=_FLAT)
+    views = [msgspec.structs.replace(view, image=name) for view, name in zip(bright.settings.view, names, strict=True)]
+    settings = msgspec.structs.replace(
+        bright.settings, exposure_s=options.exposure_s, camera=camera, noise=stated_noise(sensor), view=views
+    )
+    write_set(folder, settings)
