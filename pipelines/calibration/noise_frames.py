@@ -11,6 +11,7 @@ from faintfield.calib.noise import Series, SeriesSums
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
 from faintfield.pipelines.formats.sets.noise_set import NoiseSet, Region, group_frames
 
 
@@ -43,7 +44,7 @@ class MosaicPhase:
 
     def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Return the phase's part of an array (row, column), as a view."""
-        return pixels[self.phase[0] :: self.period[0], self.phase[1] :: self.period[1]]
+        return at_phase(pixels, self.phase, self.period)
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _layout(first: Path, settings: NoiseSet) -> Readout:
         )
     height, width = frame.pixels_dn.shape
     mosaic = settings.mosaic or frame.mosaic
-    period = (1, 1) if mosaic is None else (len(mosaic), len(mosaic[0]))
+    period = mosaic_period(mosaic)
     rows, columns = _slices(settings.region, (height, width), period)
     phases = [MosaicPhase((r, c), period, "" if mosaic is None else mosaic[r][c]) for r, c in np.ndindex(*period)]
     saturation_dn = settings.saturation_dn or frame.saturation_dn or float(np.iinfo(frame.pixels_dn.dtype).max)

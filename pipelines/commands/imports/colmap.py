@@ -1,12 +1,11 @@
 """`faintfield import colmap`: lens and poses from COLMAP's sparse models."""
 
 from pathlib import Path
-from typing import Any
 
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.formats.exchange.colmap import model_files, read_model
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
-from faintfield.pipelines.formats.exchange.posed_images import import_posed
+from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
 def import_colmap(
@@ -19,7 +18,7 @@ def import_colmap(
     reference: str | None = None,
     exposure_s: Positive | None = None,
     overwrite: bool = False,
-) -> dict[str, Any]:
+) -> ImportedSet:
     """Make an elemental set from a COLMAP model, text or binary, and its images.
 
     Parameters

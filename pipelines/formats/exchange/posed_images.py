@@ -1,12 +1,12 @@
-"""What other programs' models have in common: images posed in a world of their own, in a unit of their own."""
+"""Models of other programs: images with poses in a world and a unit of their own, imported as an elemental set."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from faintfield.calib.lens import Lens
@@ -15,6 +15,14 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
 from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+
+
+class ImportedSet(msgspec.Struct, frozen=True):
+    """The result of an import: the folder, the number of views, and the image whose camera is the reference."""
+
+    out: str
+    views: int
+    reference: str
 
 
 def import_posed(
@@ -27,8 +35,8 @@ def import_posed(
     exposure_s: float | None,
     command: str,
     overwrite: bool,
-) -> dict[str, Any]:
-    """Make an elemental set of images posed in units of `mm_per_unit` by the files `models`; return what is said of it.
+) -> ImportedSet:
+    """Make an elemental set of images whose poses, read from the files `models`, are in units of `mm_per_unit`.
 
     Raises
     ------
@@ -62,7 +70,7 @@ def import_posed(
         overwrite=overwrite,
     )
     inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
-    return {"out": str(out), "views": len(images), "reference": images[index].path.name}
+    return ImportedSet(str(out), len(images), images[index].path.name)
 
 
 def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
@@ -71,7 +79,7 @@ def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
 
 
 def _reference(images: Sequence[PosedImage], name: str | None) -> int:
-    """Return the image asked for, or that nearest to the middle of all cameras."""
+    """Return the index of the image asked for, or of the one nearest to the middle of all cameras."""
     if name is not None:
         found = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
         if not found:
@@ -82,7 +90,7 @@ def _reference(images: Sequence[PosedImage], name: str | None) -> int:
 
 
 def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
-    """Return the rows and columns in names such as view_r3_c12.tiff; names that are not of a grid say nothing."""
+    """Return the rows and columns in names such as view_r3_c12.tiff; None for each if the names are not of a grid."""
     found = [re.search(r"r(\d+)_c(\d+)$", image.path.stem) for image in images]
     nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)
