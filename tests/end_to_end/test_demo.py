@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.reconstruction.planes import TOGETHER, Method
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
 
-METHODS = [method for method in get_args(Method.__value__) if method not in TOGETHER]
+METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
 _ROOT = Path(__file__).parents[2]
 _MAIN = "from faintfield.pipelines.cli import main; main({words!r})"
 

@@ -9,8 +9,8 @@ import pytest
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
 from faintfield.pipelines.formats.files import (
-    alone_in,
     building_folder,
+    exclusive,
     require_room,
     sha256,
     write_json,
@@ -212,12 +212,12 @@ def test_the_fingerprint_is_that_of_the_standard(tmp_path: Path) -> None:
 
 def test_two_that_write_into_one_folder_are_told_apart(tmp_path: Path) -> None:
     folder = tmp_path / "results"
-    with alone_in(folder):
-        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), alone_in(folder):
+    with exclusive(folder):
+        with pytest.raises(OutputBusy, match="another faintfield command is writing there"), exclusive(folder):
             pass
         assert folder.is_dir()
     assert not folder.exists()  # nothing was put into it
-    with alone_in(folder):
+    with exclusive(folder):
         (folder / "plane.tiff").touch()
     assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
 
