@@ -63,18 +63,23 @@ def board(
         OpenCV's dictionary of the markers.
     """
     across, down = _squares(paper, columns, rows, square_mm)
-    marker_mm = round(_MARKER_SHARE * square_mm, 1)
-    try:
-        made = [
-            Board(f"board-{index}", across, down, square_mm, marker_mm, dictionary, index * (across * down // 2))
-            for index in range(boards)
-        ]
-    except ValueError as failure:
-        raise WrongUsage(f"{failure}") from failure
+    made = _boards(boards, across, down, square_mm, dictionary)
     write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
     inform(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
     entries = [BoardEntry(**asdict(each)) for each in made]
     return BoardSheets(str(out), paper, entries)
+
+
+def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> list[Board]:
+    """Return boards of one size that share no marker."""
+    marker_mm, markers = round(_MARKER_SHARE * square_mm, 1), across * down // 2
+    try:
+        return [
+            Board(f"board-{index}", across, down, square_mm, marker_mm, dictionary, index * markers)
+            for index in range(count)
+        ]
+    except ValueError as failure:
+        raise WrongUsage(f"{failure}") from failure
 
 
 def _squares(paper: str, columns: int | None, rows: int | None, square_mm: float) -> tuple[int, int]:

@@ -79,18 +79,8 @@ def geometry(
     record = geometry_record(measured, options)
     write_geometry(out, record, {**files_beside(measured), GEOMETRY_PAGE: stage_page(record)})
     _inform_of(measured, record)
-    return GeometrySummary(
-        str(out),
-        str(out / GEOMETRY_PAGE),
-        record.lens,
-        record.rms_inlier_px,
-        record.corners,
-        record.outliers,
-        record.holdout_ratio,
-        record.transfer_sigma_px,
-        record.repeatability,
-        record.stage,
-    )
+    figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
+    return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)
 
 
 def _inform_of(measured: MeasuredGeometry, record: GeometryRecord) -> None:

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.colmap import model_files, read_model
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage
+from faintfield.pipelines.formats.exchange.colmap import read_posed_images
 from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
@@ -38,12 +37,9 @@ def import_colmap(
     overwrite
         Replace an earlier set in OUT.
     """
-    model = read_model(src)
-    folder = images or src
     return import_posed(
         out,
-        model_files(src),
-        [PosedImage(folder / image.name, model.lenses[image.camera], image.rt_cam_world) for image in model.images],
+        read_posed_images(src, images or src),
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,

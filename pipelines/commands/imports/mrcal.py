@@ -40,8 +40,7 @@ def import_mrcal(
     posed = read_camera_models(src, images or src)
     return import_posed(
         out,
-        list(posed),
-        list(posed.values()),
+        posed,
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,

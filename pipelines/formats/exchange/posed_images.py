@@ -12,7 +12,7 @@ import numpy as np
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel, write_imported_set
 from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
@@ -27,8 +27,7 @@ class ImportedSet(msgspec.Struct, frozen=True):
 
 def import_posed(
     out: Path,
-    models: Sequence[Path],
-    images: Sequence[PosedImage],
+    model: PosedModel,
     *,
     mm_per_unit: float,
     reference: str | None,
@@ -36,26 +35,18 @@ def import_posed(
     command: str,
     overwrite: bool,
 ) -> ImportedSet:
-    """Make an elemental set of images whose poses, read from the files `models`, are in units of `mm_per_unit`.
+    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`.
 
     Raises
     ------
     MissingFile, BadValue
         An image is missing, a pose is not finite, or the reference is none of the images.
     """
-    for image in images:
-        if not image.path.is_file():
-            raise MissingFile(
-                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
-            )
-        if not np.isfinite(image.rt_cam_world).all():
-            raise BadValue(
-                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
-            )
+    _check_images(model.images)
     scale = np.repeat([1.0, mm_per_unit], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
-        for image, node in zip(images, _nodes(images), strict=True)
+        for image, node in zip(model.images, _nodes(model.images), strict=True)
     ]
     index = _reference(images, reference)
     write_imported_set(
@@ -66,11 +57,24 @@ def import_posed(
         exposure_s=exposure_s,
         command=command,
         options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
-        models=models,
+        models=model.files,
         overwrite=overwrite,
     )
     inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
     return ImportedSet(str(out), len(images), images[index].path.name)
+
+
+def _check_images(images: Sequence[PosedImage]) -> None:
+    """Refuse images that are missing, and poses that are not finite."""
+    for image in images:
+        if not image.path.is_file():
+            raise MissingFile(
+                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
+            )
+        if not np.isfinite(image.rt_cam_world).all():
+            raise BadValue(
+                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
+            )
 
 
 def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
