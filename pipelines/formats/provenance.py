@@ -2,7 +2,8 @@
 
 import platform
 from collections.abc import Mapping
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 
 import msgspec
 
@@ -40,8 +41,12 @@ def provenance[Options](command: str, options: Options, inputs: dict[str, str]) 
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what computes results, by name."""
-    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+    """Return the versions of Python and of the packages that compute results, those that are installed, by name."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        with suppress(PackageNotFoundError):  # mrcal is optional
+            found[name] = version(name)
+    return found
 
 
 def first_difference[Options](written: AnyProvenance, now: Provenance[Options]) -> str | None:

@@ -22,6 +22,7 @@ from faintfield.pipelines.commands.imports.mrcal import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
+from faintfield.pipelines.formats.provenance import versions
 from faintfield.pipelines.formats.results.geometry import (
     CORNERS_FILE,
     COVARIANCE_FILE,
@@ -177,6 +178,12 @@ def test_without_mrcal_what_needs_it_fails_by_name_in_one_line(
     assert line.startswith("faintfield: MissingMrcal: ")
     assert "pip install" in line
     assert not (tmp_path / "out").exists()
+
+
+def test_results_record_no_version_of_a_package_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "mrcal" in versions()
+    monkeypatch.setattr("faintfield.pipelines.formats.provenance._PACKAGES", ("numpy", "no-such-package"))
+    assert set(versions()) == {"python", "numpy"}
 
 
 BOARD_TOML = """format = 1
