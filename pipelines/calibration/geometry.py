@@ -22,6 +22,7 @@ from faintfield.calib.geometry import (
     transfer_sigma_at,
 )
 from faintfield.calib.geometry.stage import StageEstimate, StageReport, approach_directions, stage_report
+from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import WrongSize
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
@@ -76,8 +77,9 @@ def measure_geometry(board_set: BoardSet, settings: GeometrySettings) -> Measure
     Raises
     ------
     InputError, CalibrationError
-        An image cannot be used, or the corners do not determine the geometry; the message says what to add.
+        mrcal is not installed, an image cannot be used, or the corners do not determine the geometry.
     """
+    load_mrcal()  # fails at once if it is missing, not after all images were searched
     observations, size_px = _observe(board_set)
     rig = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
     visits = [] if board_set.one_sided else [(view.node, view.sweep) for view in board_set.views]
@@ -91,6 +93,7 @@ def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> Geo
     nodes = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
     inputs = dict(measured.board_set.input_hashes())
     return GeometryRecord(
+        format=1,
         lens=_lens_record(rig),
         size_px=rig.lens.size_px,
         reference_node=rig.nodes[rig.reference],

@@ -5,7 +5,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,6 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.noise import (
     CovarianceRecord,
     Measured,
-    NoiseProvenance,
     NoiseRecord,
     PhaseRecord,
 )
@@ -98,9 +96,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         temperature_c=temperature_c,
         frames=settings.frame,
         warnings=list(dict.fromkeys(warnings)),
-        provenance=NoiseProvenance(
-            **msgspec.structs.asdict(provenance("noise", {}, _input_hashes(sensor.folder, settings)))
-        ),
+        provenance=provenance("noise", {}, _input_hashes(sensor.folder, settings)),
     )
 
 

@@ -1,7 +1,10 @@
 """`faintfield board`: ChArUco boards to print, as vectors and true to size."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
+
+import msgspec
 
 from faintfield.calib.board import Board
 from faintfield.pipelines.arguments import Count, Positive
@@ -18,6 +21,14 @@ _PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), 
 _MARKER_SHARE = 0.74
 
 
+class BoardSheets(msgspec.Struct, frozen=True):
+    """The result of `faintfield board`: the file, its paper, and the entries for charuco.toml."""
+
+    out: str
+    paper: str
+    board: list[BoardEntry]
+
+
 def board(
     out: Path,
     /,
@@ -28,7 +39,7 @@ def board(
     rows: Count | None = None,
     square_mm: Positive = 27.0,
     dictionary: str = "DICT_5X5_1000",
-) -> dict[str, Any]:
+) -> BoardSheets:
     """Write ChArUco boards as PDF, a page each; they share no marker and can be in view together.
 
     Print at 100 % ("actual size"), measure the scale bar, glue the sheet to something flat and stiff. The [[board]]
@@ -52,18 +63,23 @@ def board(
         OpenCV's dictionary of the markers.
     """
     across, down = _squares(paper, columns, rows, square_mm)
-    marker_mm = round(_MARKER_SHARE * square_mm, 1)
+    made = _boards(boards, across, down, square_mm, dictionary)
+    write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
+    inform(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
+    entries = [BoardEntry(**asdict(each)) for each in made]
+    return BoardSheets(str(out), paper, entries)
+
+
+def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> list[Board]:
+    """Return boards of one size that share no marker."""
+    marker_mm, markers = round(_MARKER_SHARE * square_mm, 1), across * down // 2
     try:
-        made = [
-            Board(f"board-{index}", across, down, square_mm, marker_mm, dictionary, index * (across * down // 2))
-            for index in range(boards)
+        return [
+            Board(f"board-{index}", across, down, square_mm, marker_mm, dictionary, index * markers)
+            for index in range(count)
         ]
     except ValueError as failure:
         raise WrongUsage(f"{failure}") from failure
-    write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
-    inform(f"{out}: {boards} board(s) of {across} x {down} squares; print at 100 % and measure the scale bar")
-    entries = [{name: getattr(each, name) for name in BoardEntry.__struct_fields__} for each in made]
-    return {"out": str(out), "paper": paper, "board": entries}
 
 
 def _squares(paper: str, columns: int | None, rows: int | None, square_mm: float) -> tuple[int, int]:

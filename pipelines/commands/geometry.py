@@ -1,7 +1,8 @@
 """`faintfield geometry`: where the camera was at every node, from images of ChArUco boards."""
 
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.arguments import LensName, Positive
@@ -17,6 +18,9 @@ from faintfield.pipelines.formats.results.geometry import (
     GEOMETRY_PAGE,
     GeometryOptions,
     GeometryRecord,
+    LensRecord,
+    RepeatabilityRecord,
+    StageRecord,
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
@@ -25,16 +29,20 @@ from faintfield.pipelines.pages.stage_page import stage_page
 # Above this the nodes of one sweep no longer stand for those of another.
 _MAX_REPEATABILITY_MM = 0.020
 
-_RETURNED = (
-    "lens",
-    "rms_inlier_px",
-    "corners",
-    "outliers",
-    "holdout_ratio",
-    "transfer_sigma_px",
-    "repeatability",
-    "stage",
-)
+
+class GeometrySummary(msgspec.Struct, frozen=True):
+    """The result of `faintfield geometry`: where it is, and the main figures of geometry.json."""
+
+    out: str
+    report: str
+    lens: LensRecord
+    rms_inlier_px: float
+    corners: int
+    outliers: int
+    holdout_ratio: float | None
+    transfer_sigma_px: dict[str, float]
+    repeatability: RepeatabilityRecord | None
+    stage: StageRecord
 
 
 def geometry(
@@ -45,7 +53,7 @@ def geometry(
     lens: LensName = "opencv5",
     depth_mm: list[Positive] | None = None,
     limit_px: Positive = 0.5,
-) -> dict[str, Any]:
+) -> GeometrySummary:
     """Measure the lens, and where the camera was at every node, from images of ChArUco boards.
 
     Writes geometry.json, its covariance, a .cameramodel per node, and a page about the stage. A set that cannot tell
@@ -71,8 +79,8 @@ def geometry(
     record = geometry_record(measured, options)
     write_geometry(out, record, {**files_beside(measured), GEOMETRY_PAGE: stage_page(record)})
     _inform_of(measured, record)
-    returned = {name: getattr(record, name) for name in _RETURNED}
-    return {"out": str(out), "report": str(out / GEOMETRY_PAGE), **returned}
+    figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
+    return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)
 
 
 def _inform_of(measured: MeasuredGeometry, record: GeometryRecord) -> None:

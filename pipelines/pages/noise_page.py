@@ -1,4 +1,4 @@
-"""A page of plots by which a noise calibration can be judged, in the names and units of EMVA 1288."""
+"""A page of plots to judge a noise calibration by, in the names and units of EMVA 1288."""
 
 import io
 from collections.abc import Callable
@@ -30,13 +30,12 @@ _ROWS = (
     ("column_noise_dn", "column noise", "DN"),
 )
 
-
-_ACROSS = 3
+_PLOTS_PER_ROW = 3
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One plot of the page; `missing` says why it would have nothing to show, None where it has."""
+class Plot:
+    """One plot of the page; `missing` is the reason for leaving it out, None where it has something to show."""
 
     title: str
     draw: Callable[[Axes, NoiseCalibration], None]
@@ -44,23 +43,23 @@ class Panel:
 
 
 def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
-    """Return the page as a PNG: the panels that have something to show, and below them what is left out and why."""
-    panels = page_panels(calibration)
-    shown = [panel for panel in panels if panel.missing is None]
-    down = -(-len(shown) // _ACROSS)
+    """Return the page as a PNG: the plots, and below them the names of those left out, with the reason."""
+    plots = page_plots(calibration)
+    shown = [plot for plot in plots if plot.missing is None]
+    down = -(-len(shown) // _PLOTS_PER_ROW)
     figure = Figure(figsize=(15.5, 0.4 + 4.7 * down), layout="constrained")
     FigureCanvasAgg(figure)
-    # Half panels as the unit, so that a last row of fewer panels can stand in the middle.
-    grid = figure.add_gridspec(down, 2 * _ACROSS)
-    for index, panel in enumerate(shown):
-        row, column = divmod(index, _ACROSS)
-        first = 2 * column + (down * _ACROSS - len(shown) if row == down - 1 else 0)
+    # The grid is in half plots, so that a shorter last row can be centred.
+    grid = figure.add_gridspec(down, 2 * _PLOTS_PER_ROW)
+    for index, plot in enumerate(shown):
+        row, column = divmod(index, _PLOTS_PER_ROW)
+        first = 2 * column + (down * _PLOTS_PER_ROW - len(shown) if row == down - 1 else 0)
         axes = figure.add_subplot(grid[row, first : first + 2])
-        axes.set_title(panel.title)
-        panel.draw(axes, calibration)
+        axes.set_title(plot.title)
+        plot.draw(axes, calibration)
     how = f"{STANDARD}; likelihood: {calibration.likelihood}"
     figure.suptitle(f"Noise calibration: {title.strip()}    ({how})", fontsize=13)
-    left_out = "; ".join(f"{panel.title} ({panel.missing})" for panel in panels if panel.missing)
+    left_out = "; ".join(f"{plot.title} ({plot.missing})" for plot in plots if plot.missing)
     if left_out:
         figure.supxlabel(f"Not shown: {left_out}", fontsize=9, color="0.4")
     page = io.BytesIO()
@@ -68,28 +67,28 @@ def draw_page(calibration: NoiseCalibration, title: str) -> bytes:
     return page.getvalue()
 
 
-def page_panels(calibration: NoiseCalibration) -> tuple[Panel, ...]:
-    """Return every panel of the page, in order."""
+def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
+    """Return every plot of the page, in order, those left out included."""
     maps = calibration.maps
     offset = calibration.estimates["offset_dn"].value or 0.0
     cut_off = " (moments as they are, cut off)" if calibration.likelihood.startswith("censored") else ""
     no_mass = None if calibration.histograms else "no gain, or values too wide apart"
     return (
-        Panel("Photon transfer" + cut_off, _photon_transfer),
-        Panel("Dark signal against exposure time", _dark_signal),
-        Panel("Results, 95 % intervals", _table),
+        Plot("Photon transfer" + cut_off, _photon_transfer),
+        Plot("Dark signal against exposure time", _dark_signal),
+        Plot("Results, 95 % intervals", _table),
         _map("Offset less its mean (DSNU) [DN]", maps.offset_dn - offset, maps.unusable),
         _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
-        # Even, unless something is missing from the model.
+        # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
-        Panel("Dark values and the fitted mass function", _histograms, no_mass),
-        Panel("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        Plot("Dark values and the fitted mass function", _histograms, no_mass),
+        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
 
 def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Variance against mean, less the dark's, with the line of the model."""
+    """Draw variance against mean minus that of the dark, with the line of the model."""
     offset = calibration.estimates["offset_dn"].value or 0.0
     measured = [point for point in calibration.points if point.frames > 1]
     flats = any(point.kind == "flat" for point in measured)
@@ -113,7 +112,7 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Mean dark signal against exposure time, with what remains once the line is taken off."""
+    """Draw the mean dark signal against exposure time, with the residuals of its line."""
     points = [point for point in calibration.points if point.kind == "dark"]
     t = _column(points, "exposure_s")
     axes.plot(t, _column(points, "mean_dn"), "o", ms=4, color=_SECOND, label="mean of a series")
@@ -122,7 +121,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
     axes.set_xlabel("exposure time [s]")
     axes.set_ylabel(r"$\mu_{y.\mathrm{dark}}$ [DN]")
-    # Both out of the way of a line that rises, or falls.
+    # Legend and inset are placed beside the line, whether it rises or falls.
     falls = model[order[-1]] < model[order[0]]
     axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
     below = axes.inset_axes((0.1, 0.1, 0.34, 0.26) if falls else (0.56, 0.12, 0.42, 0.3))
@@ -133,7 +132,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
-    """List the numbers with their intervals."""
+    """Draw a table of the numbers with their intervals."""
     axes.axis("off")
     cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
     table = axes.table(
@@ -148,7 +147,7 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _words(estimate: Estimate) -> tuple[str, str]:
-    """Return value and interval, as precise as they are known."""
+    """Return value and interval as text, rounded to the standard error."""
     if estimate.value is None or estimate.ci95 is None:
         return "—", "not identifiable"
     digits = int(np.clip(np.ceil(-np.log10(estimate.se)), 0, 6)) if estimate.se else 3
@@ -156,8 +155,8 @@ def _words(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
 
 
-def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> Panel:
-    """Return the panel of one map, with a scale that spans the usable pixels."""
+def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> Plot:
+    """Return the plot of one map; its scale spans the usable pixels."""
 
     def draw(axes: Axes, _: NoiseCalibration) -> None:
         assert values is not None
@@ -167,11 +166,11 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         axes.set_ylabel("row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Panel(title, draw, _sameness(values, unusable))
+    return Plot(title, draw, _sameness(values, unusable))
 
 
 def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
-    """Return why a map shows nothing, None where it shows something."""
+    """Return why a map has nothing to show, None if it has."""
     if values is None:
         return "not identifiable from these frames"
     if unusable.all():
@@ -180,7 +179,7 @@ def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) 
 
 
 def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Values of the shortest and the longest darks, and how often each should occur."""
+    """Draw the histograms of the shortest and the longest darks, measured and fitted."""
     for histogram, colour in zip(calibration.histograms, (_SECOND, _INK), strict=False):
         seen = histogram.count > 0
         label = f"{histogram.exposure_s:g} s, {histogram.count.sum():,} values"
@@ -198,7 +197,7 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _span(calibration: NoiseCalibration) -> tuple[float, float]:
-    """Return the range of values in which all but one in ten thousand lie."""
+    """Return the range of values between the quantiles 1e-4 and 1 - 1e-4."""
     low, high = np.inf, -np.inf
     for histogram in calibration.histograms:
         share = np.cumsum(histogram.count) / histogram.count.sum()
@@ -208,7 +207,7 @@ def _span(calibration: NoiseCalibration) -> tuple[float, float]:
 
 
 def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
-    """Amplitude spectrum of the rows and of the columns of the offset map: a peak is a fixed pattern with a period."""
+    """Draw the amplitude spectra of the offset map; a peak is a fixed pattern with a period."""
     offset = np.asarray(calibration.maps.offset_dn, np.float64)
     usable = ~calibration.maps.unusable
     mean = float(offset.mean(where=usable))
@@ -226,5 +225,5 @@ def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
 
 
 def _column(points: list[TransferPoint], name: str) -> NDArray[np.float64]:
-    """Return one number of each point."""
+    """Return one attribute of each point."""
     return np.array([getattr(point, name) for point in points], np.float64)

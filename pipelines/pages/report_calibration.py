@@ -1,5 +1,6 @@
 """The camera in a report: its noise and its geometry."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ import numpy as np
 
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
-from faintfield.pipelines.formats.results.noise import Measured, NoiseProvenance, NoiseRecord, read_noise
+from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
 from faintfield.pipelines.pages.page import data_uri
 
 if TYPE_CHECKING:
@@ -67,6 +68,17 @@ class GeometrySection(Section):
     rows: "list[Row]"
     drawing: str | None
     maps: list[str]
+
+
+@dataclass(frozen=True)
+class CalibrationOrigin:
+    """Where a calibration is, and what it was made by and from."""
+
+    where: str
+    sha256: str
+    options: Mapping[str, object]
+    inputs: dict[str, str]
+    versions: dict[str, str]
 
 
 def find_beside(directory: Path, name: str) -> Path | None:
@@ -136,20 +148,12 @@ def _link(directory: Path, path: Path) -> str:
     return path.resolve().relative_to(directory.resolve(), walk_up=True).as_posix()
 
 
-def calibration_origins(noise: NoiseSection | None, geometry: GeometrySection | None) -> list[dict[str, Any]]:
+def calibration_origins(noise: NoiseSection | None, geometry: GeometrySection | None) -> list[CalibrationOrigin]:
     """Return where and how the calibrations were made, for the page's last part."""
-    made: list[tuple[Section, NoiseProvenance | GeometryRecord]] = []
-    if noise is not None and noise.record.provenance is not None:
-        made.append((noise, noise.record.provenance))
+    found: list[CalibrationOrigin] = []
+    if noise is not None and (made := noise.record.provenance) is not None:
+        found.append(CalibrationOrigin(noise.where, noise.sha256, made.options, made.inputs, made.versions))
     if geometry is not None:
-        made.append((geometry, geometry.record))
-    return [
-        {
-            "where": section.where,
-            "sha256": section.sha256,
-            "options": msgspec.to_builtins(origin.options),
-            "inputs": origin.inputs,
-            "versions": origin.versions,
-        }
-        for section, origin in made
-    ]
+        record, options = geometry.record, msgspec.structs.asdict(geometry.record.options)
+        found.append(CalibrationOrigin(geometry.where, geometry.sha256, options, record.inputs, record.versions))
+    return found

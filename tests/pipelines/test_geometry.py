@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +16,13 @@ from faintfield.pipelines import cli
 from faintfield.pipelines.commands.board import board
 from faintfield.pipelines.commands.exports.colmap import export_colmap
 from faintfield.pipelines.commands.exports.mrcal import export_mrcal
-from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.geometry import GeometrySummary, geometry
 from faintfield.pipelines.commands.imports.colmap import import_colmap
 from faintfield.pipelines.commands.imports.mrcal import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
+from faintfield.pipelines.formats.provenance import versions
 from faintfield.pipelines.formats.results.geometry import (
     CORNERS_FILE,
     COVARIANCE_FILE,
@@ -45,7 +47,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, GeometrySummary]:
     folder = tmp_path_factory.mktemp("boards")
     paper = paper_experiment(320, 240)
     experiment = SimulatedExperiment(paper.planes, paper.optics, paper.sensor, 3, 3, 100.0)
@@ -55,14 +57,14 @@ def measured(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     return folder, geometry(folder)
 
 
-def test_the_files_say_where_the_camera_was(measured: tuple[Path, dict[str, Any]], scene: Path) -> None:
+def test_the_files_say_where_the_camera_was(measured: tuple[Path, GeometrySummary], scene: Path) -> None:
     folder, result = measured
     truth = read_truth(scene)
     assert truth is not None
     found = read_geometry(folder)
     np.testing.assert_allclose([node.rt_cam_ref for node in found.nodes], truth.true_rt_cam_ref, atol=0.6)
     assert found.camera_lens().fx_px == pytest.approx(400.0, abs=1.0)
-    assert result["rms_inlier_px"] < 0.1
+    assert result.rms_inlier_px < 0.1
     content = json.loads((folder / "geometry.json").read_text())
     assert set(content["transfer_sigma_px"]) == {"500", "700"}
     assert set(content["inputs"]) >= {"charuco.toml", "b0_r0_c0.tiff"}
@@ -90,7 +92,7 @@ def test_the_depths_of_the_command_are_those_of_the_calibration() -> None:
     assert GeometrySettings().depths_mm == DEFAULT_DEPTHS_MM
 
 
-def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, dict[str, Any]]) -> None:
+def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, GeometrySummary]) -> None:
     folder, _ = measured
     content = read_geometry(folder)
     corners = read_corners(folder / CORNERS_FILE)
@@ -104,7 +106,7 @@ def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, dict[s
     np.testing.assert_allclose(again.lens.project(points), here.project(points), atol=1e-6)
 
 
-def test_mrcal_opens_the_camera_models(measured: tuple[Path, dict[str, Any]]) -> None:
+def test_mrcal_opens_the_camera_models(measured: tuple[Path, GeometrySummary]) -> None:
     folder, _ = measured
     found = read_geometry(folder)
     for node in found.nodes:
@@ -118,14 +120,14 @@ def test_mrcal_opens_the_camera_models(measured: tuple[Path, dict[str, Any]]) ->
         )
 
 
-def test_measured_poses_replace_the_sets_own(measured: tuple[Path, dict[str, Any]], scene: Path) -> None:
+def test_measured_poses_replace_the_sets_own(measured: tuple[Path, GeometrySummary], scene: Path) -> None:
     loaded = with_measured_geometry(load_set(scene), measured[0])
     assert loaded.settings.view[0].rt_cam_ref == read_geometry(measured[0]).nodes[0].rt_cam_ref
     assert loaded.lens.fx_px == read_geometry(measured[0]).lens.fx_px
     assert "geometry.json" in dict(loaded.input_hashes())
 
 
-def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, GeometrySummary], tmp_path: Path) -> None:
     simulate(tmp_path / "other", rows=1, columns=1, size_px=(160, 120), snr=1.0)
     with pytest.raises(BadValue, match=r"is of .* px images"):
         with_measured_geometry(load_set(tmp_path / "other"), measured[0])
@@ -137,7 +139,7 @@ def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, dict
 
 
 def test_a_set_with_one_board_is_refused_in_one_line(
-    measured: tuple[Path, dict[str, Any]], capsys: pytest.CaptureFixture[str], tmp_path: Path
+    measured: tuple[Path, GeometrySummary], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     folder, _ = measured
     lines = (folder / "charuco.toml").read_text().split("[[image]]")
@@ -152,6 +154,36 @@ def test_a_set_with_one_board_is_refused_in_one_line(
     assert last.startswith("faintfield: NotIdentifiable: ")
     assert "1 board pose(s) only" in last
     assert not (poor / "geometry.json").exists()
+
+
+@pytest.mark.parametrize("command", ["geometry", "export", "import"])
+def test_without_mrcal_what_needs_it_fails_by_name_in_one_line(
+    command: str,
+    measured: tuple[Path, GeometrySummary],
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    folder, _ = measured
+    calls = {
+        "geometry": [folder, "--out", tmp_path / "out"],
+        "export": ["mrcal", scene, tmp_path / "out"],
+        "import": ["mrcal", folder / "cameras", tmp_path / "out"],
+    }
+    monkeypatch.setitem(sys.modules, "mrcal", None)
+    capsys.readouterr()
+    assert cli.run([command, *map(str, calls[command])]) == 1
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("faintfield: MissingMrcal: ")
+    assert "pip install" in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_record_no_version_of_a_package_that_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "mrcal" in versions()
+    monkeypatch.setattr("faintfield.pipelines.formats.provenance._PACKAGES", ("numpy", "no-such-package"))
+    assert set(versions()) == {"python", "numpy"}
 
 
 BOARD_TOML = """format = 1
@@ -191,11 +223,11 @@ def test_the_board_pdf_is_true_to_size(tmp_path: Path) -> None:
     content = (tmp_path / "b.pdf").read_bytes().decode("ascii")
     assert "/MediaBox [0 0 1190.55118 841.88976]" in content  # 420 x 297 mm in points
     assert "/Count 2" in content
-    first, second = result["board"]
-    markers = first["columns"] * first["rows"] // 2
-    assert second["first_marker_id"] == first["first_marker_id"] + markers
+    first, second = result.board
+    markers = first.columns * first.rows // 2
+    assert second.first_marker_id == first.first_marker_id + markers
     squares = [line.split() for line in content.splitlines() if line.endswith(" re")]
-    assert sum(line[2] == line[3] == "30.00000" for line in squares) == 2 * -(-first["columns"] * first["rows"] // 2)
+    assert sum(line[2] == line[3] == "30.00000" for line in squares) == 2 * -(-first.columns * first.rows // 2)
     start = int(content.split("startxref\n")[1].split()[0])
     assert content[start:].startswith("xref")
     for number, line in enumerate(content[start:].splitlines()[3:], start=1):

@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.pages.noise_page import draw_page, page_panels
+from faintfield.pipelines.pages.noise_page import draw_page, page_plots
 from tests.calib.noise.darkroom import darks, specimen
 from tests.pipelines.noise_sets import take_set, write_frames
 
@@ -67,9 +67,9 @@ def test_the_page_leaves_out_what_it_could_not_show() -> None:
     chip, rng = specimen(17, dsnu_e=0.0)
     series = [measure_series(frames, Conditions("dark", t)) for t, frames in darks(chip, [0.1], 4, rng).items()]
     short = calibrate(series)
-    shown = [panel.title for panel in page_panels(short) if panel.missing is None]
+    shown = [plot.title for plot in page_plots(short) if plot.missing is None]
     assert shown[:3] == ["Photon transfer", "Dark signal against exposure time", "Results, 95 % intervals"]
-    missing = {panel.title: panel.missing for panel in page_panels(short) if panel.missing}
+    missing = {plot.title: plot.missing for plot in page_plots(short) if plot.missing}
     assert (
         missing["Dark current [e⁻/s]"] == missing["Relative response to light"] == "not identifiable from these frames"
     )
@@ -78,7 +78,7 @@ def test_the_page_leaves_out_what_it_could_not_show() -> None:
         measure_series(frames, Conditions("dark", t)) for t, frames in darks(chip, (0.1, 10.0, 60.0), 4, rng).items()
     ]
     longer = calibrate(series)
-    assert len([panel for panel in page_panels(longer) if panel.missing is None]) > 6
+    assert len([plot for plot in page_plots(longer) if plot.missing is None]) > 6
     # A PNG's header states its width and height after 16 bytes.
     lower, higher = (np.frombuffer(draw_page(one, "")[16:24], ">u4") for one in (short, longer))
     assert lower[0] == higher[0]

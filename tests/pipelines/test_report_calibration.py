@@ -55,6 +55,7 @@ def _geometry() -> dict[str, Any]:
     lens = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 400.0) | {"distortion": [0.0], "sigma": [0.1] * 5}
     known = dict.fromkeys(("rms_inlier_px", "rms_mrcal_px", "corner_sigma_px"), 0.018)
     return {
+        "format": 1,
         "lens": {"model": "opencv4", **lens},
         "size_px": [800, 800],
         "reference_node": [1, 1],

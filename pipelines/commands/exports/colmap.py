@@ -1,7 +1,7 @@
 """`faintfield export colmap`: lens and poses of a set as a COLMAP sparse model."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -18,7 +18,7 @@ def export_colmap(
     *,
     binary: bool = False,
     overwrite: bool = False,
-) -> dict[str, Any]:
+) -> dict[str, str | int]:
     """Write the lens and poses of an elemental set as a COLMAP model without points; its unit is the mm.
 
     Views with principal points of their own get cameras of their own.

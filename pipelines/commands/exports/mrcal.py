@@ -1,7 +1,7 @@
 """`faintfield export mrcal`: lens and poses of a set as .cameramodel files."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -14,7 +14,7 @@ from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 
 def export_mrcal(
     elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
-) -> dict[str, Any]:
+) -> dict[str, str | int]:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
 
     Parameters

@@ -1,12 +1,10 @@
 """`faintfield import colmap`: lens and poses from COLMAP's sparse models."""
 
 from pathlib import Path
-from typing import Any
 
 from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.colmap import model_files, read_model
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage
-from faintfield.pipelines.formats.exchange.posed_images import import_posed
+from faintfield.pipelines.formats.exchange.colmap import read_posed_images
+from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
 def import_colmap(
@@ -19,7 +17,7 @@ def import_colmap(
     reference: str | None = None,
     exposure_s: Positive | None = None,
     overwrite: bool = False,
-) -> dict[str, Any]:
+) -> ImportedSet:
     """Make an elemental set from a COLMAP model, text or binary, and its images.
 
     Parameters
@@ -39,12 +37,9 @@ def import_colmap(
     overwrite
         Replace an earlier set in OUT.
     """
-    model = read_model(src)
-    folder = images or src
     return import_posed(
         out,
-        model_files(src),
-        [PosedImage(folder / image.name, model.lenses[image.camera], image.rt_cam_world) for image in model.images],
+        read_posed_images(src, images or src),
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,

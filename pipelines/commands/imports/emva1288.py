@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -13,7 +12,7 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, write_noise_set
 
 
-def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, Any]:
+def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, str | float]:
     """Make a noise set of EMVA 1288 reference data.
 
     Parameters

@@ -1,11 +1,10 @@
 """`faintfield import mrcal`: lens and poses from .cameramodel files."""
 
 from pathlib import Path
-from typing import Any
 
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
-from faintfield.pipelines.formats.exchange.posed_images import import_posed
+from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
 def import_mrcal(
@@ -18,7 +17,7 @@ def import_mrcal(
     reference: str | None = None,
     exposure_s: Positive | None = None,
     overwrite: bool = False,
-) -> dict[str, Any]:
+) -> ImportedSet:
     """Make an elemental set from a folder of .cameramodel files and images of the same names.
 
     Parameters
@@ -41,8 +40,7 @@ def import_mrcal(
     posed = read_camera_models(src, images or src)
     return import_posed(
         out,
-        list(posed),
-        list(posed.values()),
+        posed,
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,

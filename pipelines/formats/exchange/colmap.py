@@ -15,9 +15,10 @@ from scipy.spatial.transform import Rotation
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
 from faintfield.pipelines.formats.files import write_whole
 
-# Name, number of parameters, by COLMAP's number of the model.
+# Name and number of parameters of a camera model, by COLMAP's number.
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -29,7 +30,7 @@ _MODELS = {
 _NUMBERS = {name: number for number, (name, _) in _MODELS.items()}
 _HALF_PX = 0.5
 
-# All that a model is written to.
+# Names of all files that a model is written to.
 MODEL_FILES = [f"{part}{suffix}" for part in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")]
 
 
@@ -73,6 +74,13 @@ def read_model(folder: Path) -> ColmapModel:
                 f"{', '.join(map(str, model.lenses)) or 'none'}; export the whole model"
             )
     return model
+
+
+def read_posed_images(folder: Path, images: Path) -> PosedModel:
+    """Return the images of a model, which are in the folder `images`, with their lenses and poses."""
+    model = read_model(folder)
+    posed = [PosedImage(images / it.name, model.lenses[it.camera], it.rt_cam_world) for it in model.images]
+    return PosedModel(list(model_files(folder)), posed)
 
 
 def model_files(folder: Path) -> tuple[Path, Path]:
@@ -146,7 +154,7 @@ def _quaternion(image: ColmapImage) -> list[float]:
 
 
 def _model_name(path: Path, model: str | int) -> str:
-    """Return the name of a camera model of which we know the name or COLMAP's number."""
+    """Return the name of a camera model, from its name or COLMAP's number."""
     number = _NUMBERS.get(model) if isinstance(model, str) else model
     if number not in _MODELS:
         raise BadValue(

@@ -47,18 +47,10 @@ def read_descriptor(path: Path) -> Descriptor:
             continue
         try:
             keyword, rest = words
-            if keyword == "i":
-                if current is None:
-                    raise ValueError("an image before any 'b' or 'd' line")
-                read.frames.append(msgspec.structs.replace(current, file=rest.strip()))
-            elif keyword in ("b", "d"):
+            if keyword in ("b", "d"):
                 current = _measurement(keyword, rest, levels)
-            elif keyword == "v":
-                read.release = rest.strip()
-            elif keyword == "n":
-                read.bits = int(rest.split()[0])
             else:
-                raise ValueError(f"'{keyword}' is none of v, n, b, d, i")
+                _add(read, current, keyword, rest.strip())
         except ValueError as failure:
             raise BadValue(
                 f"{path}: line {number}: '{line.strip()}' cannot be read ({failure}); correct it"
@@ -69,6 +61,21 @@ def read_descriptor(path: Path) -> Descriptor:
             "name the descriptor of a data set"
         )
     return read
+
+
+def _add(read: Descriptor, current: NoiseFrame | None, keyword: str, rest: str) -> None:
+    """Add a `v`, `n` or `i` line to a descriptor; `current` is the frame of the last `b` or `d` line."""
+    match keyword:
+        case "v":
+            read.release = rest
+        case "n":
+            read.bits = int(rest.split()[0])
+        case "i":
+            if current is None:
+                raise ValueError("an image before any 'b' or 'd' line")
+            read.frames.append(msgspec.structs.replace(current, file=rest))
+        case _:
+            raise ValueError(f"'{keyword}' is none of v, n, b, d, i")
 
 
 def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFrame:

@@ -1,4 +1,4 @@
-"""An elemental set made of pictures that lie elsewhere: copied, with the lens and the poses that others found."""
+"""An elemental set made of copies of other pictures, with lens and poses that other programs found."""
 
 import shutil
 from collections.abc import Sequence
@@ -31,6 +31,14 @@ class PosedImage:
     node: tuple[int, int] | None = None
 
 
+@dataclass(frozen=True)
+class PosedModel:
+    """Another program's model: the files that it was read from, and its images."""
+
+    files: list[Path]
+    images: list[PosedImage]
+
+
 def write_imported_set(
     out: Path,
     images: Sequence[PosedImage],
@@ -43,18 +51,18 @@ def write_imported_set(
     models: Sequence[Path] = (),
     overwrite: bool,
 ) -> None:
-    """Copy images into an elemental set whose frame is that of one of them.
+    """Copy images into an elemental set whose reference frame is the camera of one of them.
 
     Parameters
     ----------
     reference : int
-        Index of the image whose frame is the set's.
+        Index of the image whose camera is the reference.
     noise : Noise
-        What is known of the sensor; what pictures say of themselves (saturation, black level) is filled in.
+        The sensor; saturation and black level are filled in from the pictures.
     exposure_s : float, optional
-        Of each image; where it is None, what the first one states.
+        Exposure of each image; by default what the first one states.
     models : sequence of Path
-        The files that lens and poses were read from, for the record; nothing that is read is overwritten.
+        Files that lens and poses were read from, for the record; no file that is read is overwritten.
 
     Raises
     ------
@@ -66,15 +74,8 @@ def write_imported_set(
     lens = images[reference].lens
     first = read_picture(images[0].path)
     _check_lenses([image.lens for image in images], images[0].path, first)
-    exposure_s = exposure_s or first.exposure_s
-    if exposure_s is None:
-        inform("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
-        exposure_s = 1.0
-    noise = msgspec.structs.replace(
-        noise,
-        offset_dn=0.0 if noise.offset_dn is None and first.black_dn is None else noise.offset_dn,
-        saturation_dn=first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max),
-    )
+    exposure_s = exposure_s or _stated_exposure_s(first)
+    noise = _completed(noise, first)
     inputs = [*models, *(image.path for image in images)]
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
         views = [
@@ -87,8 +88,25 @@ def write_imported_set(
         write_json(folder / "provenance.json", provenance(command, options, hashes))
 
 
+def _stated_exposure_s(first: Frame) -> float:
+    """Return the exposure that a picture states, 1 s if it states none."""
+    if first.exposure_s is not None:
+        return first.exposure_s
+    inform("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
+    return 1.0
+
+
+def _completed(noise: Noise, first: Frame) -> Noise:
+    """Return the noise with black level and saturation of a picture filled in."""
+    return msgspec.structs.replace(
+        noise,
+        offset_dn=0.0 if noise.offset_dn is None and first.black_dn is None else noise.offset_dn,
+        saturation_dn=first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max),
+    )
+
+
 def read_picture(path: Path) -> Frame:
-    """Read a picture whose pixels are what a camera's are."""
+    """Read a picture; only pixels of 8 or 16 bits are accepted."""
     frame = read_frame(path)
     if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
         raise BadValue(
@@ -121,7 +139,7 @@ def _check_lenses(lenses: Sequence[Lens], path: Path, first: Frame) -> None:
 
 
 def _view(name: str, image: PosedImage, reference: PosedImage) -> View:
-    """Return an image as a view; a principal point that is the camera's is not said again."""
+    """Return an image as a view; it states a principal point only if that differs from the camera's."""
     rx, ry, rz, x, y, z = relative(image.rt_cam_world, reference.rt_cam_world).tolist()
     own = {key: getattr(image.lens, key) for key in ("cx_px", "cy_px")}
     own = {key: value for key, value in own.items() if value != getattr(reference.lens, key)}

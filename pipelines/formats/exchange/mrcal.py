@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from faintfield.calib.lens import Lens
 from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 
 SUFFIX = ".cameramodel"
@@ -52,8 +52,8 @@ def camera_model_text(lens: Lens, lens_model: str, rt_cam_ref: ArrayLike) -> str
     return text.getvalue()
 
 
-def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:
-    """Return the images of the camera models in a folder, each with its lens and pose, by the model's file.
+def read_camera_models(folder: Path, images: Path) -> PosedModel:
+    """Return the images of the camera models in a folder, each with its lens and pose.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def read_camera_models(folder: Path, images: Path) -> dict[Path, PosedImage]:
     paths = sorted(folder.glob(f"*{SUFFIX}"))
     if not paths:
         raise MissingFile(f"{folder}: holds no {SUFFIX} files; name the folder that holds one per image")
-    return {path: _read(path, images) for path in paths}
+    return PosedModel(paths, [_read(path, images) for path in paths])
 
 
 def _read(path: Path, images: Path) -> PosedImage:

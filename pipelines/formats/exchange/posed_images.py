@@ -1,53 +1,52 @@
-"""What other programs' models have in common: images posed in a world of their own, in a unit of their own."""
+"""Models of other programs: images with poses in a world and a unit of their own, imported as an elemental set."""
 
 import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.imported_set import PosedImage, write_imported_set
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel, write_imported_set
 from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 
+class ImportedSet(msgspec.Struct, frozen=True):
+    """The result of an import: the folder, the number of views, and the image whose camera is the reference."""
+
+    out: str
+    views: int
+    reference: str
+
+
 def import_posed(
     out: Path,
-    models: Sequence[Path],
-    images: Sequence[PosedImage],
+    model: PosedModel,
     *,
     mm_per_unit: float,
     reference: str | None,
     exposure_s: float | None,
     command: str,
     overwrite: bool,
-) -> dict[str, Any]:
-    """Make an elemental set of images posed in units of `mm_per_unit` by the files `models`; return what is said of it.
+) -> ImportedSet:
+    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`.
 
     Raises
     ------
     MissingFile, BadValue
         An image is missing, a pose is not finite, or the reference is none of the images.
     """
-    for image in images:
-        if not image.path.is_file():
-            raise MissingFile(
-                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
-            )
-        if not np.isfinite(image.rt_cam_world).all():
-            raise BadValue(
-                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
-            )
+    _check_images(model.images)
     scale = np.repeat([1.0, mm_per_unit], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
-        for image, node in zip(images, _nodes(images), strict=True)
+        for image, node in zip(model.images, _nodes(model.images), strict=True)
     ]
     index = _reference(images, reference)
     write_imported_set(
@@ -58,11 +57,24 @@ def import_posed(
         exposure_s=exposure_s,
         command=command,
         options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
-        models=models,
+        models=model.files,
         overwrite=overwrite,
     )
     inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
-    return {"out": str(out), "views": len(images), "reference": images[index].path.name}
+    return ImportedSet(str(out), len(images), images[index].path.name)
+
+
+def _check_images(images: Sequence[PosedImage]) -> None:
+    """Refuse images that are missing, and poses that are not finite."""
+    for image in images:
+        if not image.path.is_file():
+            raise MissingFile(
+                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
+            )
+        if not np.isfinite(image.rt_cam_world).all():
+            raise BadValue(
+                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
+            )
 
 
 def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
@@ -71,7 +83,7 @@ def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
 
 
 def _reference(images: Sequence[PosedImage], name: str | None) -> int:
-    """Return the image asked for, or that nearest to the middle of all cameras."""
+    """Return the index of the image asked for, or of the one nearest to the middle of all cameras."""
     if name is not None:
         found = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
         if not found:
@@ -82,7 +94,7 @@ def _reference(images: Sequence[PosedImage], name: str | None) -> int:
 
 
 def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
-    """Return the rows and columns in names such as view_r3_c12.tiff; names that are not of a grid say nothing."""
+    """Return the rows and columns in names such as view_r3_c12.tiff; None for each if the names are not of a grid."""
     found = [re.search(r"r(\d+)_c(\d+)$", image.path.stem) for image in images]
     nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)

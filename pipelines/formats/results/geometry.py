@@ -15,6 +15,7 @@ from msgspec import Meta, Struct
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import remove, write_json, write_whole
+from faintfield.pipelines.formats.provenance import Provenance
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -109,10 +110,10 @@ class GeometryOptions(Struct, frozen=True):
     limit_px: float
 
 
-class GeometryRecord(Struct, frozen=True, kw_only=True):
+class GeometryRecord(Provenance[GeometryOptions], frozen=True):
     """`geometry.json`: the lens, the camera's poses, how well they are known, and how they were found."""
 
-    format: Literal[1] = 1
+    format: Literal[1]
     lens: LensRecord
     size_px: tuple[int, int]
     reference_node: tuple[int, int]
@@ -128,10 +129,6 @@ class GeometryRecord(Struct, frozen=True, kw_only=True):
     repeatability: RepeatabilityRecord | None
     boards: list[BoardRecord]
     stage: StageRecord
-    command: str
-    options: GeometryOptions
-    inputs: dict[str, str]
-    versions: dict[str, str]
 
     def camera_lens(self) -> Lens:
         """Return the lens."""

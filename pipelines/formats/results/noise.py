@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole, writing
+from faintfield.pipelines.formats.provenance import Provenance
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
 STANDARD = "EMVA 1288 release 4.0"
@@ -91,15 +92,6 @@ class TemperatureRange(Struct, frozen=True):
     max: float
 
 
-class NoiseProvenance(Struct, frozen=True):
-    """What a noise calibration was made by and from; see `formats.provenance`."""
-
-    command: str
-    options: dict[str, Any]
-    inputs: dict[str, str]
-    versions: dict[str, str]
-
-
 # A class of its own because msgspec puts keyword-only fields after all others: these two come before the quantities.
 class _StandardQuantities(Quantities, frozen=True):
     format: Literal[1] = 1
@@ -126,7 +118,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     warnings: list[str] = []
     maps: str = NOISE_MAPS
     maps_sha256: str = ""
-    provenance: NoiseProvenance | None = None
+    provenance: Provenance[dict[str, object]] | None = None
 
 
 def read_noise(path: Path) -> NoiseRecord:

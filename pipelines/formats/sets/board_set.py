@@ -15,6 +15,7 @@ from faintfield.calib.geometry import Node
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_whole
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.rig.grid import centre_node
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
@@ -35,12 +36,12 @@ class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     first_marker_id: int = 0
 
     def board(self) -> Board:
-        """Return the board described (ValueError where it cannot be)."""
+        """Return the board; ValueError where it is impossible."""
         return Board(**msgspec.structs.asdict(self))
 
 
 class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One `[[image]]`; several of the same node and sweep are repeated frames and are averaged."""
+    """One `[[image]]`; images of the same node and sweep are repeated frames, which are averaged."""
 
     file: str
     node: tuple[int, int]
@@ -48,7 +49,7 @@ class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `charuco.toml`; `pitch_mm`, what the stage was told, is needed for its scale only."""
+    """`charuco.toml`; `pitch_mm`, the commanded distance of nodes, is needed for the scale of the stage only."""
 
     format: Literal[1]
     board: list[BoardEntry]
@@ -58,7 +59,7 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 @dataclass(frozen=True)
 class BoardView:
-    """What was seen at a node in a sweep: the files of its repeated frames, and the filters on their pixels."""
+    """The view of a node in a sweep: the files of its repeated frames, and their colour filters."""
 
     node: Node
     sweep: int
@@ -100,9 +101,9 @@ class BoardSet:
     reference : (int, int)
         The node whose camera is the reference: the centre of the grid.
     pitch_mm : float, optional
-        Distance of neighbouring nodes as the stage was told.
+        Commanded distance of neighbouring nodes.
     one_sided : bool
-        The stage approached every node from the same side, whatever the order.
+        Whether the stage approached every node from the same side, in whatever order.
     """
 
     source: Path
@@ -125,7 +126,7 @@ def load_board_set(folder: Path) -> BoardSet:
     Raises
     ------
     InputError
-        A file is missing, a key unknown, or a value cannot be; the message names it.
+        A file is missing, a key unknown, or a value impossible; the message names it.
     """
     if has_session(folder) and not (folder / FILE_NAME).is_file():
         return _of_session(folder)
@@ -149,7 +150,7 @@ def load_board_set(folder: Path) -> BoardSet:
 
 
 def _of_session(folder: Path) -> BoardSet:
-    """Return the charuco frames of a session; each charuco step is a sweep, during which the boards stand still."""
+    """Return the charuco frames of a session; each charuco step is a sweep, with the boards at rest."""
     frozen = read_plan(folder)
     files: dict[tuple[Node, int], list[Path]] = {}
     for planned, _, path in taken_frames(folder):
@@ -170,20 +171,19 @@ def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | 
 
 
 def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None) -> NDArray[np.float32]:
-    """Return a frame as if it had no colour filters: black and white of each phase brought to those of the whole.
+    """Return a frame without the effect of its filters: each phase is scaled to the black and white of the whole frame.
 
-    A board is grey, so that its light differs from phase to phase by a factor only, whatever the black level.
+    A board is grey, so that its light differs between phases by a factor only, whatever the black level.
     """
     if mosaic is None:
         return pixels
-    period = (len(mosaic), len(mosaic[0]))
-    ends = (0.05, 0.95)
+    period, ends = mosaic_period(mosaic), (0.05, 0.95)
     black, white = np.quantile(pixels, ends)
     grey = np.empty_like(pixels)
-    for row, column in np.ndindex(*period):
-        phase = pixels[row :: period[0], column :: period[1]]
-        low, high = np.quantile(phase, ends)
-        grey[row :: period[0], column :: period[1]] = black + (phase - low) * ((white - black) / max(high - low, 1.0))
+    for phase in np.ndindex(period):
+        filtered = at_phase(pixels, phase, period)
+        low, high = np.quantile(filtered, ends)
+        at_phase(grey, phase, period)[...] = black + (filtered - low) * ((white - black) / max(high - low, 1.0))
     return grey
 
 
