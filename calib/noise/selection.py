@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.exact import Counts
 from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
+from faintfield.calib.noise.marginal import Counts
 from faintfield.calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.

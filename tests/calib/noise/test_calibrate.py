@@ -242,7 +242,7 @@ def test_noise_that_changed_between_series_is_noticed() -> None:
     assert result.estimates["gain_dn_per_e"].value is None
 
 
-def test_a_plain_sensor_raises_no_doubts() -> None:
+def test_a_plain_sensor_raises_no_warnings() -> None:
     result = calibrate(take(*specimen(12, shape=(128, 128), jitter_dn=0.5, banding_dn=1.0, dcnu=0.1)))
     assert result.warnings == ()
     assert result.likelihood is NoiseLikelihood.GAUSSIAN

@@ -7,7 +7,7 @@ import pytest
 from scipy import linalg, stats
 
 from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
-from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, log_likelihood
+from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, negative_log_likelihood
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
@@ -71,8 +71,8 @@ def test_likelihood_is_that_of_the_dense_covariance() -> None:
         ("offset_dn", 0.3),
     ]:
         other = one | {name: changed}
-        ours = log_likelihood(one, moments) - log_likelihood(other, moments)
-        assert ours == pytest.approx(dense(one) - dense(other), rel=1e-9), name
+        ours = negative_log_likelihood(other, moments) - negative_log_likelihood(one, moments)
+        assert float(ours) == pytest.approx(dense(one) - dense(other), rel=1e-9), name
 
 
 def test_bound_on_the_gain_from_one_bright_flat_pair() -> None:
