@@ -95,8 +95,9 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
 
 
 def _fit_gaussian(moments: Moments) -> tuple[NoiseFit, NoiseFit | None]:
-    """Return the fit, and the one with a nonlinear response if flats have three levels; the former is the latter if
-    the nonlinearity is significant.
+    """Return the fit, and the fit with a nonlinear response if flats have three levels.
+
+    The first is the second if the nonlinearity is significant.
     """
     straight = fit_gaussian(moments)
     if np.unique(np.round(moments.flats.mean_dn, -1)).size < 3:

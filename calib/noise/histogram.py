@@ -9,7 +9,7 @@ from scipy.signal import fftconvolve
 
 from faintfield.calib.noise.mass import mass_function
 
-# Mean charge in electrons above which the normal law replaces the Poisson sum: it is as good there, and needs less memory.
+# Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
 _MAX_POISSON_CHARGE_E = 200.0
 
 
