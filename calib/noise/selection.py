@@ -1,7 +1,7 @@
 """Choose the likelihood that the frames require, and the initial values of its fit.
 
 It is Gaussian unless that fails: with values cut off at the black level it is biased (gain nearly doubled, read noise
-reduced to a third), and with read noise below an electron it ignores the information in single electrons.
+a third), and with read noise below an electron it ignores the information in single electrons.
 """
 
 from collections.abc import Sequence
