@@ -112,24 +112,18 @@ def _detect_board(
     marker_corners, marker_ids = markers.of(board)
     if not marker_ids.size:
         return None
-    layouts = (False, True) if board.rows % 2 == 0 else (False,)
-    best: tuple[NDArray[np.float64], NDArray[np.intp], bool] | None = None
-    for legacy in layouts:
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
         detector = _detector(board, legacy)
-        pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
-        if pixels is not None and len(pixels):  # the wrong layout gives no corners
-            best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
+        found, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
+        if found is not None and len(found):  # the wrong layout gives no corners
             break
-    count = len(marker_ids)
-    if best is None:
-        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
-    guesses, ids, legacy = best
-    clear = (1 - board.marker_mm / board.square_mm) / 2
-    pixels, sigma_px = refine_corners(
-        light, guesses, _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids), clear
-    )
+    else:
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), len(marker_ids), legacy=False)
+    guesses, ids = np.reshape(found, (-1, 2)).astype(float), np.ravel(ids).astype(int)
+    squares_px = _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids)
+    pixels, sigma_px = refine_corners(light, guesses, squares_px, (1 - board.marker_mm / board.square_mm) / 2)
     kept = np.isfinite(sigma_px)
-    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], len(marker_ids), legacy)
 
 
 @dataclass(frozen=True)

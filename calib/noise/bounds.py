@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.gaussian import ROUNDING_DN2, information
+from faintfield.calib.noise.gaussian import ROUNDING_DN2, information, main_quantities
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 
 
@@ -68,7 +68,7 @@ def cramer_rao(
     Returns
     -------
     dict
-        `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`: standard errors in those units.
+        Standard errors of `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`.
     """
     values = _parameters(sensor)
     moments = _expected_moments(sensor, np.asarray(exposures_s, float), frames, pixels, flat_signals_dn, flat_frames)
@@ -76,8 +76,8 @@ def cramer_rao(
     # A spread of zero is on the boundary of the model, and does not affect the errors of the others.
     free = [i for i, (name, value) in enumerate(values.items()) if value > 0 or not name.endswith(("dn2", "per_s2"))]
     covariance = np.linalg.inv(fisher[np.ix_(free, free)])
-    names = [list(values)[i] for i in free]
-    gradients = _gradients(sensor, names)
+    derivatives = {name: by for name, (_, by) in main_quantities(values).items() if name != "offset_dn"}
+    gradients = {name: np.array([by.get(key, 0.0) for key in values])[free] for name, by in derivatives.items()}
     return {name: float(np.sqrt(gradient @ covariance @ gradient)) for name, gradient in gradients.items()}
 
 
@@ -93,17 +93,6 @@ def _parameters(sensor: Sensor) -> dict[str, float]:
         "dcnu_dn2_per_s2": (gain * sensor.dcnu_e_per_s) ** 2,
         "log_gain": float(np.log(gain)),
     }
-
-
-def _gradients(sensor: Sensor, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return the derivatives of σ = √r / g, D = d / g and g with respect to the parameters."""
-    sigma, current, gain = sensor.read_noise_e, sensor.dark_current_e_per_s, sensor.gain_dn_per_e
-    derivatives = {
-        "gain_dn_per_e": {"log_gain": gain},
-        "read_noise_e": {"log_read_dn2": sigma / 2, "log_gain": -sigma},
-        "dark_current_e_per_s": {"dark_signal_dn_per_s": 1 / gain, "log_gain": -current},
-    }
-    return {quantity: np.array([by.get(name, 0.0) for name in names]) for quantity, by in derivatives.items()}
 
 
 def _expected_moments(

@@ -153,17 +153,19 @@ def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram
 
 def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     """Return the photon transfer and dark signal points."""
-    values, moments = fitted.fit.values, fitted.moments
-    slope = values.get("dark_signal_dn_per_s", 0.0)
-    dark_models = values["offset_dn"] + slope * moments.darks.exposure_s
-    means = np.concatenate([moments.darks.mean_dn, moments.flats.mean_dn])
-    withins = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
-    models = np.concatenate([dark_models, moments.flats.mean_dn])
-    variances = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
-    series = (*fitted.darks, *fitted.flats)
+    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
+    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
+    rows = zip(
+        (*fitted.darks, *fitted.flats),
+        (*darks.mean_dn, *flats.mean_dn),
+        (*darks.within_dn2, *flats.within_dn2),
+        (*dark_models, *flats.mean_dn),
+        (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
+        strict=True,
+    )
     points = []
-    for one, mean, within, model_mean, model_variance in zip(series, means, withins, models, variances, strict=True):
-        degrees = max((one.frames - 1) * moments.freedom, 1.0)
+    for one, mean, within, model_mean, model_variance in rows:
+        degrees = max((one.frames - 1) * fitted.moments.freedom, 1.0)
         measured = float(within) / degrees if one.frames > 1 else float("nan")
         points.append(
             TransferPoint(

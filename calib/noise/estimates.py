@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
+from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
 from faintfield.calib.noise.moments import Moments
 from faintfield.calib.noise.response import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
@@ -66,15 +66,15 @@ def _in_electrons(
     fit: NoiseFit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return the four main quantities, and the covariance of those without a reason against them."""
-    transforms = _transforms(fit)
+    quantities = main_quantities(fit.values)
     known = tuple(name for name, why in whys.items() if why is None)
-    jacobian = np.array([transforms[name][1] for name in known])
+    jacobian = np.array([[quantities[name][1].get(parameter, 0.0) for parameter in fit.values] for name in known])
     covariance = jacobian @ fit.covariance @ jacobian.T
     estimates = {name: Estimate(None, why=why) for name, why in whys.items()}
     for index, name in enumerate(known):
         se, positive = float(np.sqrt(covariance[index, index])), name in ("gain_dn_per_e", "read_noise_e")
         quantile = gain_quantile if positive else levels_quantile
-        estimates[name] = _interval(transforms[name][0], se, quantile, positive=positive)
+        estimates[name] = _interval(quantities[name][0], se, quantile, positive=positive)
     return estimates, (known, covariance)
 
 
@@ -88,29 +88,6 @@ def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
     if freedom >= 1 and fit.values.get("jitter_dn2", 0.0) > 0.5 * pixel_part:
         return float(stats.t.ppf(0.975, freedom))
     return float(stats.norm.ppf(0.975))
-
-
-def _transforms(fit: NoiseFit) -> dict[str, tuple[float, NDArray[np.float64]]]:
-    """Return the four main quantities and their derivatives by the parameters."""
-    values = fit.values
-    index = {name: i for i, name in enumerate(values)}
-
-    def gradient(by: dict[str, float]) -> NDArray[np.float64]:
-        row = np.zeros(len(values))
-        for name, derivative in by.items():
-            if name in index:
-                row[index[name]] = derivative
-        return row
-
-    gain = float(np.exp(values.get("log_gain", 0.0)))
-    sigma = float(np.exp(0.5 * values["log_read_dn2"])) / gain
-    current = values.get("dark_signal_dn_per_s", 0.0) / gain
-    return {
-        "offset_dn": (values["offset_dn"], gradient({"offset_dn": 1.0})),
-        "gain_dn_per_e": (gain, gradient({"log_gain": gain})),
-        "read_noise_e": (sigma, gradient({"log_read_dn2": 0.5 * sigma, "log_gain": -sigma})),
-        "dark_current_e_per_s": (current, gradient({"dark_signal_dn_per_s": 1 / gain, "log_gain": -current})),
-    }
 
 
 def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:

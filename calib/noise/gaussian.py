@@ -123,6 +123,19 @@ def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.flo
     return _hessian(objective, x, list(values.values()))
 
 
+def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
+    """Return offset, gain, read noise and dark current, each with its derivatives by the parameters."""
+    gain = float(np.exp(values.get("log_gain", 0.0)))
+    sigma = float(np.exp(0.5 * values["log_read_dn2"])) / gain
+    current = values.get("dark_signal_dn_per_s", 0.0) / gain
+    return {
+        "offset_dn": (values["offset_dn"], {"offset_dn": 1.0}),
+        "gain_dn_per_e": (gain, {"log_gain": gain}),
+        "read_noise_e": (sigma, {"log_read_dn2": 0.5 * sigma, "log_gain": -sigma}),
+        "dark_current_e_per_s": (current, {"dark_signal_dn_per_s": 1 / gain, "log_gain": -current}),
+    }
+
+
 def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64]) -> list[Any]:
     """Return the pixel noise of each dark series, eq. (1); parameters may be numbers or casadi expressions.
 
