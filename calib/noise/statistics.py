@@ -285,8 +285,8 @@ def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
 def _outlier(values: NDArray[np.float64], min_excess: float, certain_excess: float) -> tuple[int, float]:
     """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
 
-    An excess above `certain_excess` is no chance. One above `min_excess` is none if Student's t from the scatter of the
-    others has a probability below `_MAX_CHANCE`.
+    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
+    from the scatter of the others, is below `_MAX_CHANCE`.
     """
     largest = int(values.argmax())
     others = np.delete(values, largest)
