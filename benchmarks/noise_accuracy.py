@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
-from faintfield.calib.noise.exact import PARAMETERS, Counts, exact_likelihood
+from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
@@ -84,8 +84,9 @@ def _bound_of_values(read_noise_e: float, floor_dn: int | None = None, offset_dn
     """Return the bound of the likelihood of single values, from the scores at the truth of 16 384 pixels."""
     series = take(1, read_noise_e=read_noise_e, offset_dn=offset_dn, shape=(128, 128))
     counts = Counts(EXPOSURES_S, tuple(one.sample_dn for one in series), floor_dn)
-    truth = [np.log(2.0), np.log(read_noise_e), np.log(0.2), 0.0, offset_dn, np.log(3.0)]
-    _, scores = exact_likelihood(counts, dict(zip(PARAMETERS, truth, strict=True)), exact=True, spread=False)
+    truth = np.array([np.log(2.0), np.log(read_noise_e), np.log(0.2), 0.0, offset_dn, np.log(3.0)])
+    start = dict(zip(PARAMETERS, truth, strict=True))
+    _, _, scores = MarginalLikelihood(counts, start, exact=True, spread=False).evaluate(truth)
     free = [i for i, name in enumerate(PARAMETERS) if name != "dcnu"]
     error = np.sqrt(np.diag(np.linalg.inv(scores[np.ix_(free, free)] / 4)))
     return {name: float(e * value) for name, e, value in zip(NAMES, error, (2.0, read_noise_e, 0.2), strict=False)}

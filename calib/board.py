@@ -1,4 +1,4 @@
-"""The ChArUco board: a chessboard with a marker in every white square, so that each corner is known by number."""
+"""ChArUco boards: chessboards with a marker in every white square, which identifies each corner."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,34 +7,34 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# A marker must leave some white around it, and its bits some size, for the detector to find it.
+# Smallest and largest edge of a marker over that of its square: detection needs bits of some size and a white margin.
 _MARKER_SHARE = (0.3, 0.95)
 
 
 @dataclass(frozen=True)
 class Board:
-    """A board to print or to look for.
+    """A board to print or to detect.
 
-    The board's coordinates have their origin at its first inner corner (top left), x along a row, y down, z into the
-    board, in mm. Corners are numbered along the rows.
+    The board's coordinates in mm have their origin at the first inner corner (top left), x along a row, y down, and z
+    into the board. Corners are numbered along the rows.
 
     Parameters
     ----------
     name : str
-        By which messages and results know it.
+        Name in messages and results.
     columns, rows : int
-        Squares across and down.
+        Numbers of squares across and down.
     square_mm, marker_mm : float
-        Edge lengths, as measured on the print.
+        Edge lengths as measured on the print.
     dictionary : str
-        Of OpenCV's predefined ones, such as "DICT_5X5_1000".
+        One of OpenCV's predefined dictionaries, such as "DICT_5X5_1000".
     first_marker_id : int
-        Its markers are numbered from here; boards that are in view together share no number.
+        Number of the first marker; boards that are in view together must not share numbers.
 
     Raises
     ------
     ValueError
-        Fewer than 3 x 3 squares, markers that do not fit their squares, an unknown dictionary or too small a one.
+        There are fewer than 3 x 3 squares, markers do not fit their squares, or the dictionary is unknown or too small.
     """
 
     name: str
@@ -50,11 +50,11 @@ class Board:
             raise ValueError(f"board '{self.name}' has {self.columns} x {self.rows} squares; at least 3 x 3 are needed")
         if not (np.isfinite(self.square_mm) and self.square_mm > 0):
             raise ValueError(f"board '{self.name}': square_mm must be positive, got {self.square_mm}")
-        least, most = (share * self.square_mm for share in _MARKER_SHARE)
-        if not least <= self.marker_mm <= most:
+        smallest, largest = (share * self.square_mm for share in _MARKER_SHARE)
+        if not smallest <= self.marker_mm <= largest:
             raise ValueError(
                 f"board '{self.name}': marker_mm = {self.marker_mm} does not fit squares of {self.square_mm} mm; "
-                f"give {least:.3g} to {most:.3g}"
+                f"give {smallest:.3g} to {largest:.3g}"
             )
         known = len(predefined_dictionary(self.dictionary).bytesList)
         if self.first_marker_id < 0 or self.first_marker_id + self.marker_count > known:
@@ -66,27 +66,27 @@ class Board:
 
     @property
     def marker_count(self) -> int:
-        """How many markers it carries: one in each white square."""
+        """Number of markers: one in each white square."""
         return self.columns * self.rows // 2
 
     @property
     def marker_ids(self) -> range:
-        """Numbers of its markers."""
+        """Numbers of the markers."""
         return range(self.first_marker_id, self.first_marker_id + self.marker_count)
 
     @property
     def corner_shape(self) -> tuple[int, int]:
-        """Rows and columns of its inner corners."""
+        """Numbers of rows and columns of the inner corners."""
         return self.rows - 1, self.columns - 1
 
     def corners_mm(self) -> NDArray[np.float64]:
-        """Return the inner corners (corner, 3) in the board's coordinates, by number."""
+        """Return the inner corners (corner, 3) in the board's coordinates, ordered by number."""
         rows, columns = self.corner_shape
         row, column = np.divmod(np.arange(rows * columns), columns)
         return np.column_stack([column, row, np.zeros(len(row))]) * self.square_mm
 
     def opencv_board(self, *, legacy: bool = False) -> Any:
-        """Return the board as OpenCV knows it; `legacy`: an even number of rows begins with a white square."""
+        """Return OpenCV's board; in the `legacy` layout, boards with an even number of rows begin with white."""
         size, ids = (self.columns, self.rows), np.array(self.marker_ids)
         lengths = (float(self.square_mm), float(self.marker_mm))
         board = cv2.aruco.CharucoBoard(size, *lengths, predefined_dictionary(self.dictionary), ids)
@@ -95,12 +95,12 @@ class Board:
 
 
 def predefined_dictionary(name: str) -> Any:
-    """Return OpenCV's dictionary of markers.
+    """Return OpenCV's dictionary of markers by name.
 
     Raises
     ------
     ValueError
-        There is none of that name.
+        The name is unknown.
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
@@ -110,9 +110,9 @@ def predefined_dictionary(name: str) -> Any:
 
 
 def black_rectangles_mm(board: Board) -> NDArray[np.float64]:
-    """Return what is black on a board as rectangles (rectangle, 4): left, top, width, height in mm from its top left.
+    """Return the black parts of a board as rectangles (rectangle, 4): left, top, width, height in mm from the top left.
 
-    Rectangles of one row of a marker that touch are one, so that a printer leaves no hairline between them. The first
+    Adjacent bits in a row of a marker form one rectangle, so that a printer leaves no hairline between them. The first
     square is black, as OpenCV draws boards by default.
     """
     rectangles = []
@@ -130,7 +130,7 @@ def black_rectangles_mm(board: Board) -> NDArray[np.float64]:
 
 
 def _marker_runs(board: Board, marker_id: int) -> list[tuple[float, float, float, float]]:
-    """Return the black runs of one marker, row by row, in mm from the marker's top left."""
+    """Return the black rectangles of one marker, row by row, in mm from the marker's top left."""
     dictionary = predefined_dictionary(board.dictionary)
     side = dictionary.markerSize + 2
     black = dictionary.generateImageMarker(marker_id, side, borderBits=1) == 0

@@ -1,12 +1,12 @@
-"""Where the corner of a chessboard is, to a small part of a pixel, and how well that is known.
+"""Fit the corners of a chessboard to a fraction of a pixel, with standard deviations.
 
 Two edges cross in a corner, each blurred by lens and pixel. With t along an edge and n across it, from the corner,
 
     I(u) = a + c f₁ f₂,      fᵢ = erf(dᵢ / √2 s),      dᵢ = nᵢ − κᵢ tᵢ² / 2,
 
-is fitted to the pixels beside the edges by weighted least squares: nine numbers per corner, its place, the directions
-and bends of its edges, the blur, and two levels. Every pixel weighs by its own noise, which grows with the light; the
-inverse of the normal matrix is the covariance.
+is fitted to the pixels beside the edges by weighted least squares. A corner has nine parameters: its position, the
+directions and bends of its edges, the blur, and two levels. The weight of a pixel follows from its noise, which grows
+with the light; the inverse of the normal matrix is the covariance.
 """
 
 from dataclasses import dataclass
@@ -16,42 +16,42 @@ from numpy.typing import NDArray
 from scipy.special import erf
 
 type Array = NDArray[np.float64]
-type Pixels = NDArray[np.floating]  # single precision: a fit corrects its own rounding in the next step
+type Pixels = NDArray[np.floating]  # single precision: each step corrects the rounding of the one before
 
-# A corner's numbers: x, y, two directions (rad), two bends (1/px), the blur's logarithm (px), a, c.
+# Parameters of a corner: x, y (px), two directions (rad), two bends (1/px), ln of the blur (px), a, c.
 _PLACE, _ANGLES, _BENDS, _BLUR, _LEVEL, _CONTRAST = slice(0, 2), slice(2, 4), slice(4, 6), 6, 7, 8
 _COUNT = 9
 
-# The window: along an edge, and to its sides. Longer, and what lens and print do to edges counts more than noise.
-_MOST_ALONG_PX, _MOST_ACROSS_PX, _LEAST_ACROSS_PX = 10.0, 5.0, 1.5
-_CLEAR_OF_NEXT_CORNER = 0.75  # in squares
+# Extent of the window along an edge and to its sides; in longer ones errors of lens and print exceed the noise.
+_MAX_ALONG_PX, _MAX_ACROSS_PX, _MIN_ACROSS_PX = 10.0, 5.0, 1.5
+_MAX_ALONG_SQUARES = 0.75  # keeps clear of the next corner
 _BLUR_OF_MARKERS_PX = 1.0
 
-# What is known before the fit: edges turn by this over the image's width (rad), and lenses blur by about this.
+# Priors: standard deviation of the turn of an edge over the image's width (rad), and mean and standard deviation of the
+# blur of a lens, the latter of its logarithm.
 _BEND_SD = 0.25
 _BLUR_PX, _LOG_BLUR_SD = 0.7, 0.6
-_FIRST_BLUR_PX = 1.2  # wider than most, so that edges which are still apart attract each other
-_PIXEL_VARIANCE = 1 / 12  # px²: a pixel is the mean over its area
+_INITIAL_BLUR_PX = 1.2  # wider than most, so that the fit converges from guesses some pixels off
+_PIXEL_VARIANCE = 1 / 12  # px², since a pixel is the mean over its area
 
-# First in windows about the guesses, then about what was found there.
+# Numbers of steps in windows about the guesses, then about the corners found; the step that ends each; largest steps.
 _MAX_STEPS = (8, 4)
-_SETTLED_PX = 1e-4
+_TOLERANCE_PX = 1e-4
 _LARGEST_STEP = np.array([0.7, 0.7, 0.1, 0.1, 0.01, 0.01, 0.25, np.inf, np.inf])
 
-# A corner that is farther than this from its guess, or whose contrast is less than this over its own σ, is none.
-_FARTHEST_PX, _FAINTEST = 4.0, 4.0
-_MIN_PIXELS = 24
+# Limits for a corner to be accepted: distance from its guess, contrast over its own σ, and pixels in its window.
+_MAX_SHIFT_PX, _MIN_CONTRAST_SIGMAS, _MIN_PIXELS = 4.0, 4.0, 24
 
-_FLAT = 0.9  # from where on |f₁ f₂| is one of the two levels
-_LEAST_NOISE = 1e-3  # of the contrast, for pictures without any
+_FLAT = 0.9  # |f₁ f₂| from which a pixel counts as flat
+_MIN_NOISE = 1e-3  # of the contrast, for images without noise
 
-# Below this, what counts is the lens and the print, not the noise.
+# Standard deviation in pixels that lens and print add in any case.
 _FLOOR_PX = 0.01
 
 
 @dataclass(frozen=True)
 class _Windows:
-    """Pixels about each corner: where they are (corner, pixel, 2), their values, and which count (corner, pixel)."""
+    """Pixels about each corner: positions (corner, pixel, 2), values and use in the fit (corner, pixel)."""
 
     places: Pixels
     values: Pixels
@@ -59,67 +59,70 @@ class _Windows:
 
 
 def refine_corners(image: NDArray[np.float32], guesses: Array, squares_px: Array, clear: float) -> tuple[Array, Array]:
-    """Return where corners are, and their standard deviations per axis.
+    """Return the corners near the guesses, and their standard deviations per axis.
 
     Parameters
     ----------
     image : array (row, column)
-        Linear in the light, in any unit.
+        Image that is linear in the light, in any unit.
     guesses : array (corner, 2)
-        Column, row, within a few pixels of the corners.
+        Column and row to within a few pixels.
     squares_px : array (corner, 2, 2)
-        How one square is seen there: the step along the board's rows, then that along its columns.
+        Image of one square at each corner: the step along the board's rows, then that along its columns.
     clear : float
-        To how far from an edge nothing but its two squares is seen, in squares.
+        Distance from an edge, in squares, up to which only its two squares are seen.
 
     Returns
     -------
     points : array (corner, 2)
-        NaN where no corner is found near the guess.
+        Column and row; NaN if there is no corner near the guess.
     sigma_px : array (corner,)
-        From the noise of the flat pixels beside the edges; NaN likewise.
+        Standard deviations from the noise of the flat pixels beside the edges; NaN likewise.
     """
     if not len(guesses):
         return np.empty((0, 2)), np.empty(0)
     state = _start(guesses, squares_px)
-    for index, most_steps in enumerate(_MAX_STEPS):
+    for index, max_steps in enumerate(_MAX_STEPS):
         windows = _windows(image, guesses, state[:, _PLACE], squares_px, clear)
         if index == 0:
             _set_levels(state, windows)
-        for _ in range(most_steps):
+        for _ in range(max_steps):
             step, normal = _step(state, windows, image.shape[1])
             state += np.clip(step, -_LARGEST_STEP, _LARGEST_STEP)
-            if np.abs(step[:, _PLACE]).max() < _SETTLED_PX:
+            if np.abs(step[:, _PLACE]).max() < _TOLERANCE_PX:
                 break
     points = guesses + state[:, _PLACE]
     variances = np.diagonal(np.linalg.inv(normal), axis1=1, axis2=2)
-    found = (
-        (np.abs(state[:, _PLACE]).max(axis=1) <= _FARTHEST_PX)
-        & (np.abs(state[:, _CONTRAST]) >= _FAINTEST * np.sqrt(variances[:, _CONTRAST]))
-        & (windows.counts.sum(axis=1) >= _MIN_PIXELS)
-        & ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
-    )
+    found = _accepted(state, variances, windows)
+    found &= ((points >= 0) & (points <= np.array(image.shape[::-1]) - 1)).all(axis=1)
     sigma_px = np.hypot(np.sqrt(variances[:, _PLACE].mean(axis=1)), _FLOOR_PX)
     return np.where(found[:, np.newaxis], points, np.nan), np.where(found, sigma_px, np.nan)
 
 
+def _accepted(state: Array, variances: Array, windows: _Windows) -> NDArray[np.bool_]:
+    """Return which corners (corner,) are near their guess, of sufficient contrast, and seen by enough pixels."""
+    near = np.abs(state[:, _PLACE]).max(axis=1) <= _MAX_SHIFT_PX
+    contrast = np.abs(state[:, _CONTRAST]) >= _MIN_CONTRAST_SIGMAS * np.sqrt(variances[:, _CONTRAST])
+    return np.asarray(near & contrast & (windows.counts.sum(axis=1) >= _MIN_PIXELS))
+
+
 def _start(guesses: Array, squares_px: Array) -> Array:
-    """Return each corner's numbers (corner, 9) before the fit, its place counted from the guess."""
+    """Return the initial parameters (corner, 9), with positions relative to the guesses."""
     state = np.zeros((len(guesses), _COUNT))
     state[:, _ANGLES] = np.arctan2(squares_px[..., 1], squares_px[..., 0])
-    state[:, _BLUR] = np.log(_FIRST_BLUR_PX)
+    state[:, _BLUR] = np.log(_INITIAL_BLUR_PX)
     return state
 
 
 def _windows(image: Pixels, guesses: Array, found: Array, squares_px: Array, clear: float) -> _Windows:
-    """Cut a cross of pixels along the edges about what was found (corner, 2), counted from the guesses."""
+    """Return a cross of pixels along the edges about each position `found` (corner, 2), relative to the guesses."""
     sides = np.linalg.norm(squares_px, axis=2)
     heights = np.abs(np.linalg.det(squares_px))[:, np.newaxis] / sides
-    along = np.minimum(_CLEAR_OF_NEXT_CORNER * sides, _MOST_ALONG_PX)
-    across = np.clip(clear * heights - _BLUR_OF_MARKERS_PX, _LEAST_ACROSS_PX, _MOST_ACROSS_PX)
+    along = np.minimum(_MAX_ALONG_SQUARES * sides, _MAX_ALONG_PX)
+    across = np.clip(clear * heights - _BLUR_OF_MARKERS_PX, _MIN_ACROSS_PX, _MAX_ACROSS_PX)
     reach = np.arange(-int(along.max()) - 1, int(along.max()) + 2)
     offsets = np.stack(np.meshgrid(reach, reach), axis=-1).reshape(-1, 2)
-    whole = np.rint(guesses + np.clip(found, -_FARTHEST_PX, _FARTHEST_PX)).astype(int)[:, np.newaxis] + offsets
+    whole = np.rint(guesses + np.clip(found, -_MAX_SHIFT_PX, _MAX_SHIFT_PX)).astype(int)[:, np.newaxis] + offsets
     limits = np.array(image.shape[::-1]) - 1
     columns, rows = np.moveaxis(np.clip(whole, 0, limits), -1, 0)
     places = whole - guesses[:, np.newaxis]
@@ -133,7 +136,7 @@ def _windows(image: Pixels, guesses: Array, found: Array, squares_px: Array, cle
 
 
 def _set_levels(state: Array, windows: _Windows) -> None:
-    """Set a and c to the line through pixels against pattern."""
+    """Set a and c, in place, by a linear regression of the pixels on the pattern."""
     pattern = _edges(state, windows).pattern
     share = windows.counts / np.maximum(windows.counts.sum(axis=1, keepdims=True), 1)
     middle, level = ((share * what).sum(axis=1, keepdims=True) for what in (pattern, windows.values))
@@ -144,7 +147,7 @@ def _set_levels(state: Array, windows: _Windows) -> None:
 
 @dataclass(frozen=True)
 class _Edges:
-    """Of both edges of each corner (2, corner, pixel): distance along, across, f and its derivative by d."""
+    """Both edges of each corner (2, corner, pixel): distances along and across, f, its derivative by d, direction."""
 
     along: Pixels
     across: Pixels
@@ -160,6 +163,7 @@ class _Edges:
 
 
 def _edges(state: Array, windows: _Windows) -> _Edges:
+    """Return the edges that the parameters describe at the pixels of the windows."""
     numbers = state.astype(np.float32)[..., np.newaxis]
     x, y = (windows.places[..., axis] - numbers[:, axis] for axis in (0, 1))
     angles, bends = (np.swapaxes(numbers[:, which], 0, 1) for which in (_ANGLES, _BENDS))
@@ -194,17 +198,17 @@ def _step(state: Array, windows: _Windows, width_px: int) -> tuple[Array, Array]
 
 
 def _prior(width_px: int) -> tuple[Array, Array]:
-    """Return what is known of a corner's numbers before the fit, and the inverse of its variance."""
-    known, weights = np.zeros(_COUNT), np.full(_COUNT, 1e-12)  # so that a window without pixels is no error
+    """Return the prior means of the parameters and the inverses of their variances."""
+    known, weights = np.zeros(_COUNT), np.full(_COUNT, 1e-12)  # not zero, or windows without pixels would be singular
     weights[_BENDS] = (width_px / _BEND_SD) ** 2
     known[_BLUR], weights[_BLUR] = np.log(_BLUR_PX), _LOG_BLUR_SD**-2
     return known, weights
 
 
 def _variances(state: Array, windows: _Windows, pattern: Pixels, residuals: Pixels) -> Pixels:
-    """Return the variance of each pixel (corner, pixel): a line in the light through that of dark and white squares.
+    """Return the variance of each pixel (corner, pixel), linear in the light between dark and white squares.
 
-    Both are medians over the corners, so that a corner which is none does not matter.
+    Both ends are medians over the corners, so that guesses without a corner do not matter.
     """
     counts = windows.counts.sum(axis=1)
     freedom = np.maximum(counts - _COUNT, 1) / np.maximum(counts, 1)
@@ -215,6 +219,6 @@ def _variances(state: Array, windows: _Windows, pattern: Pixels, residuals: Pixe
         corners = flat.any(axis=1)
         squares = np.square(residuals[corners]).sum(axis=1, where=flat[corners]) / flat[corners].sum(axis=1)
         found.append(float(np.median(squares / freedom[corners])) if corners.any() else 0.0)
-    dark, white = found[0], max(found)  # light adds noise; where whites are clipped they seem to have none
-    least = (_LEAST_NOISE * float(np.median(np.abs(state[:, _CONTRAST])))) ** 2
-    return np.asarray(np.maximum(dark + (white - dark) * (1 + light) / 2, least) + np.float32(1e-30), np.float32)
+    dark, white = found[0], max(found)  # light adds noise; clipped whites only seem to have none
+    floor = (_MIN_NOISE * float(np.median(np.abs(state[:, _CONTRAST])))) ** 2
+    return np.asarray(np.maximum(dark + (white - dark) * (1 + light) / 2, floor) + np.float32(1e-30), np.float32)

@@ -1,4 +1,4 @@
-"""Finding boards: markers first, corners between them, then each corner to a small part of a pixel."""
+"""Detect boards in images: the markers, the corners between them, then each corner to a fraction of a pixel."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,36 +13,38 @@ from numpy.typing import NDArray
 from faintfield.calib.board import Board, predefined_dictionary
 from faintfield.calib.corner_fit import refine_corners
 
-# The darkest and brightest shares of pixels that a stretch may lose.
+# Quantiles of the light that become black and white, and the number of pixels from which they are taken.
 _STRETCH_QUANTILES = (0.002, 0.998)
 _STRETCH_SAMPLES = 60_000
 
-# The detector wants this much contrast over noise; below, the picture is smoothed until it has it.
-_WANTED_CONTRAST_OVER_NOISE = 14.0
-_LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX = 0.6, 2.5
+# Contrast over noise that the marker detector needs; images with less are smoothed until they have it.
+_MIN_CONTRAST_OVER_NOISE = 14.0
 
-# A marker that lies farther than this from where the others put it is a wrong one; a lens moves them by less.
-_WRONG_MARKER_PX = 10.0
+# Range of the smoothing, σ in pixels.
+_MIN_SMOOTHING_PX, _MAX_SMOOTHING_PX = 0.6, 2.5
+
+# Largest distance in pixels of a marker from its place by the homography of the others; the lens moves it by less.
+_MAX_MARKER_ERROR_PX = 10.0
 
 
 @dataclass(frozen=True)
 class BoardCorners:
-    """The corners of one board found in one image.
+    """Corners of one board found in one image.
 
     Attributes
     ----------
     board : str
-        Its name.
+        Name of the board.
     corners : int array (corner,)
-        Their numbers.
+        Numbers of the corners.
     pixels : float array (corner, 2)
-        Column, row.
+        Column and row of each.
     sigma_px : float array (corner,)
-        Standard deviation per axis, from the image's noise.
+        Standard deviation of each per axis, from the image's noise.
     markers : int
-        How many of its markers were found.
+        Number of the board's markers that were found.
     legacy : bool
-        The print begins with a white square, as boards of an even number of rows did in older OpenCV.
+        The print begins with a white square, as boards with an even number of rows did in older OpenCV.
     """
 
     board: str
@@ -54,14 +56,14 @@ class BoardCorners:
 
 
 def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCorners]:
-    """Return the corners of every board of which markers are seen.
+    """Return the corners of every board whose markers are seen.
 
     Parameters
     ----------
     image : array (row, column)
-        Grey, of any depth and brightness; the mean of repeated frames where one is too dark.
+        Grey image of any depth and brightness, or the mean of repeated frames if one is too dark.
     boards : sequence of Board
-        Looked for; they share no marker.
+        Boards to detect, which share no marker.
     """
     light = np.asarray(image, np.float32)
     stretched = stretch(light)
@@ -76,29 +78,29 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
 def detect_all(
     images: Iterable[NDArray[Any]], boards: Sequence[Board], workers: int = 2
 ) -> Iterator[list[BoardCorners]]:
-    """Yield what `detect_boards` finds in each image, in order, several at a time."""
+    """Yield the result of `detect_boards` for each image, in order; `workers` images are processed at a time."""
     with ThreadPoolExecutor(workers) as pool:
         waiting = []
         for image in images:
             waiting.append(pool.submit(detect_boards, image, boards))
-            if len(waiting) > workers:  # so that images are not all in memory
+            if len(waiting) > workers:  # keeps few images in memory
                 yield waiting.pop(0).result()
         for task in waiting:
             yield task.result()
 
 
 def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return an image as the 8 bits that the marker detector wants, whatever its depth; smoothed if it is noisy."""
+    """Return an image of any depth in the 8 bits that the marker detector needs, smoothed if it is noisy."""
     step = max(int(np.sqrt(light.size / _STRETCH_SAMPLES)), 1)
     black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
     kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
     noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(light, cv2.CV_32F, kernel)[::step, ::step]))) / 6
-    sigma_px = _LEAST_SMOOTHING_PX
+    sigma_px = _MIN_SMOOTHING_PX
     ratio = (white - black - 4 * noise) / max(noise, 1e-12)
-    if ratio < _WANTED_CONTRAST_OVER_NOISE:
-        # a Gaussian of σ lowers the noise by 2√π σ
-        sigma_px = _WANTED_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
-    light = cv2.GaussianBlur(light, (0, 0), float(np.clip(sigma_px, _LEAST_SMOOTHING_PX, _MOST_SMOOTHING_PX)))
+    if ratio < _MIN_CONTRAST_OVER_NOISE:
+        # A Gaussian of width σ divides the noise by 2√π σ.
+        sigma_px = _MIN_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
+    light = cv2.GaussianBlur(light, (0, 0), float(np.clip(sigma_px, _MIN_SMOOTHING_PX, _MAX_SMOOTHING_PX)))
     black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
     return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
 
@@ -106,45 +108,39 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _detect_board(
     light: NDArray[np.float32], stretched: NDArray[np.uint8], markers: "_Markers", board: Board
 ) -> BoardCorners | None:
-    """Try the board's layouts until one gives corners."""
+    """Return the corners of one board; None if none of its markers is seen."""
     marker_corners, marker_ids = markers.of(board)
     if not marker_ids.size:
         return None
-    layouts = (False, True) if board.rows % 2 == 0 else (False,)
-    best: tuple[NDArray[np.float64], NDArray[np.intp], bool] | None = None
-    for legacy in layouts:
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
         detector = _detector(board, legacy)
-        pixels, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
-        if pixels is not None and len(pixels):  # the wrong layout finds markers and no corners
-            best = np.reshape(pixels, (-1, 2)).astype(float), np.ravel(ids).astype(int), legacy
+        found, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
+        if found is not None and len(found):  # the wrong layout gives no corners
             break
-    count = len(marker_ids)
-    if best is None:
-        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
-    guesses, ids, legacy = best
-    clear = (1 - board.marker_mm / board.square_mm) / 2
-    pixels, sigma_px = refine_corners(
-        light, guesses, _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids), clear
-    )
+    else:
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), len(marker_ids), legacy=False)
+    guesses, ids = np.reshape(found, (-1, 2)).astype(float), np.ravel(ids).astype(int)
+    squares_px = _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids)
+    pixels, sigma_px = refine_corners(light, guesses, squares_px, (1 - board.marker_mm / board.square_mm) / 2)
     kept = np.isfinite(sigma_px)
-    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], len(marker_ids), legacy)
 
 
 @dataclass(frozen=True)
 class _Markers:
-    """All markers of one dictionary in an image: their outlines, and their numbers (marker, 1)."""
+    """The markers of one dictionary in an image: their outlines, and their numbers (marker, 1)."""
 
     corners: Sequence[NDArray[np.float32]]
     ids: NDArray[np.int32]
 
     def of(self, board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
-        """Return those of one board."""
+        """Return the markers of one board."""
         own = [index for index, marker in enumerate(np.ravel(self.ids)) if int(marker) in board.marker_ids]
         return [self.corners[index] for index in own], self.ids[own]
 
 
 def _markers(stretched: NDArray[np.uint8], dictionary: str, wanted: tuple[int, ...]) -> _Markers:
-    """Find the wanted markers of a dictionary."""
+    """Return the wanted markers of a dictionary that are in the image."""
     corners, found, _ = _marker_detector(dictionary, wanted).detectMarkers(stretched)
     indices = np.empty(0, int) if found is None else np.ravel(found)
     return _Markers(corners, np.array(wanted, np.int32)[indices].reshape(-1, 1))
@@ -156,11 +152,11 @@ def _squares_px(
     marker_ids: NDArray[np.int32],
     corners: NDArray[np.intp],
 ) -> NDArray[np.float64]:
-    """Return how one square along a row and one along a column are seen at corners (corner, 2, 2), from the markers."""
+    """Return the images (corner, 2, 2) of one square's step along rows and along columns at each corner."""
     known = list(np.ravel(printed.getIds()))
     flat = np.concatenate([printed.getObjPoints()[known.index(marker)][:, :2] for marker in np.ravel(marker_ids)])
     seen = np.concatenate([np.reshape(outline, (4, 2)) for outline in marker_corners])
-    homography, _ = cv2.findHomography(flat / printed.getSquareLength(), seen, cv2.RANSAC, _WRONG_MARKER_PX)
+    homography, _ = cv2.findHomography(flat / printed.getSquareLength(), seen, cv2.RANSAC, _MAX_MARKER_ERROR_PX)
     row, column = np.divmod(corners, printed.getChessboardSize()[0] - 1)
     x, y, depth = homography @ np.stack([column + 1, row + 1, np.ones(len(row))])
     by_column, by_row = homography[:, 0], homography[:, 1]
@@ -170,7 +166,7 @@ def _squares_px(
 
 @cache
 def _marker_detector(dictionary: str, wanted: tuple[int, ...]) -> Any:
-    """Return a detector that knows the wanted markers alone: what it sees is compared with every marker it knows."""
+    """Return a detector of the wanted markers only, since each candidate is compared with all markers that it knows."""
     whole = predefined_dictionary(dictionary)
     few = cv2.aruco.Dictionary(whole.bytesList[list(wanted)], whole.markerSize, whole.maxCorrectionBits)
     return cv2.aruco.ArucoDetector(few, cv2.aruco.DetectorParameters())

@@ -147,11 +147,9 @@ def _transfer_derivative(
     derivative = np.empty((len(pixels), 2, len(values)))
     for index, value in enumerate(values):
         step = _STEP * (1 + abs(value))
-        ends = []
-        for end in (value + step, value - step):
-            moved = values.copy()
-            moved[index] = end
-            moved_lens = Lens.from_parameters(lens.size_px, moved[:-6])
-            ends.append(transfer(moved_lens, moved[-6:], rt_ref_plane, pixels))
-        derivative[:, :, index] = (ends[0] - ends[1]) / (2 * step)
+        ahead, behind = (
+            transfer(Lens.from_parameters(lens.size_px, moved[:-6]), moved[-6:], rt_ref_plane, pixels)
+            for moved in values + step * np.eye(len(values))[index] * [[1], [-1]]
+        )
+        derivative[:, :, index] = (ahead - behind) / (2 * step)
     return derivative

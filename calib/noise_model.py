@@ -1,4 +1,4 @@
-"""What a sensor adds to the light: the numbers by which digital numbers become electrons with known statistics."""
+"""Noise model of a sensor, which converts digital numbers to electrons with known statistics."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 type Map = float | NDArray[np.floating]
-"""One number for the whole sensor, or one per pixel as an array (row, column)."""
+"""One value for the whole sensor, or one per pixel as an array (row, column)."""
 
 
 @dataclass(frozen=True)
@@ -19,17 +19,17 @@ class NoiseModel:
     Parameters
     ----------
     offset_dn : Map
-        Mean of a dark frame of no exposure, in DN.
+        Mean of a dark frame of zero exposure, in DN.
     gain_dn_per_e : Map
         DN per electron.
     read_noise_e : Map
         σ, standard deviation of the read noise, in electrons.
     dark_current_e_per_s : Map
-        D, electrons per pixel and second with no light.
+        D, electrons per pixel and second without light.
     quantum_efficiency : float, optional
-        η, electrons per photon; None where nobody has measured it.
+        η, electrons per photon; None if unknown.
     saturation_dn : float
-        Pixels at or above this value are saturated and carry no number.
+        Value from which pixels are saturated.
 
     Raises
     ------
@@ -55,13 +55,13 @@ class NoiseModel:
             raise ValueError(f"saturation_dn must be positive, got {self.saturation_dn}")
 
     def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
-        """Return a frame (row, column) in electrons, negative where the read noise made it so."""
+        """Return a frame (row, column) in electrons; read noise can make them negative."""
         electrons: NDArray[np.float32] = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
         electrons /= np.asarray(self.gain_dn_per_e, np.float32)
         return electrons
 
     def saturated(self, frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return where a frame (row, column) is saturated."""
+        """Return the saturated pixels of a frame (row, column)."""
         return np.asarray(frame_dn >= self.saturation_dn)
 
     def background_e(self, exposure_s: float) -> Map:
@@ -69,12 +69,12 @@ class NoiseModel:
         return self.dark_current_e_per_s * exposure_s
 
     def read_variance_e2(self) -> Map:
-        """Return the variance that is added whatever the light: read noise, and rounding to whole DN (1/12 DN²)."""
+        """Return the variance that does not depend on light: read noise, and rounding to whole DN (1/12 DN²)."""
         return self.read_noise_e**2 + 1.0 / (12.0 * self.gain_dn_per_e**2)
 
 
 def _require(name: str, value: Map, *, at_least: float, at_most: float = np.inf) -> None:
-    """Raise ValueError unless every number of `value` is finite and within its limits."""
+    """Raise ValueError unless all numbers of `value` are finite and within the limits."""
     numbers = np.asarray(value)
     if not np.isfinite(numbers).all():
         raise ValueError(f"{name} must be finite everywhere, got {value}")

@@ -34,7 +34,7 @@ def transfer_sigma_at(geometry: RigGeometry, depth_mm: float) -> NDArray[np.floa
 
 
 def rms_over_views(sigma_px: NDArray[np.float64]) -> float:
-    """Return the rms of σ over all nodes and points that are seen; infinite if there is none."""
+    """Return the rms of σ over all nodes and points that are seen; infinite if none is finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         mean = float(np.nanmean(np.square(sigma_px))) if np.isfinite(sigma_px).any() else np.inf
     return float(np.sqrt(mean))

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,9 +135,7 @@ def solve_again(bundle: Bundle, observations: Observations, chosen: NDArray[np.b
 def fit_boards(bundle: Bundle, other: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> Bundle:
     """Return the poses of the boards in the chosen views (view,), with lens and cameras fixed to those of `other`."""
     inputs = _restricted(bundle, observations, chosen)
-    inputs["intrinsics"] = other.inputs["intrinsics"].copy()
-    inputs["rt_cam_ref"] = other.inputs["rt_cam_ref"].copy()
-    inputs["calobject_warp"] = None if other.inputs["calobject_warp"] is None else other.inputs["calobject_warp"].copy()
+    inputs |= {name: copy(other.inputs[name]) for name in ("intrinsics", "rt_cam_ref", "calobject_warp")}
     locked = ("intrinsics_core", "intrinsics_distortions", "extrinsics", "calobject_warp")
     inputs |= {f"do_optimize_{name}": False for name in locked}
     _optimize(inputs)
@@ -178,7 +177,7 @@ def _indices(target_of: NDArray[np.int32], node_of: NDArray[np.int32]) -> NDArra
 def _restricted(bundle: Bundle, observations: Observations, chosen: NDArray[np.bool_]) -> dict[str, Any]:
     """Return a copy of a solution's inputs with the chosen views and the boards that they see."""
     targets, frame_of = np.unique(observations.target_of[chosen], return_inverse=True)
-    inputs = {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in bundle.inputs.items()}
+    inputs = {name: copy(value) for name, value in bundle.inputs.items()}
     inputs["rt_ref_frame"] = np.ascontiguousarray(inputs["rt_ref_frame"][targets])
     inputs["observations_board"] = np.ascontiguousarray(inputs["observations_board"][chosen])
     indices = _indices(frame_of.astype(np.int32), observations.node_of[chosen])

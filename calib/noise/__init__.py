@@ -1,7 +1,7 @@
-"""The noise of a sensor, measured from dark and flat frames; the physics is in docs/noise.md.
+"""Measure the noise of a sensor from dark and flat frames; docs/noise.md describes the physics.
 
-`SeriesSums` streams frames into sufficient statistics, `calibrate` turns those into numbers, maps and doubts, and
-`cramer_rao` says how well it could be done at all.
+`SeriesSums` reduces frames to sufficient statistics, `calibrate` turns these into numbers, maps and warnings, and
+`cramer_rao` returns the smallest errors that any unbiased method could reach.
 """
 
 from faintfield.calib.noise.bounds import Sensor, cramer_rao

@@ -1,7 +1,7 @@
-"""The Cramér–Rao bound: how well any unbiased method could measure a sensor from a given set of frames.
+"""The Cramér–Rao bound: the smallest errors with which an unbiased method can measure a sensor from given frames.
 
-The log-likelihood of `calib.noise.gaussian` is linear in the sufficient statistics, so its Hessian at their expected
-values is the Fisher information, exactly. Nothing is sampled.
+The log-likelihood of `calib.noise.gaussian` is linear in the sufficient statistics, so that its Hessian at their
+expected values is exactly the Fisher information. Nothing is sampled.
 """
 
 from collections.abc import Sequence
@@ -10,24 +10,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.gaussian import ROUNDING_DN2, information
+from faintfield.calib.noise.gaussian import ROUNDING_DN2, information, main_quantities
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor as the likelihood sees it.
+    """True parameters of a sensor.
 
     Attributes
     ----------
     gain_dn_per_e, read_noise_e, dark_current_e_per_s : float
         EMVA 1288's K, σ_d and μ_I.
     offset_dn : float
-        Mean of a dark of no exposure.
+        Mean of a dark frame of zero exposure.
     dsnu_e, dcnu_e_per_s : float
         Standard deviations over the pixels of the offset and of the dark current.
     jitter_dn : float
-        Standard deviation of the level of a frame.
+        Standard deviation of the level of frames.
     """
 
     gain_dn_per_e: float
@@ -48,41 +48,41 @@ def cramer_rao(
     flat_signals_dn: Sequence[float] = (),
     flat_frames: int = 2,
 ) -> dict[str, float]:
-    """Return the least standard errors of gain, read noise and dark current.
+    """Return the Cramér–Rao bound on the standard errors of gain, read noise and dark current.
 
     Parameters
     ----------
     sensor : Sensor
-        The truth.
+        True parameters.
     exposures_s : sequence of float
         Exposure times of the darks, at least two different.
     frames : int
-        Darks at each exposure.
+        Number of darks at each exposure.
     pixels : int
-        Pixels of a frame.
+        Number of pixels of a frame.
     flat_signals_dn : sequence of float
         Mean signal of each flat series above the offset.
     flat_frames : int
-        Frames of each flat series.
+        Number of frames of each flat series.
 
     Returns
     -------
     dict
-        `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`: standard errors in those units.
+        Standard errors of `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`.
     """
     values = _parameters(sensor)
     moments = _expected_moments(sensor, np.asarray(exposures_s, float), frames, pixels, flat_signals_dn, flat_frames)
     fisher = information(values, moments)
-    # A spread that is zero is a boundary of the model; it tells nothing about the others.
+    # A spread of zero is on the boundary of the model, and does not affect the errors of the others.
     free = [i for i, (name, value) in enumerate(values.items()) if value > 0 or not name.endswith(("dn2", "per_s2"))]
     covariance = np.linalg.inv(fisher[np.ix_(free, free)])
-    names = [list(values)[i] for i in free]
-    gradients = _gradients(sensor, names)
+    derivatives = {name: by for name, (_, by) in main_quantities(values).items() if name != "offset_dn"}
+    gradients = {name: np.array([by.get(key, 0.0) for key in values])[free] for name, by in derivatives.items()}
     return {name: float(np.sqrt(gradient @ covariance @ gradient)) for name, gradient in gradients.items()}
 
 
 def _parameters(sensor: Sensor) -> dict[str, float]:
-    """Return the sensor in the parameters of the likelihood."""
+    """Return the parameters of the likelihood for a sensor."""
     gain = sensor.gain_dn_per_e
     return {
         "offset_dn": sensor.offset_dn,
@@ -93,17 +93,6 @@ def _parameters(sensor: Sensor) -> dict[str, float]:
         "dcnu_dn2_per_s2": (gain * sensor.dcnu_e_per_s) ** 2,
         "log_gain": float(np.log(gain)),
     }
-
-
-def _gradients(sensor: Sensor, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return the derivatives of σ = √r / g, D = d / g and g with respect to the parameters."""
-    sigma, current, gain = sensor.read_noise_e, sensor.dark_current_e_per_s, sensor.gain_dn_per_e
-    derivatives = {
-        "gain_dn_per_e": {"log_gain": gain},
-        "read_noise_e": {"log_read_dn2": sigma / 2, "log_gain": -sigma},
-        "dark_current_e_per_s": {"dark_signal_dn_per_s": 1 / gain, "log_gain": -current},
-    }
-    return {quantity: np.array([by.get(name, 0.0) for name in names]) for quantity, by in derivatives.items()}
 
 
 def _expected_moments(

@@ -1,4 +1,4 @@
-"""The whole calibration of one plane: from series of darks and flats to numbers, maps and doubts."""
+"""Calibrate one plane: from series of darks and flats to numbers, maps and warnings."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from faintfield.calib.noise.diagnostics import check_series, frame_warnings, lev
 from faintfield.calib.noise.estimates import estimate_all
 from faintfield.calib.noise.fitting import SeriesFit, fit_series
 from faintfield.calib.noise.histogram import Histogram, compare_histogram
-from faintfield.calib.noise.maps import offset_and_dark_signal, shrunk_variance_ratio
+from faintfield.calib.noise.maps import PixelLevels, pixel_levels, shrunk_variance_ratio
 from faintfield.calib.noise.pixels import hot_pixels, noisy_pixels, variance_ratio
 from faintfield.calib.noise.response import Response, measure_response
 from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
@@ -18,14 +18,14 @@ from faintfield.calib.noise.statistics import Series
 
 
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:
-    """Measure a sensor, or one colour phase of it.
+    """Measure a sensor or one of its colour phases.
 
     Parameters
     ----------
     series : sequence of Series
-        Darks of at least one exposure, flats or none; all of one size.
+        Darks of at least one exposure, and possibly flats, all of one size.
     saturation_dn : float
-        Value from which a pixel is saturated, passed on to the result.
+        Value from which a pixel is saturated; part of the result.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     TooFewFrames
         No exposure has two frames, a light level has one, or the frames are too small.
     CopiedFrame
-        Two frames are the same.
+        Two frames are identical.
     PoorFit
         The likelihood has no maximum.
     """
@@ -42,75 +42,74 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     flats = [one for one in series if one.conditions.kind == "flat"]
     check_series(darks, flats)
     hot = hot_pixels(darks)
-    fitted = fit_series(darks, flats, ~hot)
-    noisy = _noisy(fitted) & ~hot
-    if noisy.any():
-        fitted = fit_series(darks, flats, ~hot & ~noisy)
-    points = _points(fitted)
+    return _result(*_fit_without_noisy(darks, flats, hot), hot, saturation_dn)
+
+
+def _result(
+    fitted: SeriesFit, noisy: NDArray[np.bool_], hot: NDArray[np.bool_], saturation_dn: float
+) -> NoiseCalibration:
+    """Return the numbers, maps and warnings that follow from a fit."""
+    usable, points = ~hot & ~noisy, _points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
-    offsets = _offsets(fitted, hot)
-    response = _response(fitted, offsets[0], offsets[1], ~hot & ~noisy)
+    levels = _levels(fitted, hot)
+    response = _response(fitted, levels, usable)
     estimates, covariance = estimate_all(fitted, response, levels_hold=level is None, noise_holds=noise is None)
     dead = response.dead if response else np.zeros_like(hot)
     return NoiseCalibration(
         estimates=estimates,
         covariance=covariance,
         likelihood=fitted.likelihood,
-        maps=_maps(fitted, estimates, offsets, response, hot | noisy | dead),
+        maps=_maps(fitted, estimates, levels, response, hot | noisy | dead),
         hot=hot,
         noisy=noisy,
         dead=dead,
-        variance_ratio=variance_ratio(darks, fitted.dark_noise_dn2)[0].astype(np.float32),
+        variance_ratio=variance_ratio(fitted.darks, fitted.dark_noise_dn2)[0].astype(np.float32),
         points=points,
-        histograms=_histograms(fitted, ~hot & ~noisy),
+        histograms=_histograms(fitted, usable),
         saturation_dn=saturation_dn,
         warnings=(*frame_warnings(fitted), *filter(None, (level, noise))),
     )
 
 
-def _noisy(fitted: SeriesFit) -> NDArray[np.bool_]:
-    """Return the noisy pixels; where values are cut off their variances tell nothing."""
-    if fitted.likelihood is NoiseLikelihood.CENSORED:
-        return np.zeros(fitted.darks[0].pattern_dn.shape, bool)
-    return noisy_pixels(*variance_ratio(fitted.darks, fitted.dark_noise_dn2))
+def _fit_without_noisy(
+    darks: Sequence[Series], flats: Sequence[Series], hot: NDArray[np.bool_]
+) -> tuple[SeriesFit, NDArray[np.bool_]]:
+    """Return the fit without hot and noisy pixels, and the noisy ones (row, column)."""
+    fitted = fit_series(darks, flats, ~hot)
+    if fitted.likelihood is NoiseLikelihood.CENSORED:  # variances of values that are cut off tell nothing
+        return fitted, np.zeros_like(hot)
+    noisy = noisy_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
+    return (fit_series(darks, flats, ~hot & ~noisy) if noisy.any() else fitted), noisy
 
 
-def _offsets(
-    fitted: SeriesFit, hot: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return offset and dark signal of every pixel, with variances; those of the whole sensor where values are cut."""
+def _levels(fitted: SeriesFit, hot: NDArray[np.bool_]) -> PixelLevels:
+    """Return offset and dark signal of every pixel; the sensor's own if values are cut off."""
     values = fitted.fit.values
     if fitted.likelihood is NoiseLikelihood.CENSORED:
-        shape = hot.shape
-        spreads = np.array([values["dsnu_dn2"], values["dcnu_dn2_per_s2"]])
-        return (
-            np.full(shape, values["offset_dn"]),
-            np.full(shape, values["dark_signal_dn_per_s"]),
-            np.broadcast_to(spreads[:, None, None], (2, *shape)),
-        )
-    return offset_and_dark_signal(fitted.darks, values, fitted.dark_noise_dn2, fitted.profiles_dn2, hot)
+        names = ("offset_dn", "dark_signal_dn_per_s", "dsnu_dn2", "dcnu_dn2_per_s2")
+        return PixelLevels(*(np.full(hot.shape, values[name]) for name in names))
+    return pixel_levels(fitted.darks, values, fitted.dark_noise_dn2, fitted.profiles_dn2, hot)
 
 
 def _maps(
     fitted: SeriesFit,
     estimates: dict[str, Estimate],
-    offsets: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    levels: PixelLevels,
     response: Response | None,
     unusable: NDArray[np.bool_],
 ) -> NoiseMaps:
-    """Return the maps: in electrons what can be, nothing for what cannot."""
-    offset, signal, variances = offsets
+    """Return the maps; those in electrons only where the gain is known."""
     gain = estimates["gain_dn_per_e"].value
     read_noise = dark_current = dark_variance = None
     if gain is not None:
         ratio = shrunk_variance_ratio(*variance_ratio(fitted.darks, fitted.dark_noise_dn2), ~unusable)
         read_noise = (np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain).astype(np.float32)
     if gain is not None and estimates["dark_current_e_per_s"].value is not None:
-        dark_current = np.maximum(signal / gain, 0).astype(np.float32)
-        dark_variance = (variances[1] / gain**2).astype(np.float32)
+        dark_current = np.maximum(levels.dark_signal_dn_per_s / gain, 0).astype(np.float32)
+        dark_variance = (levels.dark_signal_variance_dn2_per_s2 / gain**2).astype(np.float32)
     return NoiseMaps(
-        offset_dn=offset.astype(np.float32),
-        offset_variance_dn2=variances[0].astype(np.float32),
+        offset_dn=levels.offset_dn.astype(np.float32),
+        offset_variance_dn2=levels.offset_variance_dn2.astype(np.float32),
         unusable=unusable,
         dark_current_e_per_s=dark_current,
         dark_current_variance_e2_per_s2=dark_variance,
@@ -120,22 +119,19 @@ def _maps(
     )
 
 
-def _response(
-    fitted: SeriesFit,
-    offset_dn: NDArray[np.float64],
-    signal_dn_per_s: NDArray[np.float64],
-    usable: NDArray[np.bool_],
-) -> Response | None:
+def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_]) -> Response | None:
     """Return the photo response, None without flats."""
     if not fitted.flats:
         return None
-    signals = [one.mean_dn - offset_dn - signal_dn_per_s * one.conditions.exposure_s for one in fitted.flats]
+    signals = [
+        one.mean_dn - levels.offset_dn - levels.dark_signal_dn_per_s * one.conditions.exposure_s for one in fitted.flats
+    ]
     noise = [v / one.frames for v, one in zip(fitted.flat_noise_dn2, fitted.flats, strict=True)]
     return measure_response(signals, noise, usable)
 
 
 def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:
-    """Return the values of the shortest and the longest darks beside their prediction."""
+    """Return the values of the shortest and the longest darks with their prediction; none while the gain is unknown."""
     values = fitted.fit.values
     if "log_gain" not in values:
         return ()
@@ -157,17 +153,19 @@ def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram
 
 def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
     """Return the photon transfer and dark signal points."""
-    values, moments = fitted.fit.values, fitted.moments
-    slope = values.get("dark_signal_dn_per_s", 0.0)
-    dark_models = values["offset_dn"] + slope * moments.darks.exposure_s
-    means = np.concatenate([moments.darks.mean_dn, moments.flats.mean_dn])
-    withins = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
-    models = np.concatenate([dark_models, moments.flats.mean_dn])
-    variances = [*fitted.dark_noise_dn2, *fitted.flat_noise_dn2]
-    series = (*fitted.darks, *fitted.flats)
+    values, darks, flats = fitted.fit.values, fitted.moments.darks, fitted.moments.flats
+    dark_models = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * darks.exposure_s
+    rows = zip(
+        (*fitted.darks, *fitted.flats),
+        (*darks.mean_dn, *flats.mean_dn),
+        (*darks.within_dn2, *flats.within_dn2),
+        (*dark_models, *flats.mean_dn),
+        (*fitted.dark_noise_dn2, *fitted.flat_noise_dn2),
+        strict=True,
+    )
     points = []
-    for one, mean, within, model_mean, model_variance in zip(series, means, withins, models, variances, strict=True):
-        degrees = max((one.frames - 1) * moments.freedom, 1.0)
+    for one, mean, within, model_mean, model_variance in rows:
+        degrees = max((one.frames - 1) * fitted.moments.freedom, 1.0)
         measured = float(within) / degrees if one.frames > 1 else float("nan")
         points.append(
             TransferPoint(

@@ -1,4 +1,4 @@
-"""What is wrong with the frames: refused where nothing can be told, a warning in the result where something can."""
+"""Check the series before the fit, and warn of what contradicts the model after it."""
 
 from collections.abc import Sequence
 
@@ -11,15 +11,16 @@ from faintfield.calib.noise.result import TransferPoint
 from faintfield.calib.noise.selection import NoiseLikelihood
 from faintfield.calib.noise.statistics import Series
 
-# Fewer pixels leave the spreads over pixels, and so everything, to chance.
-_MIN_PIXELS = 256
+# Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.
+_MIN_PIXELS, _MIN_SIDE_PX = 256, 8
 
-# A model that the series contradict this improbably is wrong; by less than this fraction it does not matter.
-_CONTRADICTION, _CONTRADICTION_SIGMA, _NEGLIGIBLE = 1e-4, 6.0, 0.02
+# The series contradict the model if a departure has at most this probability, or exceeds this many standard errors, and
+# is more than this fraction: less does not matter.
+_MAX_PROBABILITY, _MIN_SIGMAS, _NEGLIGIBLE_FRACTION = 1e-4, 6.0, 0.02
 
 
 def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
-    """Refuse series from which nothing can be told.
+    """Check that the series are enough for a calibration.
 
     Raises
     ------
@@ -28,7 +29,7 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     TooFewFrames
         No exposure has two frames, a light level has one, or the frames are too small.
     CopiedFrame
-        Two frames are the same.
+        Two frames are identical.
     """
     if not darks:
         raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
@@ -53,15 +54,15 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
                 "each light level: record another or leave it out"
             )
     pixels = darks[0].pattern_dn.size
-    if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < 8:
+    if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < _MIN_SIDE_PX:
         raise TooFewFrames(
-            f"frames of {pixels} pixels: {_MIN_PIXELS} and 8 rows and columns are the least; "
+            f"frames of {pixels} pixels: {_MIN_PIXELS} and {_MIN_SIDE_PX} rows and columns are the least; "
             "record larger frames, or widen the region"
         )
 
 
 def frame_warnings(fitted: SeriesFit) -> list[str]:
-    """Return what is doubtful about the darks."""
+    """Return warnings about lone frames and values that are cut off."""
     warnings = [
         f"{one.names[0]}: the only one of the {one.conditions}; it tells the mean but no noise: record at least 2"
         for one in fitted.darks
@@ -76,7 +77,7 @@ def frame_warnings(fitted: SeriesFit) -> list[str]:
 
 
 def level_warning(fitted: SeriesFit) -> str | None:
-    """Return a warning where the dark levels do not lie on a straight line over exposure time."""
+    """Return a warning if the dark levels do not lie on a straight line over exposure time."""
     moments, values = fitted.moments, fitted.fit.values
     darks = moments.darks
     within = float((darks.frames - 1).sum())
@@ -91,7 +92,7 @@ def level_warning(fitted: SeriesFit) -> str | None:
     chance = float(stats.f.sf(float(weight @ residual**2) / free, free, within))
     worst = int(np.abs(residual).argmax())
     span = abs(slope) * float(np.ptp(darks.exposure_s)) + np.sqrt(np.exp(values["log_read_dn2"]))
-    if chance > _CONTRADICTION or abs(residual[worst]) < _NEGLIGIBLE * span:
+    if chance > _MAX_PROBABILITY or abs(residual[worst]) < _NEGLIGIBLE_FRACTION * span:
         return None
     return (
         f"the dark level against exposure time is no straight line: that at {darks.exposure_s[worst]:g} s is "
@@ -101,7 +102,7 @@ def level_warning(fitted: SeriesFit) -> str | None:
 
 
 def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | None:
-    """Return a warning where a series is noisier or quieter than eq. (1) allows."""
+    """Return a warning if a series is noisier or quieter than eq. (1) allows."""
     if fitted.likelihood is NoiseLikelihood.CENSORED:
         return None
     measured = [point for point in points if point.frames > 1]
@@ -109,7 +110,7 @@ def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | N
     worst = int(np.abs(excess).argmax())
     point = measured[worst]
     sigmas = abs(point.variance_dn2 - point.model_variance_dn2) / point.variance_se_dn2
-    if abs(excess[worst]) < _NEGLIGIBLE or sigmas < _CONTRADICTION_SIGMA:
+    if abs(excess[worst]) < _NEGLIGIBLE_FRACTION or sigmas < _MIN_SIGMAS:
         return None
     return (
         f"the noise of the {point.kind}s of {point.exposure_s:g} s is {100 * excess[worst]:+.1f} % off the model's in "

@@ -1,7 +1,7 @@
-"""From fitted parameters to EMVA 1288 quantities with intervals, or with the reason why there is none.
+"""Convert fitted parameters to EMVA 1288 quantities with intervals, or with the reason why there is no value.
 
-A quantity has a value when the frames tell it: gain and read noise within a tenth, the dark current such that its
-error does not matter beside the noise. Anything worse is no measurement, however confidently a fit returns a number.
+A quantity has a value if the frames determine it: gain and read noise to a tenth, the dark current so well that its
+error does not matter in comparison with the noise. A fit returns a number even if they do not.
 """
 
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
+from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
 from faintfield.calib.noise.moments import Moments
 from faintfield.calib.noise.response import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.statistics import Series
 
-# A relative standard error above this is no measurement.
+# Largest relative standard error of a value.
 MAX_RELATIVE_SE = 0.1
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
@@ -27,22 +27,23 @@ _ONE_REPEATED = (
     "each of 2 exposures, better 10 each of 4 up to 60 s"
 )
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
+_NO_PHOTONS = "no flat states its photons per pixel (`photons` in noise.toml, or `photons_per_s` in rig.toml)"
 _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
 
 
 def estimate_all(
     fitted: SeriesFit, response: Response | None, *, levels_hold: bool, noise_holds: bool
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return every quantity, and the covariance of offset, gain, read noise and dark current.
+    """Return all quantities, and the covariance of offset, gain, read noise and dark current.
 
     Parameters
     ----------
     fitted : SeriesFit
-        The fit and what it rests on.
+        Fit and series.
     response : Response, optional
-        What flats told.
+        Photo response; None without flats.
     levels_hold, noise_holds : bool
-        Whether the dark levels lie on a straight line over exposure time, and the noise of all series on eq. (1).
+        The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """
     fit, darks = fitted.fit, fitted.darks
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
@@ -64,23 +65,23 @@ def estimate_all(
 def _in_electrons(
     fit: NoiseFit, whys: dict[str, str | None], gain_quantile: float, levels_quantile: float
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """Return the four main quantities, those with a reason why not left out of the covariance."""
-    transforms = _transforms(fit)
+    """Return the four main quantities, and the covariance of those without a reason against them."""
+    quantities = main_quantities(fit.values)
     known = tuple(name for name, why in whys.items() if why is None)
-    jacobian = np.array([transforms[name][1] for name in known])
+    jacobian = np.array([[quantities[name][1].get(parameter, 0.0) for parameter in fit.values] for name in known])
     covariance = jacobian @ fit.covariance @ jacobian.T
     estimates = {name: Estimate(None, why=why) for name, why in whys.items()}
     for index, name in enumerate(known):
         se, positive = float(np.sqrt(covariance[index, index])), name in ("gain_dn_per_e", "read_noise_e")
         quantile = gain_quantile if positive else levels_quantile
-        estimates[name] = _interval(transforms[name][0], se, quantile, positive=positive)
+        estimates[name] = _interval(quantities[name][0], se, quantile, positive=positive)
     return estimates, (known, covariance)
 
 
 def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
-    """Return how many standard errors make 95 % of what rests on the levels of the darks.
+    """Return the half width of a 95 % interval, in standard errors, of a quantity that follows from the dark levels.
 
-    Student's where the jitter of the levels, known from few frames, matters.
+    It is Student's if the jitter of the levels, which few frames determine, matters.
     """
     pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
     freedom = float((moments.darks.frames - 1).sum())
@@ -89,31 +90,8 @@ def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
     return float(stats.norm.ppf(0.975))
 
 
-def _transforms(fit: NoiseFit) -> dict[str, tuple[float, NDArray[np.float64]]]:
-    """Return the four main quantities and their derivatives by the parameters."""
-    values = fit.values
-    index = {name: i for i, name in enumerate(values)}
-
-    def gradient(by: dict[str, float]) -> NDArray[np.float64]:
-        row = np.zeros(len(values))
-        for name, derivative in by.items():
-            if name in index:
-                row[index[name]] = derivative
-        return row
-
-    gain = float(np.exp(values.get("log_gain", 0.0)))
-    sigma = float(np.exp(0.5 * values["log_read_dn2"])) / gain
-    current = values.get("dark_signal_dn_per_s", 0.0) / gain
-    return {
-        "offset_dn": (values["offset_dn"], gradient({"offset_dn": 1.0})),
-        "gain_dn_per_e": (gain, gradient({"log_gain": gain})),
-        "read_noise_e": (sigma, gradient({"log_read_dn2": 0.5 * sigma, "log_gain": -sigma})),
-        "dark_current_e_per_s": (current, gradient({"dark_signal_dn_per_s": 1 / gain, "log_gain": -current})),
-    }
-
-
 def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bool) -> str | None:
-    """Return why gain and read noise in electrons cannot be told, None if they can."""
+    """Return why the frames do not determine gain and read noise in electrons, None if they do."""
     if "log_gain" not in fit.values:
         return f"{_why_no_growth(moments)}, or flats"
     relative = fit.standard_error("log_gain")
@@ -129,14 +107,14 @@ def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bo
 
 
 def _why_no_growth(moments: Moments) -> str:
-    """Return why the darks do not tell how noise and pattern grow with exposure time."""
+    """Return why the darks do not determine the growth of noise and pattern with exposure time."""
     return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
 
 
 def _why_no_current(
     fit: NoiseFit, moments: Moments, why_no_gain: str | None, quantile: float, *, levels_hold: bool
 ) -> str | None:
-    """Return why the dark current cannot be told, None if it can."""
+    """Return why the frames do not determine the dark current, None if they do."""
     if "dark_signal_dn_per_s" not in fit.values:
         return _ONE_EXPOSURE
     if why_no_gain is not None:
@@ -144,7 +122,7 @@ def _why_no_current(
     if not levels_hold:
         return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
     signal, half_width = fit.values["dark_signal_dn_per_s"], quantile * fit.standard_error("dark_signal_dn_per_s")
-    # Where few frames tell the jitter, that of the normal law with the same interval: the formal one flatters.
+    # The error of a normal law with the same interval: with few frames the formal one is too small.
     se = half_width / float(stats.norm.ppf(0.975))
     gain = float(np.exp(fit.values["log_gain"]))
     noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
@@ -164,7 +142,7 @@ def _why_no_current(
 
 
 def _interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
-    """Return an estimate with its interval, on a logarithmic scale for what cannot be negative."""
+    """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
     if positive:
         factor = float(np.exp(quantile * se / value))
         return Estimate(value, se, (value / factor, value * factor))
@@ -172,7 +150,7 @@ def _interval(value: float, se: float, quantile: float, *, positive: bool = Fals
 
 
 def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
-    """Return the root of a variance that may be zero, times a scale; none where it is significantly negative."""
+    """Return the root of a variance, times a scale; no value if the variance is significantly negative."""
     if not se:
         return Estimate(None, why=_NO_SPREAD)
     if variance + quantile * se <= 0:
@@ -182,7 +160,7 @@ def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Es
 
 
 def _negative(errors: float) -> str:
-    """Return why a variance so many standard errors below zero is no spread of zero."""
+    """Return why a variance that many standard errors below zero does not mean a spread of zero."""
     return (
         f"there is less scatter than the pixels' noise alone makes (by {errors:.2g} standard errors), so that a spread "
         "would be hidden: pickup whose phase turns from frame to frame does that; record more frames, away from what "
@@ -191,7 +169,7 @@ def _negative(errors: float) -> str:
 
 
 def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
-    """Return what needs no gain."""
+    """Return the quantities that need no gain."""
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
     read = _interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), quantile, positive=True)
     signal = Estimate(None, why=_ONE_EXPOSURE)
@@ -202,7 +180,7 @@ def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, 
 
 
 def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
-    """Return the pixels' own spreads: DSNU and DCNU."""
+    """Return the spreads over the pixels: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
     spreads = {"dsnu_dn": _root(dsnu2, se, quantile)}
@@ -217,7 +195,7 @@ def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Es
 
 
 def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
-    """Return the noise that the pixels of a frame, a row or a column share."""
+    """Return the noise that all pixels of a frame, a row or a column share."""
     fit, darks, pixels = fitted.fit, fitted.darks, fitted.moments.pixels
     if "jitter_dn2" not in fit.values:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
@@ -231,7 +209,7 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
         se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
         return _root(excess, se, quantile)
 
-    # A fit at its bound of zero has no curvature to take an error from: that of the levels' scatter without jitter.
+    # A fit at its bound of zero has no curvature; the error is then that of the levels' scatter without jitter.
     chance = float(np.average(noise, weights=freedom) / pixels * np.sqrt(2 / freedom.sum()))
     jitter_se = fit.standard_error("jitter_dn2") or chance
     return {
@@ -242,7 +220,7 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
 
 
 def _profiles(fit: NoiseFit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
-    """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, here in DN."""
+    """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, in DN."""
     dark = max(darks, key=lambda one: one.frames)
     rows, columns = dark.pattern_dn.shape
     noise = dark_variances_dn2(fit.values, np.array([dark.conditions.exposure_s]))[0]
@@ -258,7 +236,7 @@ def _profiles(fit: NoiseFit, darks: Sequence[Series], quantile: float) -> dict[s
 
 
 def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
-    """Return what only flats tell."""
+    """Return the quantities that only flats determine."""
     prnu = Estimate(None, why=_NO_FLATS)
     if response is not None:
         prnu = _interval(response.prnu, response.prnu_se, quantile)
@@ -266,10 +244,7 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
     if (bend := fitted.bend) is not None:
         se = bend.standard_error("nonlinearity_per_dn")
         nonlinearity = _interval(bend.values["nonlinearity_per_dn"], se, quantile)
-    efficiency = Estimate(
-        None,
-        why="no flat states its photons per pixel (`photons` in noise.toml, or `photons_per_s` in rig.toml)",
-    )
+    efficiency = Estimate(None, why=_NO_PHOTONS)
     if gain.value is not None:
         means_dn = fitted.moments.flats.mean_dn
         charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]
@@ -282,7 +257,7 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
 
 
 def _light_e(fit: NoiseFit, flat: Series, mean_dn: float) -> float:
-    """Return the electrons that light made in a flat series."""
+    """Return the electrons per pixel from light in a flat series."""
     values = fit.values
     signal = mean_dn - values["offset_dn"]
     charge_dn = signal * (1 + values.get("nonlinearity_per_dn", 0.0) * signal)

@@ -1,4 +1,4 @@
-"""Fitting the series of a sensor: pixels chosen, likelihood chosen, parameters found."""
+"""Fit the series of a sensor: choose pixels and likelihood, then find the parameters."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,20 +22,20 @@ from faintfield.calib.noise.statistics import Series
 
 @dataclass(frozen=True)
 class SeriesFit:
-    """A fit and what it rests on.
+    """A fit and the series behind it.
 
     Attributes
     ----------
     darks, flats : sequence of Series
-        The frames, reduced.
+        Statistics of the frames.
     moments : Moments
-        The same, reduced further.
+        Sums of the statistics over the pixels in use.
     likelihood : NoiseLikelihood
-        Which likelihood was maximised.
+        Likelihood that was maximized.
     fit : NoiseFit
-        Where.
+        Its maximum.
     bend : NoiseFit, optional
-        The fit that let the response bend, where flats of three levels allow one.
+        Fit with a nonlinear response; None unless there are flats of three levels.
     """
 
     darks: Sequence[Series]
@@ -69,17 +69,17 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
     darks, flats : sequence of Series
         At least one dark series.
     usable : array (row, column), bool
-        Pixels to learn from.
+        Pixels in use.
 
     Raises
     ------
     PoorFit, NotIdentifiable
-        The likelihood has no maximum, or too much is cut off at the black level to begin.
+        The likelihood has no maximum, or too many values are cut off at the black level to start.
     """
     suspect = np.any([one.suspect for one in darks], axis=0)
     moments = gather_moments(darks, flats, usable & ~suspect)
     fit, bend = _fit_gaussian(moments)
-    # Among values cut off at the floor the highest look suspect, and leaving them out would bias the rest.
+    # Among values cut off at the floor the highest look suspect; leaving them out would bias the fit.
     counts = collect_counts(darks, usable)
     likelihood = choose_likelihood(counts, fit, shared_noise_dn2(darks, fit))
     if likelihood is not NoiseLikelihood.GAUSSIAN:
@@ -95,7 +95,10 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
 
 
 def _fit_gaussian(moments: Moments) -> tuple[NoiseFit, NoiseFit | None]:
-    """Fit a straight response, and where three light levels allow it a bent one; the bent one where it is bent."""
+    """Return the fit, and the fit with a nonlinear response if flats have three levels.
+
+    The first is the second if the nonlinearity is significant.
+    """
     straight = fit_gaussian(moments)
     if np.unique(np.round(moments.flats.mean_dn, -1)).size < 3:
         return straight, None

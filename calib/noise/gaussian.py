@@ -1,14 +1,14 @@
 """The marginal Gaussian likelihood of dark and flat frames, fitted with casadi and IPOPT.
 
-Model of a dark pixel i in frame k of series j: `dn = o_i + d_i t_j + jitter_k + noise`, the noise of variance
+The model of a dark pixel i in frame k of series j is `dn = o_i + d_i t_j + jitter_k + noise`, the noise of variance
 
     v_j = r + g d t_j + 1/12                                                             (1)
 
-with r = g²σ² the read noise in DN², d = g D the dark signal in DN/s and 1/12 the rounding to whole DN; EMVA 1288
-release 4 has the same line for flats, `σ_y² = K²σ_d² + 1/12 + K(μ_y − μ_dark)`, with K = g. Offsets and dark signals
-of the pixels are integrated out, o_i ~ N(μ, s²) and d_i ~ N(d, q²), instead of being fitted one by one: that would
-lose a degree of freedom in every pixel and series, and bias the noise by (n − 1)/n. What is left of the frames are the
-few numbers of `calib.noise.moments`; see there for the distribution of each.
+with r = g²σ² the read noise in DN², d = g D the dark signal in DN/s and 1/12 the rounding to whole DN. EMVA 1288
+release 4 has the same line for flats, `σ_y² = K²σ_d² + 1/12 + K(μ_y − μ_dark)`, with K = g. Offsets o_i ~ N(μ, s²) and
+dark signals d_i ~ N(d, q²) of the pixels are integrated out. Fitting them one by one would lose a degree of freedom in
+every pixel and series, and bias the noise by (n − 1)/n. The likelihood depends on the frames through a few numbers
+only; `calib.noise.moments` gives the distribution of each.
 """
 
 from collections.abc import Mapping
@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from faintfield.calib.errors import PoorFit
 from faintfield.calib.noise.moments import FlatMoments, Moments
 
+# Variance in DN² that rounding to whole DN adds.
 ROUNDING_DN2 = 1.0 / 12.0
 
-# All three are needed for silence; the solver tries points where a variance is negative, and backs off by itself.
+# IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
 _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
@@ -32,17 +33,17 @@ _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """Maximum-likelihood parameters and their covariance, here the inverse of the exact Hessian.
+    """Maximum-likelihood parameters of a sensor and their covariance.
 
     Attributes
     ----------
     values : dict
-        `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, where the design has them,
+        `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, if the series determine them,
         `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, `nonlinearity_per_dn` κ.
     covariance : array (parameter, parameter)
-        In the order of `values`; zero for a jitter that came out as zero.
+        Covariance in the order of `values`; zero for a jitter that is zero.
     log_likelihood : float
-        At the maximum.
+        Log-likelihood at the maximum, up to a constant.
     """
 
     values: dict[str, float]
@@ -50,7 +51,7 @@ class NoiseFit:
     log_likelihood: float
 
     def standard_error(self, name: str) -> float:
-        """Return the standard error of one parameter, infinite for one that the design does not hold."""
+        """Return the standard error of one parameter, infinite for one that was not fitted."""
         if name not in self.values:
             return float("inf")
         index = list(self.values).index(name)
@@ -58,14 +59,14 @@ class NoiseFit:
 
 
 def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
-    """Maximise the marginal likelihood.
+    """Maximize the marginal likelihood; the covariance is the inverse of the exact Hessian.
 
     Parameters
     ----------
     moments : Moments
         Sufficient statistics; some series must have two frames or more.
     nonlinear : bool
-        Fit the bend κ of the response too; needs flats at three light levels.
+        Fit the nonlinearity κ of the response too, which requires flats at three light levels.
 
     Raises
     ------
@@ -73,56 +74,72 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
         IPOPT did not converge.
     """
     start, scale = _start(moments, nonlinear)
-    names = list(start)
-    x = ca.SX.sym("x", len(names))
-    parameters = {name: x[i] * scale[name] for i, name in enumerate(names)}
-    objective = _negative_log_likelihood(parameters, moments)
-    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0})
-    # The spreads over pixels may come out negative, as unbiased differences of variances do: a bound at zero would
-    # push what contradicts it (a pickup whose phase turns from frame to frame, say) into the read noise.
-    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in names]
-    # From the spreads that the frames suggest, a first step may overshoot to where a variance vanishes; from less of
-    # them it does not.
-    for share in (1.0, 0.1, 0.01):
-        first = {name: start[name] * (share if name in _SPREADS else 1.0) for name in names}
-        found = solver(x0=[first[name] / scale[name] for name in names], lbx=lower)
-        if solver.stats()["success"]:
-            break
-    if not solver.stats()["success"]:
-        raise PoorFit(
-            f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
-            f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
-        )
-    at = np.array(found["x"]).ravel()
-    hessian = np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
-    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(names)])
-    units = np.array([scale[name] for name in names])
+    units = np.array([*scale.values()])
+    x = ca.SX.sym("x", len(start))
+    parameters = {name: x[i] * scale[name] for i, name in enumerate(start)}
+    objective = negative_log_likelihood(parameters, moments)
+    at, minimum = _minimize(objective, x, start, units)
+    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(start)])
     return NoiseFit(
-        values={name: float(at[i] * scale[name]) for i, name in enumerate(names)},
-        covariance=_inverse_on(hessian, free) * np.outer(units, units),
-        log_likelihood=-float(found["f"]),
+        values=dict(zip(start, (at * units).tolist(), strict=True)),
+        covariance=_inverse_on(_hessian(objective, x, at), free) * np.outer(units, units),
+        log_likelihood=-minimum,
     )
 
 
-def log_likelihood(values: Mapping[str, float], moments: Moments) -> float:
-    """Return ln L at given parameters, up to a constant that depends on the frames alone."""
-    return -float(ca.DM(ca.evalf(ca.SX(_negative_log_likelihood(values, moments)))))
+def _minimize(
+    objective: Any, x: Any, start: Mapping[str, float], units: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Return the minimum of an expression in `x`, in `units`, and the value there."""
+    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0})
+    # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would push
+    # what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
+    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in start]
+    # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
+    # avoid that.
+    for share in (1.0, 0.1, 0.01):
+        first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
+        found = solver(x0=(first / units).tolist(), lbx=lower)
+        if solver.stats()["success"]:
+            return np.array(found["x"]).ravel(), float(found["f"])
+    raise PoorFit(
+        f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
+        f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
+    )
+
+
+def _hessian(objective: Any, x: Any, at: NDArray[np.float64] | list[float]) -> NDArray[np.float64]:
+    """Return the Hessian (parameter, parameter) of an expression in `x` at given values."""
+    return np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
 
 
 def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.float64]:
     """Return the Hessian of the negative log-likelihood at given parameters.
 
-    At the expected moments this is the Fisher information, for the likelihood is linear in the statistics.
+    At the expected moments it is the Fisher information, since the log-likelihood is linear in the statistics.
     """
     x = ca.SX.sym("x", len(values))
-    objective = _negative_log_likelihood({name: x[i] for i, name in enumerate(values)}, moments)
-    return np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(list(values.values())))
+    objective = negative_log_likelihood({name: x[i] for i, name in enumerate(values)}, moments)
+    return _hessian(objective, x, list(values.values()))
+
+
+def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
+    """Return offset, gain, read noise and dark current, each with its derivatives by the parameters."""
+    gain = float(np.exp(values.get("log_gain", 0.0)))
+    sigma = float(np.exp(0.5 * values["log_read_dn2"])) / gain
+    current = values.get("dark_signal_dn_per_s", 0.0) / gain
+    return {
+        "offset_dn": (values["offset_dn"], {"offset_dn": 1.0}),
+        "gain_dn_per_e": (gain, {"log_gain": gain}),
+        "read_noise_e": (sigma, {"log_read_dn2": 0.5 * sigma, "log_gain": -sigma}),
+        "dark_current_e_per_s": (current, {"dark_signal_dn_per_s": 1 / gain, "log_gain": -current}),
+    }
 
 
 def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64]) -> list[Any]:
-    """Return the pixel noise of each dark series, eq. (1), from numbers or casadi expressions alike.
+    """Return the pixel noise of each dark series, eq. (1); parameters may be numbers or casadi expressions.
 
-    A dark signal that falls, because the black level drifts, has no shot noise to take away.
+    A negative dark signal, which is drift of the black level, has no shot noise.
     """
     gain = _exp(values["log_gain"]) if "log_gain" in values else 0.0
     slope = ca.fmax(values.get("dark_signal_dn_per_s", 0.0), 0.0)
@@ -130,7 +147,7 @@ def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64
 
 
 def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) -> list[Any]:
-    """Return the pixel noise of each flat series, eq. (1) with a response that bends.
+    """Return the pixel noise of each flat series, eq. (1) with a nonlinear response.
 
     The charge behind a signal s is (s/g)(1 + κs), so that one more electron raises s by g/(1 + 2κs).
     """
@@ -145,7 +162,7 @@ def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) 
 def flat_log_likelihood(
     values: Mapping[str, Any], flats: FlatMoments, freedom: float
 ) -> tuple[Any, list[Any], list[float]]:
-    """Return ln L of the flats up to a constant, and each series' ln v and half its degrees of freedom."""
+    """Return ln L of the flats up to a constant, and ln v and half the degrees of freedom of each series."""
     total, log_variances, half_freedom = 0.0, [], []
     for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
         weight = flats.evenness[index]
@@ -161,8 +178,8 @@ def _exp(value: Any) -> Any:
     return ca.exp(value) if isinstance(value, ca.SX) else float(np.exp(value))
 
 
-def _negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
-    """Return −ln L, up to a constant, as a casadi expression."""
+def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
+    """Return −ln L as a casadi expression, up to a constant that depends on the frames alone."""
     darks = moments.darks
     dark_v = dark_variances_dn2(values, darks.exposure_s)
     total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
@@ -173,10 +190,10 @@ def _negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any
 
 
 def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
-    """Return −ln of the restricted likelihood of the frames' levels about the straight line μ + d t.
+    """Return −ln of the restricted likelihood (REML) of the frames' levels about the straight line μ + d t.
 
-    Restricted (REML): offset and slope are integrated out, or the jitter would come out too small by the two degrees
-    of freedom that they take.
+    Offset and slope are integrated out; otherwise the two degrees of freedom that they take would make the jitter too
+    small.
     """
     darks, t = moments.darks, moments.darks.exposure_s
     total, weight = 0.0, []
@@ -192,15 +209,15 @@ def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any
 
 
 def _chi_squared(freedom: float, squares: Any, variance: Any) -> Any:
-    """Return −ln of the likelihood of a sum of squares that is `variance` × χ² with `freedom` degrees of freedom."""
+    """Return −ln of the likelihood of a sum of squares that is `variance` times χ² of `freedom` degrees."""
     return 0.5 * (freedom * ca.log(variance) + squares / variance)
 
 
 def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
     """Return −ln of the Wishart likelihood of the scatter of pixel means, covariance A + s² 11ᵀ + q² ttᵀ.
 
-    A is diagonal with v_j/n_j. Woodbury's identity leaves 2 × 2 matrices, whatever the number of series. A series of
-    one frame has no part: it cannot tell its noise from its pattern, so nothing would check what it claims.
+    A is diagonal with v_j/n_j. Woodbury's identity reduces it to 2 × 2 matrices, whatever the number of series. Series
+    of one frame are left out, since they cannot separate noise from pattern.
     """
     several = moments.darks.frames > 1
     scatter = moments.darks.scatter_dn2[np.ix_(several, several)]
@@ -210,12 +227,12 @@ def _between(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> 
     basis = (np.ones_like(t), t)
     p = [[sum(w * a[j] * b[j] for j, w in enumerate(weight)) for b in basis] for a in basis]
     k = [[_quadratic(weight, a, b, scatter) for b in basis] for a in basis]
-    # M = I + K P with K = diag(s², q²); ln det(A + U K Uᵀ) = ln det A + ln det M, and (M⁻¹ K) mends the trace.
+    # M = I + K P with K = diag(s², q²); ln det(A + U K Uᵀ) = ln det A + ln det M, and (M⁻¹ K) corrects the trace.
     m00, m01, m10, m11 = 1 + s2 * p[0][0], s2 * p[0][1], q2 * p[1][0], 1 + q2 * p[1][1]
     determinant = m00 * m11 - m01 * m10
-    mended = (m11 * s2 * k[0][0] - m01 * q2 * k[1][0] - m10 * s2 * k[0][1] + m00 * q2 * k[1][1]) / determinant
+    correction = (m11 * s2 * k[0][0] - m01 * q2 * k[1][0] - m10 * s2 * k[0][1] + m00 * q2 * k[1][1]) / determinant
     log_det = ca.log(determinant) - sum(ca.log(w) for w in weight)
-    trace = sum(w * scatter[j, j] for j, w in enumerate(weight)) - mended
+    trace = sum(w * scatter[j, j] for j, w in enumerate(weight)) - correction
     return 0.5 * (moments.freedom * log_det + trace)
 
 
@@ -227,14 +244,14 @@ def _quadratic(weight: list[Any], a: NDArray[np.float64], b: NDArray[np.float64]
 
 
 def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[str, float]]:
-    """Return a start from simple moments, and the scale of each parameter; the keys are what the design can hold."""
+    """Return initial values from simple moments, and the scale, of each parameter that the series determine."""
     darks, flats = moments.darks, moments.flats
     measured = darks.frames > 1
     variance = darks.within_dn2[measured] / ((darks.frames[measured] - 1) * moments.freedom)
     read = max(float(variance.min()) - ROUNDING_DN2, 1e-3)
     exposures, repeated = np.unique(darks.exposure_s), np.unique(darks.exposure_s[measured])
     line = np.polyfit(darks.exposure_s, darks.mean_dn, 1) if exposures.size > 1 else (0.0, darks.mean_dn.mean())
-    # No less than the levels could show; from far off the search for a small jitter would be long.
+    # No smaller than any jitter that the levels can show; from far below the search would take long.
     jitter = float(darks.level_scatter_dn2.sum() / max((darks.frames - 1).sum(), 1)) + read / moments.pixels
     start = {"offset_dn": float(line[1]), "log_read_dn2": float(np.log(read)), "dsnu_dn2": read, "jitter_dn2": jitter}
     scale = {"offset_dn": 1.0, "log_read_dn2": 1.0, "dsnu_dn2": read, "jitter_dn2": jitter}
@@ -251,7 +268,7 @@ def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[st
 
 
 def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> float:
-    """Return a first gain: excess variance over signal, from the brightest flat or the longest dark."""
+    """Return an initial gain: excess variance over signal, from the brightest flat or the longest dark."""
     darks, flats = moments.darks, moments.flats
     if flats.frames.size:
         k = int(flats.mean_dn.argmax())
@@ -265,7 +282,7 @@ def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> flo
 
 
 def _inverse_on(hessian: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Invert the Hessian over the free parameters; directions that it does not determine get infinite variance."""
+    """Return the inverse of the Hessian over the free parameters, with a huge variance in undetermined directions."""
     covariance = np.zeros_like(hessian)
     values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
     inverse = np.where(values > 1e-9, 1.0 / np.maximum(values, 1e-9), 1e12)

@@ -1,4 +1,4 @@
-"""How often each digital number should occur, beside how often it did: the test that eyes can make of a fit."""
+"""Predicted and observed frequency of each digital number, for a check of the fit by eye."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,22 +9,22 @@ from scipy.signal import fftconvolve
 
 from faintfield.calib.noise.mass import mass_function
 
-# The Poisson sum costs memory with the charge; beyond this many electrons the normal law is as good.
+# Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
 _MAX_POISSON_CHARGE_E = 200.0
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Values of one dark series.
+    """Observed and predicted values of one dark series.
 
     Attributes
     ----------
     exposure_s : float
-        Its exposure.
+        Exposure time.
     value_dn : array (value,)
-        Digital numbers, every one from the lowest to the highest.
+        All digital numbers from the lowest to the highest.
     count, expected : array (value,)
-        How often each occurred among the sampled pixels and frames, and should by the fit.
+        Number of times each occurred among the sampled pixels and frames, and its expectation by the fit.
     """
 
     exposure_s: float
@@ -45,15 +45,15 @@ def compare_histogram(
     Parameters
     ----------
     values_dn : array (frame, pixel), int
-        The values.
+        Values of the series.
     exposure_s : float
-        Their exposure.
+        Exposure time.
     fitted : mapping
-        Parameters of the fit, gain included.
+        Parameters of the fit, which include the gain.
     pattern_dn2 : float
-        Variance over pixels, rows, columns and frames of the level about which a value scatters.
+        Variance over pixels, rows, columns and frames of the level about which values scatter.
     floor_dn : int, optional
-        Where values are cut off.
+        Black level at which values are cut off.
     """
     lowest, highest = int(values_dn.min()), int(values_dn.max())
     value = np.arange(lowest, highest + 1)
@@ -63,7 +63,7 @@ def compare_histogram(
     offset = np.arange(-reach * per_dn, reach * per_dn + 1) / per_dn
     prior = np.exp(-0.5 * (offset / spread_dn) ** 2)
     prior /= prior.sum()
-    # A black level that drifts down takes the values along, but makes no charge; see `dark_variances_dn2`.
+    # A black level that drifts down moves the values but makes no charge; see `dark_variances_dn2`.
     level_dn = fitted["offset_dn"] + min(fitted.get("dark_signal_dn_per_s", 0.0), 0.0) * exposure_s
     u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - level_dn
     mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in _logs(u, exposure_s, fitted))
@@ -76,7 +76,7 @@ def compare_histogram(
 def _logs(
     u_dn: NDArray[np.float64], exposure_s: float, fitted: Mapping[str, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return ln of the mass at each u = value − level without charge, and of all below it."""
+    """Return ln of the mass at each u = value − level without charge, and ln of the mass up to it."""
     slope = max(fitted.get("dark_signal_dn_per_s", 0.0), 1e-9)
     log_gain = fitted["log_gain"]
     charge = float(slope / np.exp(log_gain)) * exposure_s

@@ -1,4 +1,4 @@
-"""Probability of each digital number: what a sensor gives is whole, never below the black level, and rarely Gaussian.
+"""Probability of each digital number: values are whole, never below the black level, and rarely Gaussian.
 
 With offset o, gain g, read noise σ and mean charge λ = D t, the value of a dark pixel is y = round(o + g(k + σ z)),
 k ~ Poisson(λ), z ~ N(0, 1), and no less than the floor c. In u = y − o:
@@ -6,12 +6,13 @@ k ~ Poisson(λ), z ~ N(0, 1), and no less than the floor c. In u = y − o:
     exact      P(y | o) = Σ_k e^−λ λ^k / k! · [ Φ((u + ½ − g k) / gσ) − Φ((u − ½ − g k) / gσ) ]        (2)
     censored   P(y | o) = Φ((u + ½ − g λ) / s) − Φ((u − ½ − g λ) / s),  s² = g²(σ² + λ)                (3)
 
-and at the floor, y = c, the first Φ of the bracket alone: everything below it ends there (Tobin, Econometrica 26, 24,
-1958). (3) is (2) with the Poisson law replaced by a normal one: good enough when σ hides the single electrons.
+and at the floor, y = c, only the first Φ of the bracket, since everything below ends there (Tobin, Econometrica 26, 24,
+1958). (3) replaces the Poisson law of (2) by a normal one, which suffices when σ hides single electrons.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -26,8 +27,8 @@ _Z, _WEIGHT = np.polynomial.hermite_e.hermegauss(5)
 DARK_NODES = _Z
 DARK_LOG_WEIGHTS = np.log(_WEIGHT / _WEIGHT.sum())
 
-# A probability no smaller than this keeps one cosmic ray from deciding the fit, and erf's rounding out of the logs.
-_LEAST = 1e-14
+# Smallest probability: keeps one cosmic ray from deciding the fit, and the rounding of erf out of the logarithms.
+_MIN_PROBABILITY = 1e-14
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class MassTable:
     Attributes
     ----------
     log_mass, log_tail : array (u, node)
-        ln P(y | o), and ln P(≤ y | o), the mass of the floor.
+        ln P(y | o), and ln P(≤ y | o), which is the mass of the floor.
     mass_slope, tail_slope : array (parameter, u, node)
         Their derivatives by `MASS_PARAMETERS`.
     """
@@ -51,7 +52,7 @@ class MassTable:
 def mass_function(
     u_dn: NDArray[np.float64], exposure_s: float, max_charge_e: float, *, exact: bool, spread: bool
 ) -> Callable[[NDArray[np.float64]], MassTable]:
-    """Build the mass function of one exposure; casadi differentiates it.
+    """Return the mass function of one exposure, differentiated by casadi.
 
     Parameters
     ----------
@@ -60,16 +61,16 @@ def mass_function(
     exposure_s : float
         Exposure time t.
     max_charge_e : float
-        The largest λ that will be asked for; the Poisson sum reaches well above it.
+        Largest λ at which the function will be evaluated; the Poisson sum extends well above it.
     exact : bool
-        Eq. (2) rather than (3).
+        Use eq. (2) rather than (3).
     spread : bool
-        Whether pixels differ in dark current; if not there is a single node.
+        Let pixels differ in dark current, with several nodes rather than one.
 
     Returns
     -------
     callable
-        From the values of `MASS_PARAMETERS` to a `MassTable`.
+        Function from the values of `MASS_PARAMETERS` to a `MassTable`.
     """
     x = ca.MX.sym("x", len(MASS_PARAMETERS))
     gain, read, dark = ca.exp(x[0]), ca.exp(x[1]), ca.exp(x[2])
@@ -77,24 +78,21 @@ def mass_function(
     for z in DARK_NODES if spread else (0.0,):
         charge = dark * ca.fmax(1 + x[3] * z, 0.05) * exposure_s
         upper, lower = (
-            _poisson_tail(u_dn + half, charge, gain, read, max_charge_e)
-            if exact
-            else _normal_tail(u_dn + half, charge, gain, read)
-            for half in (0.5, -0.5)
+            _poisson_tail(u, charge, gain, read, max_charge_e) if exact else _normal_tail(u, charge, gain, read)
+            for u in (u_dn + 0.5, u_dn - 0.5)
         )
-        mass.append(ca.log(ca.fmax(upper - lower, _LEAST)))
-        tail.append(ca.log(ca.fmax(upper, _LEAST)))
+        mass.append(ca.log(ca.fmax(upper - lower, _MIN_PROBABILITY)))
+        tail.append(ca.log(ca.fmax(upper, _MIN_PROBABILITY)))
     table = ca.vertcat(*mass, *tail)
-    function = ca.Function("mass", [x], [table, ca.jacobian(table, x)])
+    return partial(_tabulate, ca.Function("mass", [x], [table, ca.jacobian(table, x)]), (2, len(mass), u_dn.size))
 
-    def tabulate(values: NDArray[np.float64]) -> MassTable:
-        logs, slopes = (np.array(part) for part in function(values))
-        nodes = len(mass)
-        logs = logs.reshape(2, nodes, u_dn.size).transpose(0, 2, 1)
-        slopes = slopes.reshape(2, nodes, u_dn.size, len(MASS_PARAMETERS)).transpose(0, 3, 2, 1)
-        return MassTable(logs[0], logs[1], slopes[0], slopes[1])
 
-    return tabulate
+def _tabulate(function: ca.Function, shape: tuple[int, int, int], values: NDArray[np.float64]) -> MassTable:
+    """Return the table at some values of `MASS_PARAMETERS`; `shape` is (mass or tail, node, u)."""
+    logs, slopes = (np.array(part) for part in function(values))
+    logs = logs.reshape(shape).transpose(0, 2, 1)
+    slopes = slopes.reshape(*shape, len(MASS_PARAMETERS)).transpose(0, 3, 2, 1)
+    return MassTable(logs[0], logs[1], slopes[0], slopes[1])
 
 
 def _normal_tail(u_dn: NDArray[np.float64], charge: ca.MX, gain: ca.MX, read: ca.MX) -> ca.MX:

@@ -1,11 +1,11 @@
-"""From series to the few numbers that the Gaussian likelihood rests on.
+"""Reduce series to the sufficient statistics of the Gaussian likelihood.
 
-Under Gaussian noise nothing else of the frames matters: with R rows, C columns and P pixels in use, taking levels and
-profiles out costs R + C − 1 of the P degrees of freedom, and of what is left
+Under Gaussian noise the likelihood depends on nothing else. With R rows, C columns and P pixels in use, removing
+levels and profiles takes R + C − 1 of the P degrees of freedom. Of the rest,
 
 - the sum of squares within pixels, W_j, is v_j χ² with (n_j − 1)(P − R − C + 1) degrees of freedom,
 - the J × J scatter of the pixel means of the dark series is Wishart with P − R − C + 1,
-- the mean of each dark series and the scatter of its frames' levels tell the dark signal and the frame jitter.
+- the mean of each dark series and the scatter of its frames' levels determine the dark signal and the frame jitter.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from faintfield.calib.noise.statistics import Series
 
 @dataclass(frozen=True)
 class DarkMoments:
-    """The dark series, J of them, over the P pixels in use.
+    """Statistics of the J dark series over the P pixels in use.
 
     Attributes
     ----------
@@ -28,11 +28,11 @@ class DarkMoments:
     mean_dn : array (series,)
         Mean over frames and pixels.
     within_dn2 : array (series,)
-        W_j: squared deviations of pixels from their own means, summed over frames and pixels.
+        W_j, the squared deviations of pixels from their means, summed over frames and pixels.
     level_scatter_dn2 : array (series,)
         Squared deviations of the frames' mean levels from the series' level, summed over frames.
     scatter_dn2 : array (series, series)
-        S: products of the pixels' deviations from the mean pattern, summed over pixels.
+        S, the products of the pixels' patterns in two series, summed over pixels.
     """
 
     exposure_s: NDArray[np.float64]
@@ -45,15 +45,15 @@ class DarkMoments:
 
 @dataclass(frozen=True)
 class FlatMoments:
-    """The flat series, L of them (possibly none).
+    """Statistics of the flat series, possibly none.
 
     Attributes
     ----------
     frames, mean_dn, within_dn2 : array (series,)
         As for the darks.
     evenness : array (series,)
-        ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: by so much the degrees of freedom shrink where some pixels,
-        being brighter, are noisier than others.
+        ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
+        noisier than others.
     """
 
     frames: NDArray[np.float64]
@@ -64,7 +64,7 @@ class FlatMoments:
 
 @dataclass(frozen=True)
 class Moments:
-    """The sufficient statistics of all series; `pixels` are in use and give `freedom` degrees of freedom."""
+    """Sufficient statistics of all series, from `pixels` pixels in use with `freedom` degrees of freedom."""
 
     pixels: float
     freedom: float

@@ -1,4 +1,4 @@
-"""Photo response from flats: vignetting, PRNU, dead pixels, quantum efficiency."""
+"""Measure the photo response from flats: vignetting, PRNU, dead pixels, quantum efficiency."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,16 +13,17 @@ from faintfield.calib.noise.statistics import Series
 
 @dataclass(frozen=True)
 class Response:
-    """How unevenly the sensor answers even light.
+    """Response of the sensor to even light.
 
     Attributes
     ----------
     relative, vignetting : array (row, column)
         Response over its mean, and its smooth part.
     prnu, prnu_se : float
-        Standard deviation of what is left, relative to the mean: EMVA 1288's PRNU after its high-pass filter.
+        Standard deviation of the rest relative to the mean (EMVA 1288's PRNU after its high-pass filter), and its
+        standard error.
     dead : array (row, column), bool
-        Pixels that answer by less than half of their neighbourhood.
+        Pixels that respond less than half as much as their neighbourhood.
     """
 
     relative: NDArray[np.float64]
@@ -35,16 +36,16 @@ class Response:
 def measure_response(
     signals_dn: Sequence[NDArray[np.float64]], noise_dn2: Sequence[float], usable: NDArray[np.bool_]
 ) -> Response:
-    """Separate vignetting from PRNU, and shrink the latter by what is mere noise.
+    """Separate vignetting from PRNU, and shrink the latter by its share of noise.
 
     Parameters
     ----------
     signals_dn : sequence of arrays (row, column)
-        Mean of each flat series less the dark signal of its exposure.
+        Mean of each flat series minus offset and dark signal.
     noise_dn2 : sequence of float
         Variance of these means for a pixel of mean signal.
     usable : array (row, column), bool
-        Pixels to learn from.
+        Pixels in use.
     """
     total = np.sum(signals_dn, axis=0)
     mean = float(total.mean(where=usable))
@@ -53,7 +54,7 @@ def measure_response(
     usable = usable & ~dead
     vignetting = _smooth(raw, usable)
     pixel = raw / np.maximum(vignetting, 1e-6) - 1
-    # The signal's shot noise grows with it: brighter pixels have less of it, relative to their signal.
+    # Shot noise grows less than the signal, so that brighter pixels have less of it in relation to their signal.
     noise = float(np.sum(noise_dn2)) / mean**2 / np.maximum(vignetting, 1e-6)
     spread2 = max(float(pixel.var(where=usable)) - float(noise.mean(where=usable)), 0.0)
     kept = spread2 / (spread2 + noise)
@@ -78,9 +79,9 @@ def _smooth(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray
 def quantum_efficiency(
     flats: Sequence[Series], charges_e: Sequence[float], gain_relative_se: float
 ) -> tuple[float, float] | None:
-    """Return electrons per photon over all flats that state their photons, and the standard error; None without.
+    """Return electrons per photon with the standard error, from the flats that state their photons; None without any.
 
-    EMVA 1288's η = R/K: the slope of charge on photons through the origin, its error that of the gain and of the
+    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
     light's steadiness.
     """
     stated = [

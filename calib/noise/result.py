@@ -1,4 +1,4 @@
-"""What a calibration says: each quantity with its standard error, or the reason why the frames cannot tell it."""
+"""Result of a noise calibration: each quantity with its standard error, or the reason why it has no value."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from faintfield.calib.noise_model import Map, NoiseModel
 
 @dataclass(frozen=True)
 class Estimate:
-    """A measured number, or none.
+    """A measured value, or the reason why there is none.
 
     Attributes
     ----------
     value : float, optional
-        None where the frames cannot tell.
+        None if the frames do not determine it.
     se : float, optional
         Standard error.
     ci95 : tuple of float, optional
@@ -34,22 +34,22 @@ class Estimate:
 
 @dataclass(frozen=True)
 class NoiseMaps:
-    """Numbers per pixel, arrays (row, column) of float32; None where the frames cannot tell.
+    """Maps per pixel, arrays (row, column) of float32; None if the frames do not determine them.
 
     Attributes
     ----------
     offset_dn, offset_variance_dn2 : array
-        Posterior mean of each pixel's offset, and the variance of its error.
+        Posterior mean of the offset, and the variance of its error.
     dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
-        Likewise of the dark current.
+        Posterior mean of the dark current, and the variance of its error.
     read_noise_e : array, optional
         Read noise.
     relative_response : array, optional
         Photo response over its mean: vignetting and PRNU.
     vignetting : array, optional
-        Its smooth part.
+        Smooth part of the photo response.
     unusable : array, bool
-        Hot, noisy, stuck or dead.
+        Pixels that are hot, noisy or dead.
     """
 
     offset_dn: NDArray[np.float32]
@@ -64,7 +64,7 @@ class NoiseMaps:
 
 @dataclass(frozen=True)
 class TransferPoint:
-    """One series as EMVA 1288 plots it: means, variances and the model's own, in DN and DN²."""
+    """One series as EMVA 1288 plots it: measured and modelled mean and variance, in DN and DN²."""
 
     kind: str
     exposure_s: float
@@ -78,7 +78,7 @@ class TransferPoint:
 
 @dataclass(frozen=True)
 class NoiseCalibration:
-    """The result of `calib.noise.calibrate`.
+    """Result of `calib.noise.calibrate`.
 
     Attributes
     ----------
@@ -87,23 +87,23 @@ class NoiseCalibration:
         dsnu_dn, dsnu_row_dn, dsnu_column_dn, dcnu_e_per_s, frame_jitter_dn, row_noise_dn, column_noise_dn, prnu,
         quantum_efficiency, nonlinearity_per_dn`.
     covariance : tuple (names, array)
-        Of offset, gain, read noise and dark current; of those that have values.
+        Covariance of those of offset, gain, read noise and dark current that have values.
     likelihood : str
-        The likelihood that was used, by name.
+        Name of the likelihood that was used.
     maps : NoiseMaps
-        Per pixel.
+        Maps per pixel.
     hot, noisy, dead : array (row, column), bool
         The kinds of unusable pixels.
     variance_ratio : array (row, column)
-        Each pixel's variance over the frames, over that of the model.
+        Variance of each pixel over the frames, divided by that of the model.
     points : tuple of TransferPoint
-        The series.
+        Photon transfer and dark signal of each series.
     histograms : tuple of Histogram
-        Values of the shortest and the longest darks, and their prediction; none while the gain is unknown.
+        Values of the shortest and the longest darks with their prediction; empty if the gain is unknown.
     saturation_dn : float
-        As given.
+        Value from which a pixel is saturated.
     warnings : tuple of str
-        What is doubtful about the frames.
+        Problems of the frames.
     """
 
     estimates: dict[str, Estimate]
@@ -120,10 +120,9 @@ class NoiseCalibration:
     warnings: tuple[str, ...]
 
     def noise_model(self, *, per_pixel: bool = True) -> NoiseModel:
-        """Return what reconstruction needs, per pixel or as single numbers.
+        """Return the noise model for a reconstruction, per pixel or as single numbers.
 
-        The gain per pixel is the gain alone: photo response belongs to the light, `maps.relative_response`, not to the
-        electrons.
+        The gain does not include the photo response, which belongs to the light: see `maps.relative_response`.
 
         Raises
         ------
@@ -143,7 +142,7 @@ class NoiseCalibration:
         )
 
     def _value(self, name: str) -> float:
-        """Return a value that must be there."""
+        """Return the value of a quantity, or raise NotIdentifiable."""
         estimate = self.estimates[name]
         if estimate.value is None:
             raise NotIdentifiable(f"{name}: no value: {estimate.why}")

@@ -1,7 +1,7 @@
-"""Which likelihood the frames call for, and where its search begins.
+"""Choose the likelihood that the frames require, and the initial values of its fit.
 
-Gaussian unless it fails: where values are cut off at the black level it is biased (gain nearly doubled, read noise a
-third), and with read noise below an electron it wastes what single electrons tell.
+It is Gaussian unless that fails: with values cut off at the black level it is biased (gain nearly doubled, read noise
+a third), and with read noise below an electron it ignores the information in single electrons.
 """
 
 from collections.abc import Sequence
@@ -12,25 +12,26 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.exact import Counts
 from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2
+from faintfield.calib.noise.marginal import Counts
 from faintfield.calib.noise.statistics import Series, sample_index
 
-# Read noise, in electrons or in DN, below which single electrons or the rounding shape the values.
-_SUBTLE_READ_E, _SUBTLE_READ_DN = 1.0, 0.5
+# Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
+_MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
 
-# Noise that pixels share, as a fraction of the read noise variance, from which single electrons are not to be seen.
-_MOST_SHARED = 0.03
+# Largest noise that pixels share, as a fraction of the read noise variance, for the exact likelihood; more blurs single
+# electrons.
+_MAX_SHARED_FRACTION = 0.03
 
-# So many of the values, on the lowest one and more than on the next, are values cut off there.
-_CUT_OFF_FRACTION = 2e-3
+# Largest fraction of values on the lowest one, unless more are on the next; beyond, values are cut off there.
+_MAX_FRACTION_AT_FLOOR = 2e-3
 
-# A table of masses wider than this is refused: then the Gaussian is good enough.
+# Largest range of the values of a series, in DN; for wider tables of masses the Gaussian is good enough.
 MAX_TABLE_WIDTH_DN = 2000
 
 
 class NoiseLikelihood(StrEnum):
-    """The likelihoods by the names that results give."""
+    """Names of the likelihoods in results."""
 
     GAUSSIAN = "marginal Gaussian"
     CENSORED = "censored Gaussian (Tobit), marginal over offsets"
@@ -38,18 +39,18 @@ class NoiseLikelihood(StrEnum):
 
 
 def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
-    """Return the sampled values of the pixels in use, with the floor where they are cut off."""
+    """Return the sampled values of the pixels in use, with their floor if they are cut off."""
     keep = used.ravel()[sample_index(used.shape)]
     values = tuple(series.sample_dn[:, keep] for series in darks)
     floor = min(series.floor_dn for series in darks)
     pooled = np.concatenate([v.ravel() for v in values])
     at_floor, above = (pooled == floor).mean(), (pooled == floor + 1).mean()
-    cut_off = at_floor > max(_CUT_OFF_FRACTION, above)
+    cut_off = at_floor > max(_MAX_FRACTION_AT_FLOOR, above)
     return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
 
 
 def shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
-    """Return the variance that frames, rows and columns add to all their pixels at once, in the quietest series."""
+    """Return the variance of the noise that pixels of a frame, row or column share, in the quietest series."""
     noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
     variance, quietest = min(
         (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
@@ -66,12 +67,12 @@ def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> 
     Parameters
     ----------
     counts : Counts
-        The values, with their floor where they are cut off.
+        Values, with their floor if they are cut off.
     gaussian : NoiseFit
-        What the Gaussian likelihood makes of them.
+        Fit of the Gaussian likelihood.
     shared_dn2 : float
-        Noise that pixels share. It blurs single electrons and has no part in the exact likelihood, so that with more
-        than a little of it the Gaussian is the better one.
+        Variance of the noise that pixels share. It blurs single electrons, and the exact likelihood does not model it,
+        so that the Gaussian is better with more than a little of it.
     """
     widest = max(int(np.ptp(values)) for values in counts.values_dn)
     if widest > MAX_TABLE_WIDTH_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
@@ -81,15 +82,15 @@ def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> 
     telling = gaussian.standard_error("log_gain") < 0.5 and gaussian.values["dark_signal_dn_per_s"] > 0
     if counts.floor_dn is not None:
         return NoiseLikelihood.CENSORED
-    if shared_dn2 > _MOST_SHARED * read_dn**2:
+    if shared_dn2 > _MAX_SHARED_FRACTION * read_dn**2:
         return NoiseLikelihood.GAUSSIAN
-    if read_dn < _SUBTLE_READ_DN or (telling and read_e < _SUBTLE_READ_E):
+    if read_dn < _MIN_GAUSSIAN_READ_DN or (telling and read_e < _MIN_GAUSSIAN_READ_E):
         return NoiseLikelihood.EXACT
     return NoiseLikelihood.GAUSSIAN
 
 
 def gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
-    """Return a start for the exact likelihood from the Gaussian fit."""
+    """Return initial values for the exact likelihood from the Gaussian fit."""
     values = gaussian.values
     signal = max(values["dark_signal_dn_per_s"], 1e-6)
     return {
@@ -103,12 +104,12 @@ def gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
 
 
 def censored_start(counts: Counts) -> dict[str, float]:
-    """Return a start for the censored likelihood from quantiles above the floor.
+    """Return initial values for the censored likelihood from quantiles above the floor.
 
     Raises
     ------
     NotIdentifiable
-        At some two exposures fewer than a twentieth of the values stand above the black level.
+        There are no two exposures at which a twentieth of the values is above the black level.
     """
     exposure, centre, spread2 = [], [], []
     for t, values in zip(counts.exposure_s, counts.values_dn, strict=True):
@@ -138,12 +139,12 @@ def censored_start(counts: Counts) -> dict[str, float]:
 
 
 def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
-    """Return mean and variance of the normal law through two quantiles above the floor, None if too little is."""
+    """Return mean and variance of the normal law through two quantiles above the floor, None with too few values."""
     hidden = float((values == floor_dn).mean())
     if hidden > 0.95:
         return None
     low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
-    # Half a DN of dither undoes the steps that rounding makes.
+    # Half a DN of dither smooths the steps of the rounding.
     dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
     below, above = np.quantile(dithered, [low, high])
     sigma = float((above - below) / (ndtri(high) - ndtri(low)))

@@ -1,9 +1,9 @@
-"""What a series of frames says about the noise, gathered in one pass: each frame is seen once and forgotten.
+"""Reduce a series of frames to sufficient statistics in one pass, with one frame in memory at a time.
 
-A *series* is all frames of one kind, exposure and light level. Within it only noise differs from frame to frame, so
-its sufficient statistics are, for every pixel, the mean and the sum of squared deviations over the frames. What all
-pixels of a frame, a row or a column share (a jittering black level, banding) is taken out of each frame first and
-kept apart; otherwise it would count as pixel noise.
+A *series* is all frames of one kind, exposure and light level. Its frames differ only by noise, so that the
+sufficient statistics are the mean and the sum of squared deviations of every pixel over the frames. The level of each
+frame, and the means of its rows and columns, are subtracted first and kept separately; otherwise a jittering black
+level and banding would count as pixel noise.
 """
 
 import hashlib
@@ -17,35 +17,38 @@ from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
 
-# Pixels this many robust standard deviations off in the first frame of a series are left out of its row and column
-# means: a hot pixel's shot noise would otherwise spread along its row.
+# Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
+# the shot noise of a hot pixel would otherwise spread along its row.
 _SUSPECT_SIGMA = 8.0
 
-# A dark brighter than its series by this multiple of the pixel noise has seen light; one brighter by the smaller
-# multiple, when the black level's own jitter would do so less often than the chance given.
-_LEAK_SURELY, _LEAK_FRACTION, _LEAK_CHANCE = 5.0, 0.25, 1e-7
+# A dark has seen light if it is brighter than its series by the first multiple of the pixel noise, or by the second one
+# if jitter of the black level does that with less than this probability.
+_CERTAIN_LEAK, _MIN_LEAK, _MAX_CHANCE = 5.0, 0.25, 1e-7
 
-# A flat with a larger fraction of its pixels (and more than so many) on its highest value has reached the end.
-_SATURATED_FRACTION, _SATURATED_PX = 1e-3, 10
+# A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
+_CERTAIN_EXCESS, _MIN_EXCESS = 1.0, 0.2
 
-# The exact likelihoods and the histograms need the values themselves; so many pixels are kept, spread evenly.
+# Largest share, and number, of a flat's pixels on its highest value; beyond, the flat is saturated.
+_MAX_SATURATED_FRACTION, _MAX_SATURATED_PX = 1e-3, 10
+
+# Pixels whose values are kept for histograms and for the likelihood of single values.
 SAMPLE_PX = 65_536
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the frames of one series have in common.
+    """Conditions that the frames of one series share.
 
     Attributes
     ----------
     kind : {"dark", "flat"}
-        Lens covered, or evenly lit.
+        A dark has the lens covered, a flat is evenly lit.
     exposure_s : float
         Exposure time.
     level : int
-        Which light level a flat was taken at; 0 for darks.
+        Index of the light level of a flat; 0 for darks.
     photons : float, optional
-        Mean photons per pixel and exposure, where a radiometer told.
+        Mean photons per pixel and exposure, if measured by a radiometer.
     """
 
     kind: Literal["dark", "flat"]
@@ -67,23 +70,23 @@ class Series:
     conditions : Conditions
         Kind, exposure and light level.
     names : tuple of str
-        The frames, as the caller calls them; they appear in messages.
+        Names of the frames for messages.
     digests : tuple of bytes
-        Fingerprint of each frame's pixels, by which copies are found.
+        Hash of each frame's pixels, which reveals copies.
     levels_dn : array (frame,)
         Mean of each frame.
     row_dn, column_dn : array (row,), array (column,)
-        Mean profile over the frames, less the mean level.
+        Mean profile over the frames, minus the mean level.
     row_noise_dn2, column_noise_dn2 : float
-        Variance over the frames of a row's and a column's mean; pixel noise has its part in them.
+        Variance over the frames of a row's and a column's mean, which includes pixel noise.
     pattern_dn : array (row, column), float32
-        Mean over the frames of what remains of each pixel once level and profiles are taken out.
+        Mean over the frames of each pixel minus level and profiles.
     within_dn2 : array (row, column), float32
-        Sum over the frames of its squared deviations from that mean.
+        Sum over the frames of the squared deviations from `pattern_dn`.
     suspect : array (row, column), bool
-        Left out of levels and profiles.
+        Pixels left out of levels and profiles.
     sample_dn : array (frame, pixel), int32
-        The values themselves at `sample_index(shape)`.
+        Values of the pixels `sample_index(shape)`.
     floor_dn : int
         Lowest value of all frames.
     """
@@ -104,22 +107,22 @@ class Series:
 
     @property
     def frames(self) -> int:
-        """How many frames the series has."""
+        """Number of frames."""
         return len(self.names)
 
     @property
     def mean_dn(self) -> NDArray[np.float64]:
-        """Mean over the frames (row, column), nothing taken out."""
+        """Mean over the frames (row, column), with level and profiles."""
         return self.pattern_dn + self.row_dn[:, None] + self.column_dn[None, :] + self.levels_dn.mean()
 
 
 class SeriesSums:
-    """The running sums of one series; frames are given one by one, in DN (row, column), and forgotten.
+    """Running sums of one series, to which frames (row, column) in DN are added one by one.
 
     Parameters
     ----------
     conditions : Conditions
-        What the frames have in common.
+        Conditions of all frames.
     saturation_dn : float
         Value from which a pixel is saturated.
     """
@@ -137,14 +140,14 @@ class SeriesSums:
         self._floor_dn = np.iinfo(np.int64).max
 
     def add(self, name: str, frame_dn: NDArray[Any]) -> None:
-        """Take one frame in.
+        """Add one frame.
 
         Raises
         ------
         SaturatedFlat
-            More than 0.1 % of a flat's pixels stand at the end of the range.
+            More than 0.1 % of a flat's pixels are at the end of the range.
         ValueError
-            The frame differs in size from those before.
+            The frame differs in size from earlier ones.
         """
         if self.conditions.kind == "flat":
             _check_range(name, frame_dn, self.saturation_dn)
@@ -159,7 +162,7 @@ class SeriesSums:
         self._add_residual(frame_dn.astype(np.float64))
 
     def _begin(self, first_dn: NDArray[Any]) -> None:
-        """Make room for frames like the first."""
+        """Allocate the sums for frames like the first."""
         self._suspect = _suspects(first_dn)
         self._regular = ~self._suspect
         self._row_count = np.maximum(self._regular.sum(1), 1)
@@ -168,7 +171,7 @@ class SeriesSums:
         self._pattern, self._squares = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
 
     def _add_residual(self, residual_dn: NDArray[np.float64]) -> None:
-        """Take level, row and column means out of a frame (which is overwritten), and sum the rest."""
+        """Subtract level, row and column means from a frame, in place, and add the rest to the sums."""
         level = residual_dn.mean(where=self._regular)
         residual_dn -= level
         rows = residual_dn.sum(1, where=self._regular) / self._row_count
@@ -184,12 +187,12 @@ class SeriesSums:
         self._spreads_dn2.append(float(residual_dn.mean(where=self._regular)))
 
     def series(self) -> Series:
-        """Close the sums.
+        """Return the statistics of the frames so far.
 
         Raises
         ------
         LightLeak, BadFrame
-            One dark's mean or spread departs from the others'.
+            The mean or the spread of one dark differs from the others'.
         ValueError
             No frame was given.
         """
@@ -221,7 +224,7 @@ class SeriesSums:
 def measure_series(
     frames: Iterable[tuple[str, NDArray[Any]]], conditions: Conditions, saturation_dn: float = np.inf
 ) -> Series:
-    """Gather the sufficient statistics of one series, given as (name, frame) pairs; see `SeriesSums`."""
+    """Return the sufficient statistics of one series, given as (name, frame) pairs; see `SeriesSums`."""
     sums = SeriesSums(conditions, saturation_dn)
     for name, frame_dn in frames:
         sums.add(name, frame_dn)
@@ -229,7 +232,7 @@ def measure_series(
 
 
 def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return the flat indices of the pixels whose values are kept: all, or `SAMPLE_PX` spread without a grid."""
+    """Return the flat indices of the pixels whose values are kept: all, or `SAMPLE_PX` at random places."""
     pixels = int(np.prod(shape))
     if pixels <= SAMPLE_PX:
         return np.arange(pixels)
@@ -237,41 +240,41 @@ def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 
 def _suspects(frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return the pixels that stand far out of their row and column."""
+    """Return the pixels that differ much from their row and column."""
     residual = frame_dn - np.median(frame_dn, axis=1, keepdims=True)
     residual -= np.median(residual, axis=0)
     return np.asarray(np.abs(residual) > _SUSPECT_SIGMA * robust_sigma(residual) + 1.0)
 
 
 def robust_sigma(values: NDArray[Any]) -> float:
-    """Return the standard deviation that the median absolute deviation gives a normal distribution."""
+    """Return the standard deviation of a normal distribution with the same median absolute deviation."""
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
 def _check_range(name: str, frame_dn: NDArray[Any], saturation_dn: float) -> None:
-    """Refuse a flat that piles up at the end of the range, stated or not."""
+    """Check that a flat does not reach the end of the range, whether `saturation_dn` states it or not."""
     ceiling = min(float(frame_dn.max()), saturation_dn)
     at_end, next_below = int((frame_dn >= ceiling).sum()), int((frame_dn == ceiling - 1).sum())
-    if at_end > max(_SATURATED_FRACTION * frame_dn.size, _SATURATED_PX, next_below):
+    if at_end > max(_MAX_SATURATED_FRACTION * frame_dn.size, _MAX_SATURATED_PX, next_below):
         raise SaturatedFlat(
             f"{name}: {at_end / frame_dn.size:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range "
-            f"(at most {_SATURATED_FRACTION:.1%} may); shorten the exposure or dim the light"
+            f"(at most {_MAX_SATURATED_FRACTION:.1%} may); shorten the exposure or dim the light"
         )
 
 
 def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
-    """Refuse a dark that is brighter, or otherwise patterned, than the others of its series."""
+    """Check that no dark is brighter, or has another pattern, than the others of its series."""
     if series.conditions.kind != "dark" or series.frames < 2:
         return
     noise_dn = float(np.sqrt(np.median(series.within_dn2) / (series.frames - 1)))
-    worst, excess_dn = _stands_out(series.levels_dn, least=_LEAK_FRACTION * noise_dn, surely=_LEAK_SURELY * noise_dn)
+    worst, excess_dn = _outlier(series.levels_dn, _MIN_LEAK * noise_dn, _CERTAIN_LEAK * noise_dn)
     if excess_dn > 0:
         raise LightLeak(
             f"{series.names[worst]}: mean {series.levels_dn[worst]:.1f} DN, {excess_dn:.1f} DN above the other "
             f"{series.conditions} (their pixels are {noise_dn:.1f} DN rms noisy): light leaked in; cover the lens and "
             "record it again, or leave it out"
         )
-    odd, excess = _stands_out(spreads_dn2 / np.median(spreads_dn2), least=0.2, surely=1.0)
+    odd, excess = _outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
     if excess > 0:
         raise BadFrame(
             f"{series.names[odd]}: its pixels spread {np.sqrt(1 + excess):.2f} times as far as in the other "
@@ -279,18 +282,18 @@ def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
         )
 
 
-def _stands_out(values: NDArray[np.float64], least: float, surely: float) -> tuple[int, float]:
-    """Return which value is the largest, and by how much it exceeds the rest where chance is ruled out, else 0.
+def _outlier(values: NDArray[np.float64], min_excess: float, certain_excess: float) -> tuple[int, float]:
+    """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
 
-    An excess above `surely` counts by itself; one above `least` counts when Student's t of the others allows it but
-    once in `_LEAK_CHANCE` times.
+    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
+    from the scatter of the others, is below `_MAX_CHANCE`.
     """
     largest = int(values.argmax())
     others = np.delete(values, largest)
     excess = float(values[largest] - others.mean())
-    if excess > surely:
+    if excess > certain_excess:
         return largest, excess
-    if excess < least or others.size < 2:
+    if excess < min_excess or others.size < 2:
         return largest, 0.0
     t = excess / max(float(others.std(ddof=1)) * np.sqrt(1 + 1 / others.size), 1e-12)
-    return largest, excess if stats.t.sf(t, others.size - 1) < _LEAK_CHANCE else 0.0
+    return largest, excess if stats.t.sf(t, others.size - 1) < _MAX_CHANCE else 0.0

@@ -43,7 +43,7 @@ def test_corners_are_numbered_along_the_rows_from_the_first_inner_corner() -> No
         ({"first_marker_id": 240}, "has 0 to 249"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(changed: dict[str, Any], words: str) -> None:
+def test_invalid_boards_are_refused(changed: dict[str, Any], words: str) -> None:
     good: dict[str, Any] = {"name": "b", "columns": 5, "rows": 7, "square_mm": 10.0, "marker_mm": 7.0}
     good |= {"dictionary": "DICT_5X5_250"}
     Board(**good)

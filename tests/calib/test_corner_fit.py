@@ -40,7 +40,7 @@ def fitted(
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.8, 2.0])
-def test_without_noise_corners_are_where_they_are(blur_px: float) -> None:
+def test_corners_without_noise_are_exact(blur_px: float) -> None:
     generator = np.random.default_rng(1)
     light, places = checkers(blur_px, generator)
     points, sigma_px = fitted(light, places + generator.uniform(-1.5, 1.5, places.shape))
@@ -62,7 +62,7 @@ def test_stated_sigma_is_that_of_the_errors(white: float, read_noise: float) -> 
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.15)
 
 
-def test_no_estimate_is_much_better() -> None:
+def test_errors_are_near_the_cramer_rao_bound() -> None:
     """The Cramér-Rao bound of both coordinates, from the true light's own derivatives in the same window."""
     generator, read_noise = np.random.default_rng(3), 3.46
     light, places = checkers(0.8, np.random.default_rng(4), 1.5, 27.0)
@@ -85,7 +85,7 @@ def test_no_estimate_is_much_better() -> None:
     assert np.mean(np.square(errors)) < 2.0 * np.mean(bounds)
 
 
-def test_where_no_corner_is_none_is_found() -> None:
+def test_no_corner_is_found_where_there_is_none() -> None:
     generator = np.random.default_rng(5)
     guesses = np.array([[20.0, 20.0], [60.0, 20.0], [20.0, 60.0], [61.0, 61.0]])
     _, of_noise = fitted(generator.normal(100, 5, (80, 80)), guesses)

@@ -79,7 +79,7 @@ def test_averaged_frames_of_a_few_electrons() -> None:
     assert np.sqrt(np.square(errors / sigmas[:, np.newaxis]).mean()) == pytest.approx(1.0, abs=0.15)
 
 
-def test_the_stretch_does_not_care_for_the_scale() -> None:
+def test_detection_does_not_depend_on_the_scale_of_the_image() -> None:
     light, _ = rendered(4)
     dim = detect_boards((light * 400 + 100).astype(np.uint16), [BOARD])[0]
     full = detect_boards((light * 60000).astype(np.uint16), [BOARD])[0]
@@ -147,5 +147,5 @@ def test_photographs_calibrate_as_well_as_documented() -> None:
 
 
 @needs_data
-def test_an_occluded_board_shows_what_it_shows() -> None:
+def test_visible_corners_of_an_occluded_board_are_found() -> None:
     assert len(photograph("chocclusion_original").corners) == 16

@@ -99,7 +99,7 @@ def test_a_lens_is_either_refused_or_keeps_neighbours_in_order(seed: int) -> Non
         ({"size_px": (0, 43)}, "size_px"),
     ],
 )
-def test_numbers_of_no_lens_are_refused(changed: dict[str, Any], words: str) -> None:
+def test_invalid_lenses_are_refused(changed: dict[str, Any], words: str) -> None:
     good: dict[str, Any] = {"size_px": (61, 43), "fx_px": 70.0, "fy_px": 70.0, "cx_px": 30.0, "cy_px": 21.0}
     Lens(**good)
     with pytest.raises(ValueError, match=words):

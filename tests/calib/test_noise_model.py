@@ -69,7 +69,7 @@ def test_pixels_at_or_above_the_saturation_level_are_saturated() -> None:
         ("saturation_dn", np.nan),
     ],
 )
-def test_numbers_of_no_sensor_are_refused_by_name(name: str, value: Any) -> None:
+def test_invalid_sensors_are_refused_by_name(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=name):
         NoiseModel(**{**GOOD, name: value})
 

@@ -91,7 +91,7 @@ def test_the_corner_noise_is_found(many: list[tuple[Simulated, RigGeometry]]) ->
         assert geometry.repeatability is None
 
 
-def test_far_better_than_each_view_alone(many: list[tuple[Simulated, RigGeometry]]) -> None:
+def test_bundle_is_far_better_than_single_views(many: list[tuple[Simulated, RigGeometry]]) -> None:
     matrix, distortion = TRUE_LENS.camera_matrix(), np.array(TRUE_LENS.distortion)
     given, geometry = many[0]
     solved = {}
@@ -133,7 +133,7 @@ def test_outliers_are_marked_and_do_not_pull() -> None:
     assert np.abs(centres_mm(geometry.rt_cam_ref) - centres_mm(given.poses)).max() < 0.5
 
 
-def test_boards_in_turn_reveal_how_far_the_stage_comes_back() -> None:
+def test_boards_in_turn_reveal_the_repeatability_of_the_stage() -> None:
     geometry = calibrated(simulated(6, side=5, miss_mm=0.05), LENIENT)
     assert geometry.repeatability is not None
     assert geometry.repeatability.sd_mm == pytest.approx(0.05, abs=3 * geometry.repeatability.se_mm)
@@ -141,7 +141,7 @@ def test_boards_in_turn_reveal_how_far_the_stage_comes_back() -> None:
     assert geometry.sigma_px == pytest.approx(NOISE_PX, rel=0.03)
 
 
-def test_covariance_carries_the_stage_that_does_not_come_back() -> None:
+def test_covariance_includes_the_repeatability_of_the_stage() -> None:
     """Without the gantry's share the ratio would be several; with it, 8 seeds of 57 numbers: 0.9 to 1.1 within 0.25."""
     ratios, blind = [], []
     for seed in range(20, 28):
@@ -219,7 +219,7 @@ def test_a_board_of_another_size_is_found_out_by_leaving_it_out() -> None:
         calibrated(wrong)
 
 
-def test_what_leaving_a_board_out_adds_is_refused_in_pixels_not_in_multiples_of_almost_nothing() -> None:
+def test_holdout_is_judged_in_pixels_where_residuals_are_tiny() -> None:
     larger = replace(six_boards(6, 8, 40.0)[2], square_mm=40.02)
     slightly = simulated(
         11, noise_px=0.002, standing=[*six_boards(6, 8, 40.0)[:2], larger, *six_boards(6, 8, 40.0)[3:]]
@@ -248,7 +248,7 @@ def test_other_lens_models(lens_model: str) -> None:
     assert geometry.lens.fx_px == pytest.approx(OPTICS.fx_px, abs=2.0)
 
 
-def test_settings_that_cannot_be_are_refused() -> None:
+def test_invalid_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="lens model 'fisheye'"):
         GeometrySettings(lens_model="fisheye")
     with pytest.raises(ValueError, match="positive"):

@@ -81,7 +81,7 @@ def test_directions_of_a_serpentine_and_of_its_reverse_cancel() -> None:
     assert approach_directions(there + back)[1, 2] == (0.0, 0.0)
 
 
-def test_without_what_the_stage_was_told_there_is_a_pitch_but_no_scale(measured: RigGeometry) -> None:
+def test_without_pitch_mm_there_is_no_scale(measured: RigGeometry) -> None:
     report = stage_report(faulty(measured), {}, None)
     assert report.pitch_x_mm.value == pytest.approx(50.1)
     assert report.scale_x.value is None

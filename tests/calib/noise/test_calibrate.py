@@ -56,7 +56,7 @@ def test_one_exposure_tells_neither_gain_nor_dark_current_but_with_flats_the_gai
     assert "one exposure" in str(result.estimates["dark_current_e_per_s"].why)
 
 
-def test_several_exposures_of_which_one_has_two_frames_are_not_called_one_exposure() -> None:
+def test_one_repeated_exposure_among_several_is_not_called_one_exposure() -> None:
     chip, rng = specimen(16)
     series = [*take(chip, rng, (1.0,), 2), *take(chip, rng, (2.0, 12.0), 1)]
     without, with_flats = calibrate(series), calibrate([*series, light(chip, rng, 8000.0, 10)])
@@ -108,7 +108,7 @@ def test_a_falling_dark_level_is_no_dark_current_and_the_mass_function_falls_wit
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize(("read_noise_e", "dsnu_e"), [(0.3, 1.5), (12**0.5, 0.0)])
-def test_what_is_not_seen_is_not_certainly_zero(seed: int, read_noise_e: float, dsnu_e: float) -> None:
+def test_an_unseen_spread_is_not_certainly_zero(seed: int, read_noise_e: float, dsnu_e: float) -> None:
     chip, rng = specimen(seed, dsnu_e=dsnu_e, dark_current_e_per_s=0.5, read_noise_e=read_noise_e, shape=(32, 32))
     for name, estimate in calibrate(take(chip, rng)).estimates.items():
         assert estimate.se is None or estimate.se > 0, name
@@ -153,7 +153,7 @@ def test_a_pixel_that_flips_between_two_levels_is_noisy() -> None:
     assert result.noisy.sum() <= 2
 
 
-def test_what_flats_tell() -> None:
+def test_quantities_from_flats() -> None:
     chip, rng = specimen(5, shape=(96, 96), prnu=0.02)
     chip.response[40, 50] = 0.1
     result = calibrate(
@@ -242,7 +242,7 @@ def test_noise_that_changed_between_series_is_noticed() -> None:
     assert result.estimates["gain_dn_per_e"].value is None
 
 
-def test_a_plain_sensor_raises_no_doubts() -> None:
+def test_a_plain_sensor_raises_no_warnings() -> None:
     result = calibrate(take(*specimen(12, shape=(128, 128), jitter_dn=0.5, banding_dn=1.0, dcnu=0.1)))
     assert result.warnings == ()
     assert result.likelihood is NoiseLikelihood.GAUSSIAN

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.exact import PARAMETERS, Counts, exact_likelihood
+from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
 from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, DARK_NODES, mass_function
 from faintfield.calib.noise.selection import NoiseLikelihood
 from tests.calib.noise.darkroom import darks, expose, specimen
@@ -68,7 +68,7 @@ def test_log_likelihood_is_the_integral_over_offset_and_dark_current(floor_dn: i
     if floor_dn is not None:
         frames = [np.maximum(values, floor_dn) for values in frames]
     gain, read, dark, spread, centre, width = 2.1, 0.45, 0.22, 0.12, 99.5, 3.2
-    values = dict(zip(PARAMETERS, [*np.log([gain, read, dark]), spread, centre, np.log(width)], strict=True))
+    at = np.array([*np.log([gain, read, dark]), spread, centre, np.log(width)])
     offsets = np.arange(centre - 20, centre + 20, 0.02)
     total = 0.0
     for pixel in range(6):
@@ -86,7 +86,8 @@ def test_log_likelihood_is_the_integral_over_offset_and_dark_current(floor_dn: i
                         )
             integrand += product
         total += np.log(np.trapezoid(integrand * stats.norm.pdf(offsets, centre, width), offsets))
-    ours, _ = exact_likelihood(Counts(exposures_s, tuple(frames), floor_dn), values, exact=True, spread=True)
+    counts, start = Counts(exposures_s, tuple(frames), floor_dn), dict(zip(PARAMETERS, at, strict=True))
+    ours, _, _ = MarginalLikelihood(counts, start, exact=True, spread=True).evaluate(at)
     assert ours == pytest.approx(total, abs=0.02)
 
 
@@ -117,8 +118,9 @@ def bound_of_exact(read_noise_e: float, pixels: float) -> NDArray[np.float64]:
     """Return the Cramér-Rao bound on ln gain, ln σ, ln D from the scores at the truth of many pixels."""
     series = take(12345, shape=(192, 192), read_noise_e=read_noise_e)
     counts = Counts(EXPOSURES_S, tuple(one.sample_dn for one in series))
-    values = [np.log(2.0), np.log(read_noise_e), np.log(0.2), 0.0, 100.0, np.log(3.0)]
-    _, scores = exact_likelihood(counts, dict(zip(PARAMETERS, values, strict=True)), exact=True, spread=False)
+    truth = np.array([np.log(2.0), np.log(read_noise_e), np.log(0.2), 0.0, 100.0, np.log(3.0)])
+    start = dict(zip(PARAMETERS, truth, strict=True))
+    _, _, scores = MarginalLikelihood(counts, start, exact=True, spread=False).evaluate(truth)
     free = [i for i, name in enumerate(PARAMETERS) if name != "dcnu"]
     sampled = series[0].sample_dn.shape[1]
     return np.sqrt(np.diag(np.linalg.inv(scores[np.ix_(free, free)] * pixels / sampled)))[:3]

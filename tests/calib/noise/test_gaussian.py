@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
-from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, log_likelihood
+from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, negative_log_likelihood
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
@@ -21,38 +22,55 @@ def take_darks(chip: Chip, rng: np.random.Generator, frames: int = 10) -> list[S
     return [measure_series(series, Conditions("dark", t)) for t, series in taken.items()]
 
 
-def test_likelihood_is_that_of_the_dense_covariance() -> None:
+T_S, FRAMES, PIXELS = np.array([0.0, 2.0, 7.0]), np.array([2, 3, 4]), 40
+FRAME_T_S, SERIES_OF = np.repeat(T_S, FRAMES), np.repeat(np.arange(3), FRAMES)
+
+
+def moments_of(contrasts: NDArray[np.float64], levels: NDArray[np.float64]) -> Moments:
+    """Return the statistics of frames as pixel contrasts (contrast, frame) and levels (frame,)."""
+    means = np.array([contrasts[:, SERIES_OF == j].mean(1) for j in range(3)])
+    darks = DarkMoments(
+        T_S,
+        FRAMES.astype(float),
+        np.array([levels[SERIES_OF == j].mean() for j in range(3)]),
+        np.array([contrasts[:, SERIES_OF == j].var(1).sum() * FRAMES[j] for j in range(3)]),
+        np.array([levels[SERIES_OF == j].var() * FRAMES[j] for j in range(3)]),
+        means @ means.T,
+    )
+    return Moments(float(PIXELS), PIXELS - 1.0, darks, NO_FLATS)
+
+
+def dense_log_likelihood(
+    values: dict[str, float], contrasts: NDArray[np.float64], levels: NDArray[np.float64]
+) -> float:
+    v = np.array(dark_variances_dn2(values, T_S), float)[SERIES_OF]
+    covariance = np.diag(v) + values["dsnu_dn2"] + values["dcnu_dn2_per_s2"] * np.outer(FRAME_T_S, FRAME_T_S)
+    total = stats.multivariate_normal(np.zeros(FRAMES.sum()), covariance).logpdf(contrasts).sum()
+    level = values["jitter_dn2"] + v / PIXELS
+    line = values["offset_dn"] + values["dark_signal_dn_per_s"] * FRAME_T_S
+    design = np.stack([np.ones_like(FRAME_T_S), FRAME_T_S])
+    restricted = np.linalg.slogdet((design / level) @ design.T)[1]
+    return float(total + stats.norm(line, np.sqrt(level)).logpdf(levels).sum() - 0.5 * restricted)
+
+
+@pytest.mark.parametrize(
+    ("name", "changed"),
+    [
+        ("dsnu_dn2", 5.0),
+        ("dcnu_dn2_per_s2", 0.3),
+        ("log_gain", 0.8),
+        ("log_read_dn2", 2.4),
+        ("jitter_dn2", 0.2),
+        ("offset_dn", 0.3),
+    ],
+)
+def test_likelihood_is_that_of_the_dense_covariance(name: str, changed: float) -> None:
     """P pixels rotated into P − 1 contrasts and a mean: each contrast is an independent normal vector."""
     rng = np.random.default_rng(0)
-    t, n, pixels = np.array([0.0, 2.0, 7.0]), np.array([2, 3, 4]), 40
-    frame_t, series_of = np.repeat(t, n), np.repeat(np.arange(3), n)
-    y = rng.normal(0, 3, (pixels, n.sum())) + rng.normal(0, 2, (pixels, 1)) + rng.normal(1, 0.4, (pixels, 1)) * frame_t
-    contrasts, levels = linalg.helmert(pixels) @ y, y.mean(0)
-    means = np.array([contrasts[:, series_of == j].mean(1) for j in range(3)])
-    moments = Moments(
-        float(pixels),
-        pixels - 1.0,
-        DarkMoments(
-            t,
-            n.astype(float),
-            np.array([levels[series_of == j].mean() for j in range(3)]),
-            np.array([contrasts[:, series_of == j].var(1).sum() * n[j] for j in range(3)]),
-            np.array([levels[series_of == j].var() * n[j] for j in range(3)]),
-            means @ means.T,
-        ),
-        NO_FLATS,
-    )
-
-    def dense(values: dict[str, float]) -> float:
-        v = np.array(dark_variances_dn2(values, t), float)[series_of]
-        covariance = np.diag(v) + values["dsnu_dn2"] + values["dcnu_dn2_per_s2"] * np.outer(frame_t, frame_t)
-        total = stats.multivariate_normal(np.zeros(n.sum()), covariance).logpdf(contrasts).sum()
-        level = values["jitter_dn2"] + v / pixels
-        line = values["offset_dn"] + values["dark_signal_dn_per_s"] * frame_t
-        design = np.stack([np.ones_like(frame_t), frame_t])
-        restricted = np.linalg.slogdet((design / level) @ design.T)[1]
-        return float(total + stats.norm(line, np.sqrt(level)).logpdf(levels).sum() - 0.5 * restricted)
-
+    y = rng.normal(0, 3, (PIXELS, FRAMES.sum())) + rng.normal(0, 2, (PIXELS, 1))
+    y += rng.normal(1, 0.4, (PIXELS, 1)) * FRAME_T_S
+    contrasts, levels = linalg.helmert(PIXELS) @ y, y.mean(0)
+    moments = moments_of(contrasts, levels)
     one = {
         "offset_dn": 0.1,
         "log_read_dn2": 2.0,
@@ -62,17 +80,10 @@ def test_likelihood_is_that_of_the_dense_covariance() -> None:
         "dcnu_dn2_per_s2": 0.1,
         "log_gain": 0.3,
     }
-    for name, changed in [
-        ("dsnu_dn2", 5.0),
-        ("dcnu_dn2_per_s2", 0.3),
-        ("log_gain", 0.8),
-        ("log_read_dn2", 2.4),
-        ("jitter_dn2", 0.2),
-        ("offset_dn", 0.3),
-    ]:
-        other = one | {name: changed}
-        ours = log_likelihood(one, moments) - log_likelihood(other, moments)
-        assert ours == pytest.approx(dense(one) - dense(other), rel=1e-9), name
+    other = one | {name: changed}
+    ours = negative_log_likelihood(other, moments) - negative_log_likelihood(one, moments)
+    dense = dense_log_likelihood(one, contrasts, levels) - dense_log_likelihood(other, contrasts, levels)
+    assert float(ours) == pytest.approx(dense, rel=1e-9)
 
 
 def test_bound_on_the_gain_from_one_bright_flat_pair() -> None:

@@ -62,7 +62,7 @@ def test_a_leak_that_is_a_pattern_is_named() -> None:
         measure_series([*frames[1:], ("spotted", spotted.astype(np.uint16))], DARK)
 
 
-def test_two_frames_are_too_few_to_say_which_leaks_unless_it_is_plain() -> None:
+def test_with_two_frames_only_a_large_leak_is_named() -> None:
     chip, rng = specimen(4, jitter_dn=1.0)
     frames = darks(chip, [1.0], 2, rng)[1.0]
     measure_series(frames, DARK)
@@ -83,6 +83,6 @@ def test_frames_of_another_size_are_refused() -> None:
         measure_series([("first", np.zeros((8, 8), int)), ("odd", np.zeros((8, 9), int))], DARK)
 
 
-def test_no_frame_is_no_series() -> None:
+def test_a_series_without_frames_is_refused() -> None:
     with pytest.raises(ValueError, match="at least one frame"):
         measure_series([], DARK)
