@@ -31,8 +31,8 @@ from faintfield.pipelines.formats.sets.measured_poses import (
     read_geometry,
     with_measured_geometry,
 )
-from faintfield.pipelines.simulation.boards import simulate_board_set
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from tests.simulated_boards import simulate_board_set
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
 
