@@ -43,7 +43,7 @@ def covered(truth: Image, seed: int) -> tuple[float, float, float]:
     electrons = generator.poisson(light) + generator.normal(0, _READ_NOISE_E, light.shape)
     images = ElementalImages(electrons.astype(np.float32), 0.0, _READ_NOISE_E**2)
     found = solve(operator, images, "pmlem", Settings(uncertainty=True))
-    held = np.abs(found.plane - truth) <= _WITHIN * found.beside["sigma"]
+    held = np.abs(found.plane - truth) <= _WITHIN * found.sidecars["sigma"]
     on = truth > 0
     return float(held[on].mean()), float(held[~on].mean()), float(held.mean())
 

@@ -21,7 +21,7 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from faintfield.calib.geometry.stage import Estimate, StageReport, approach_directions, stage_report
+from faintfield.calib.geometry.stage import StageEstimate, StageReport, approach_directions, stage_report
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import WrongSize
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
@@ -204,7 +204,7 @@ def _board_records(measured: MeasuredGeometry) -> list[BoardRecord]:
 def _stage_record(stage: StageReport) -> StageRecord:
     """Return the figures of the stage as they stand in geometry.json."""
     figures: dict[str, Any] = {
-        name: StageFigure(**asdict(value)) for name, value in vars(stage).items() if isinstance(value, Estimate)
+        name: StageFigure(**asdict(value)) for name, value in vars(stage).items() if isinstance(value, StageEstimate)
     }
     return StageRecord(**figures, residuals_mm=stage.residuals_mm, warnings=stage.warnings)
 

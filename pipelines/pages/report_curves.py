@@ -12,6 +12,9 @@ from faintfield.pipelines.pages.report_planes import Plane
 # Colour and mark of the curves of several planes.
 _LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D"))
 
+# Largest number of curves in the legend: one of many planes would leave no room for the curves.
+_MAX_LABELLED = 8
+
 
 def focus_curve(focus: FocusCurve) -> str:
     """Return the focus curve as SVG that takes its colour from the page."""
@@ -53,12 +56,21 @@ def weight_curves(planes: Sequence[Plane]) -> str | None:
 
     figure = Figure(figsize=(5.6, 3.0), layout="constrained")
     axes = figure.subplots()
-    for ((name, channel), record), (colour, marker) in zip(known.items(), cycle(_LINES)):
+    for index, (((name, channel), record), (colour, marker)) in enumerate(zip(known.items(), cycle(_LINES))):
         curve = sorted(record.penalty_weight_curve or [], key=lambda score: score.weight)
         held_out = np.array([score.held_out for score in curve])
         label = name if channel == "grey" else f"{name}, {channel}"
+        if index == _MAX_LABELLED:
+            label = f"and {len(known) - _MAX_LABELLED} more"
         weights = [score.weight for score in curve]
-        axes.plot(weights, held_out - held_out.min(), marker=marker, markersize=4, color=colour, label=label)
+        axes.plot(
+            weights,
+            held_out - held_out.min(),
+            marker=marker,
+            markersize=4,
+            color=colour,
+            label=label if index <= _MAX_LABELLED else None,
+        )
         if record.penalty_weight is not None:
             axes.axvline(record.penalty_weight, color=colour, linewidth=1, linestyle="--")
     axes.set_xscale("log")

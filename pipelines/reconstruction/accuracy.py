@@ -55,10 +55,9 @@ def assess(
         for (method, depth), path in planes.items()
         if depth in depths
     ]
-    figures = brightness(loaded, folder / OBJECT_REGION)
     return Metrics(
         planes=[row for row in rows if row is not None],
-        snr=SnrRecord(truth.snr, figures.snr),
+        snr=SnrRecord(truth.snr, brightness(loaded, folder / OBJECT_REGION).snr),
         photons_per_px=PhotonsRecord(truth.photons_linear, truth.photons_from_moments, truth.photons_on_object),
     )
 

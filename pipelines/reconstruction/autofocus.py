@@ -10,6 +10,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth_map import Compared, compared_depths
+from faintfield.recon.depth.agreement import DepthMap
 from faintfield.recon.depth.best_focus import LEAST_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus
 
@@ -55,18 +56,8 @@ def best_focus(loaded: ElementalSet, out: Path, range_mm: tuple[float, float] | 
         The views agree on nothing in this range.
     """
     near_mm, far_mm = sorted(range_mm or searched_range_mm(loaded))
-    ranges = [(near_mm, far_mm)]
-    for _ in range(_SEARCHES):
-        compared = _searched(loaded, out, *ranges[-1])
-        found = compared.depth_map()
-        sure = found.confidence >= SURE
-        if np.count_nonzero(sure) < LEAST_SAMPLES:
-            raise _nothing(ranges[0])
-        first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
-        if last - first > _SHRUNK_ENOUGH * _DEPTHS:
-            break
-        inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
-        ranges.append((float(1 / inverse[0]), float(1 / inverse[1])))
+    ranges, compared, found = _narrowed(loaded, out, (near_mm, far_mm))
+    sure = found.confidence >= SURE
     places = places_of_focus(found, _DEPTHS)
     if not places:
         raise _nothing(ranges[0])
@@ -82,6 +73,25 @@ def best_focus(loaded: ElementalSet, out: Path, range_mm: tuple[float, float] | 
         bins_px=compared.bins_px,
         share_of_sure=[float(place.sum() / sure.sum()) for place in places],
     )
+
+
+def _narrowed(
+    loaded: ElementalSet, out: Path, range_mm: tuple[float, float]
+) -> tuple[list[tuple[float, float]], Compared, DepthMap]:
+    """Search a range, then the part of it in which anything was found; return all ranges, and the last comparison."""
+    ranges = [range_mm]
+    for _ in range(_SEARCHES):
+        compared = _searched(loaded, out, *ranges[-1])
+        found = compared.depth_map()
+        sure = found.confidence >= SURE
+        if np.count_nonzero(sure) < LEAST_SAMPLES:
+            raise _nothing(range_mm)
+        first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
+        if last - first > _SHRUNK_ENOUGH * _DEPTHS:
+            break
+        inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
+        ranges.append((float(1 / inverse[0]), float(1 / inverse[1])))
+    return ranges, compared, found
 
 
 def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:

@@ -37,7 +37,7 @@ ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
 # Hatching of unknown depths in the preview: two levels of grey (0 to 1), and their period.
 _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
-# Width of the preview in inches; its height, for what is not the map (0.6), and per width/height of the map.
+# Widths in inches of the preview and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
 
@@ -184,15 +184,10 @@ def write_depth_map(
     record = found.record(compared.bins_px)
     for method, folder in folders.items():
         remove(folder / DEPTH_MAP_FILE)
-        _write_maps(folder, found)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
-        write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
-        write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
-        files = [f"{stem}.{suffix}" for stem in (found.name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
-        hashes = {file: sha256(folder / file) for file in files}
-        write_json(
-            folder / DEPTH_MAP_FILE, DepthMapFileRecord(1, record, hashes, **msgspec.structs.asdict(origins[method]))
-        )
+        hashes = _write_maps(folder, found, sharp)
+        vouching = DepthMapFileRecord(1, record, hashes, **msgspec.structs.asdict(origins[method]))
+        write_json(folder / DEPTH_MAP_FILE, vouching)
     return record
 
 
@@ -208,13 +203,17 @@ def _map_of(loaded: ElementalSet, compared: Compared, disparities_px: Mapping[fl
     return _Map("px" if disparities_px else "mm", scale, index, values, confidence)
 
 
-def _write_maps(folder: Path, found: _Map) -> None:
-    """Write both maps with their previews."""
+def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
+    """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
     label = "disparity (px)" if found.unit == "px" else "depth (mm)"
     write_plane(folder / f"{found.name}.tiff", found.values, 1.0)
     write_plane(folder / f"{CONFIDENCE}.tiff", found.confidence, 1.0)
     write_whole(folder / f"{found.name}.png", _picture(found.values, label, min(found.scale), max(found.scale)))
     write_whole(folder / f"{CONFIDENCE}.png", _picture(found.confidence, "probability of the depth", 0.0, 1.0))
+    write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
+    write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
+    files = [f"{stem}.{suffix}" for stem in (found.name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
+    return {file: sha256(folder / file) for file in files}
 
 
 def _picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:
@@ -223,7 +222,10 @@ def _picture(values: NDArray[np.floating], label: str, low: float, high: float) 
 
     rows, columns = np.indices(values.shape)
     hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
-    figure = Figure(figsize=(8.6, 0.6 + 7.2 * values.shape[0] / values.shape[1]), layout="constrained")
+    figure = Figure(
+        figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]),
+        layout="constrained",
+    )
     axes = figure.subplots()
     axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
     shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")

@@ -39,9 +39,10 @@ def test_measured_poses_are_as_good_as_true_ones_and_nominal_ones_are_not(tmp_pa
 
 def mean_square_error(scene: Path, out: Path, measured_in: Path | None, poses: str) -> float:
     result = reconstruct(scene, out=out, depth_mm=[500.0], method=["pmlem-osl"], geometry=measured_in)
-    (row,) = result["metrics"]["planes"]
-    assert row["poses"] == poses
-    return float(row["mse_bright"])
+    assert result.metrics is not None
+    (row,) = result.metrics.planes
+    assert row.poses == poses
+    return row.mse_bright
 
 
 def with_poses(

@@ -1,17 +1,19 @@
 """Sessions of unusual rigs, from their frames to pictures that are compared with the truth."""
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from faintfield.pipelines.commands.reconstruct import DEFAULT_METHOD, Request, reconstruct_set
-from faintfield.pipelines.commands.run import run_steps, session_steps
+from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.plane_files import plane_name
+from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.paper.demo_truth import true_set, write_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+from faintfield.pipelines.reconstruction.run import reconstruct_set
+from faintfield.pipelines.reconstruction.steps import run_steps
 from tests.pipelines.sessions import captured, rig_toml
 
 _DEPTH_MM = 500.0
@@ -42,7 +44,7 @@ def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Pat
     truth = write_truth(tmp_path / "truth", session, 1.0)
     plane = session / "reconstructions" / f"{plane_name(_DEPTH_MM)}.tiff"
     measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, truth))
-    exact = reconstruct_set(true_set(session, truth), tmp_path / "true", request)["out"]
+    exact = reconstruct_set(true_set(session, truth), tmp_path / "true", request).out
     best = error(assess(true_set(session, truth), {(DEFAULT_METHOD, _DEPTH_MM): Path(exact) / plane.name}, truth))
     # Of a mosaic, a quarter of the pixels see each of two colours
     assert measured < (0.04 if "mosaic" in camera else 0.02)
@@ -50,7 +52,7 @@ def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Pat
     assert read_frame(plane).pixels_dn.ndim == (3 if "mosaic" in camera else 2)
 
 
-def error(metrics: dict[str, Any] | None) -> float:
+def error(metrics: Metrics | None) -> float:
     assert metrics is not None
-    (row,) = metrics["planes"]
-    return float(row["mse_bright"])
+    (row,) = metrics.planes
+    return row.mse_bright

@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.channels import (
-    OperatorFactory,
-    channel_layouts,
-    default_pitch_px,
-    load_channel,
-    plane_grid,
-)
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid
+from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.starts import back_projection

@@ -11,11 +11,12 @@ from typing import Any
 import numba
 import pytest
 
-from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
 from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.reconstruction.cluster import crew_of
+from faintfield.pipelines.reconstruction.cluster import make_runner
+from faintfield.pipelines.reconstruction.request import Request
+from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.reconstruction.sweep import PlaneTask
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -56,15 +57,15 @@ def test_a_worker_killed_in_mid_sweep_costs_only_its_plane(cluster: Any, simulat
     loaded = load_set(simulated_scene)
     request = Request(DEPTHS_MM, ["pmlem"], with_focus=True)
     reconstruct_set(loaded, tmp_path / "local", request)
-    crew = crew_of(None, cluster.scheduler_address)
+    runner = make_runner(None, cluster.scheduler_address)
     done: list[Place] = []
 
     def killing(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
-        for task, words in crew(loaded, out, tasks):
+        for task, messages in runner(loaded, out, tasks):
             done.extend(task.grids)
             if len(done) == 1:
                 _kill_one_that_works(cluster)
-            yield task, words
+            yield task, messages
 
     before = len(cluster.scheduler.transition_log)
     reconstruct_set(loaded, tmp_path / "spread", request, killing)

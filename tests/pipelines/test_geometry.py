@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.board import Board
-from faintfield.calib.geometry import GeometrySettings, calibrate_geometry
+from faintfield.calib.geometry import BoardObservation, GeometrySettings, Node, Target, calibrate_geometry
 from faintfield.pipelines import cli
 from faintfield.pipelines.commands.board import board
 from faintfield.pipelines.commands.exports.colmap import export_colmap
@@ -21,16 +21,16 @@ from faintfield.pipelines.commands.imports.mrcal import import_mrcal
 from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
-from faintfield.pipelines.formats.results.geometry import read_corners
+from faintfield.pipelines.formats.results.geometry import (
+    CORNERS_FILE,
+    COVARIANCE_FILE,
+    DEFAULT_DEPTHS_MM,
+    read_geometry,
+)
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
-from faintfield.pipelines.formats.sets.measured_poses import (
-    CORNERS_FILE,
-    COVARIANCE_FILE,
-    read_geometry,
-    with_measured_geometry,
-)
+from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.simulated_boards import simulate_board_set
 
@@ -73,13 +73,29 @@ def test_the_files_say_where_the_camera_was(measured: tuple[Path, dict[str, Any]
     assert "squareness" in page
 
 
+def read_corners(path: Path) -> list[BoardObservation]:
+    """Return the corners that a geometry was found from, as they are stored beside it."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in ("pixels", "sigma_px", "corner", "node", "sweep", "board")}
+    groups: dict[tuple[Node, Target], list[int]] = {}
+    for row, (node, sweep, name) in enumerate(zip(arrays["node"], arrays["sweep"], arrays["board"], strict=True)):
+        groups.setdefault(((int(node[0]), int(node[1])), Target(str(name), int(sweep))), []).append(row)
+    return [
+        BoardObservation(node, target, arrays["corner"][rows], arrays["pixels"][rows], arrays["sigma_px"][rows])
+        for (node, target), rows in groups.items()
+    ]
+
+
+def test_the_depths_of_the_command_are_those_of_the_calibration() -> None:
+    assert GeometrySettings().depths_mm == DEFAULT_DEPTHS_MM
+
+
 def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, dict[str, Any]]) -> None:
     folder, _ = measured
     content = read_geometry(folder)
     corners = read_corners(folder / CORNERS_FILE)
-    stored = json.loads((folder / "geometry.json").read_text())
     names = Board.__dataclass_fields__
-    boards = {entry["name"]: Board(**{name: entry[name] for name in names}) for entry in stored["boards"]}
+    boards = {entry.name: Board(**{name: getattr(entry, name) for name in names}) for entry in content.boards}
     again = calibrate_geometry(boards, corners, content.size_px, content.reference_node, GeometrySettings())
     pixels, here = np.array([[20.0, 30.0], [160.0, 100.0], [300.0, 200.0]]), content.camera_lens()
     points = np.column_stack([here.rays_at(pixels), np.ones(3)]) * 600.0

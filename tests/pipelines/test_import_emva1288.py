@@ -7,10 +7,12 @@ import cv2
 import pytest
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.commands.imports.emva1288 import import_emva1288, parse_descriptor
+from faintfield.pipelines.commands.imports.emva1288 import import_emva1288
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.exchange.emva1288 import read_descriptor
 from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.results.noise import Measured
 from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.calib.noise.darkroom import expose, specimen
 
@@ -59,8 +61,9 @@ def test_reference_data_become_a_noise_set(tmp_path: Path) -> None:
     ]
     assert [frame.exposure_s for frame in settings.frame if frame.kind == "dark"] == [0.1, 0.1, 30.0, 30.0]
     measured = noise(tmp_path / "set")
-    assert measured["gain_dn_per_e"]["value"] == pytest.approx(0.5, rel=0.06)
-    assert measured["quantum_efficiency"]["value"] == pytest.approx(0.5, rel=0.06)
+    assert measured.gain_dn_per_e.value == pytest.approx(0.5, rel=0.06)
+    assert isinstance(measured.quantum_efficiency, Measured)
+    assert measured.quantum_efficiency.value == pytest.approx(0.5, rel=0.06)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +84,7 @@ def test_what_is_no_descriptor_is_refused_with_its_line(tmp_path: Path, line: st
     path = tmp_path / "descriptor.txt"
     path.write_text(line + "\n")
     with pytest.raises(BadValue, match=words):
-        parse_descriptor(path)
+        read_descriptor(path)
 
 
 def test_all_that_was_read_is_recorded(tmp_path: Path) -> None:

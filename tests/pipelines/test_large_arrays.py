@@ -29,14 +29,15 @@ from faintfield.pipelines.formats import large_arrays
 from faintfield.pipelines.pages import report
 from faintfield.pipelines.reconstruction import overview
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.reconstruction.request import Request
 loaded, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
 out, request = Path(sys.argv[2]), Request([500.0], ["backprojection"])
-reconstruct_set(warm, out.with_name("warm-out"), request)
+reconstruct_and_report(warm, out.with_name("warm-out"), request)
 large_arrays.available_bytes = lambda: int(sys.argv[4])
 taken = int(re.search(r"VmData:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
 resource.setrlimit(resource.RLIMIT_DATA, (taken + int(sys.argv[3]),) * 2)
-reconstruct_set(loaded, out, request)
+reconstruct_and_report(loaded, out, request)
 """
 
 

@@ -91,9 +91,9 @@ def test_the_result_is_what_reconstruction_reads(tmp_path: Path) -> None:
     result = noise(folder)
     fitted = read_fitted_noise(folder / "noise.json", (64, 64))
     assert np.shape(fitted.model.offset_dn) == (64, 64)
-    assert fitted.model.gain_dn_per_e == result["gain_dn_per_e"]["value"]
+    assert fitted.model.gain_dn_per_e == result.gain_dn_per_e.value
     assert fitted.model.saturation_dn == 65535
-    np.testing.assert_array_equal(np.argwhere(fitted.unusable), result["hot_pixels"])
+    np.testing.assert_array_equal(np.argwhere(fitted.unusable), result.hot_pixels)
 
 
 def test_what_cannot_be_told_is_null_with_the_reason(tmp_path: Path) -> None:
@@ -114,8 +114,9 @@ def test_colour_phases_are_planes_of_their_own(tmp_path: Path) -> None:
     chip.offset_dn[1::2, 0::2] += 50
     folder = write_frames(tmp_path, take_set(chip, rng, photons=(10000.0,)), mosaic=["RG", "GB"])
     result = noise(folder)
-    assert [plane["colour"] for plane in result["planes"]] == ["R", "G", "G", "B"]
-    offsets = [plane["offset_dn"]["value"] for plane in result["planes"]]
+    assert isinstance(result.planes, list)
+    assert [plane.colour for plane in result.planes] == ["R", "G", "G", "B"]
+    offsets = [plane.offset_dn.value for plane in result.planes]
     assert offsets == pytest.approx([100, 100, 150, 100], abs=0.6)
     with np.load(folder / "noise_maps.npz") as maps:
         assert np.sqrt(np.mean((maps["offset_dn"] - chip.offset_dn) ** 2)) < 2.5
@@ -206,8 +207,8 @@ def test_a_missing_exposure_is_an_error_and_a_missing_temperature_a_warning(
     assert "dark_02.tiff: its exposure is neither stated nor in its EXIF" in line
     frames[2][1]["exposure_s"] = 0.1
     result = noise(write_frames(tmp_path / "b", frames))
-    assert result["temperature_c"] is None
-    assert any("dark_00.tiff: no temperature" in warning for warning in result["warnings"])
+    assert result.temperature_c is None
+    assert any("dark_00.tiff: no temperature" in warning for warning in result.warnings)
 
 
 @pytest.mark.parametrize(
@@ -260,9 +261,11 @@ def test_a_real_ccd_comes_out_as_published(tmp_path: Path) -> None:
     ]
     region = {"rows": [8, 520], "columns": [50, 1074]}
     result = noise(write_frames(tmp_path, frames, region=region))
-    assert 1 / result["gain_dn_per_e"]["value"] == pytest.approx(2.529, rel=0.002)
-    assert result["read_noise_dn"]["value"] == pytest.approx(4.03, rel=0.005)
-    assert "black level drifted" in result["dark_current_e_per_s"]["why"]
+    assert result.gain_dn_per_e.value is not None
+    assert 1 / result.gain_dn_per_e.value == pytest.approx(2.529, rel=0.002)
+    assert result.read_noise_dn.value == pytest.approx(4.03, rel=0.005)
+    assert result.dark_current_e_per_s.why is not None
+    assert "black level drifted" in result.dark_current_e_per_s.why
 
 
 @needs_data
@@ -281,8 +284,9 @@ def test_a_real_ccd_whose_black_level_fell_is_not_told_more_than_it_shows(tmp_pa
         "column_noise_dn": "less scatter than the pixels' noise",
     }
     for name, why in whys.items():
-        assert result[name]["value"] is None, name
-        assert why in result[name]["why"], name
+        measured = getattr(result, name)
+        assert measured.value is None, name
+        assert why in measured.why, name
 
 
 @needs_data
@@ -307,16 +311,17 @@ def raw_like(path: Path) -> Frame:
     return Frame(tifffile.imread(path), ("RG", "GB"), level, 4095.0, 1.0)
 
 
-def test_masked_pixels_that_disagree_with_the_darks_raise_a_doubt(
+def test_masked_pixels_that_disagree_with_the_darks_raise_a_warning(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("faintfield.pipelines.calibration.noise_frames.read_frame", raw_like)
     result = noise(write_frames(tmp_path, take_set(*specimen(16, shape=(96, 96)))))
-    assert [plane["masked_black_dn"] for plane in result["planes"]] == [100, 100, 100, 140]
-    assert result["saturation_dn"] == 4095
-    doubts = [warning for warning in result["warnings"] if "black level that the files bring" in warning]
-    assert len(doubts) == 1
-    assert doubts[0].startswith("plane B_r1c1: the darks' offset is ")
+    assert isinstance(result.planes, list)
+    assert [plane.masked_black_dn for plane in result.planes] == [100, 100, 100, 140]
+    assert result.saturation_dn == 4095
+    warnings = [warning for warning in result.warnings if "black level that the files bring" in warning]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("plane B_r1c1: the darks' offset is ")
 
 
 def test_the_response_that_flats_measured_is_the_flat_field_of_a_set(tmp_path: Path) -> None:

@@ -10,14 +10,18 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_png
+from faintfield.pipelines.formats.results.geometry import GeometryRecord
+from faintfield.pipelines.formats.results.records import Brightness, Overview
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.pages.report_calibration import find_beside, photon_budget
+from faintfield.pipelines.pages.report_calibration import find_beside
+from faintfield.pipelines.pages.report_light import photon_budget
 from faintfield.pipelines.pages.stage_page import holdout_rows
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -42,15 +46,32 @@ def _geometry() -> dict[str, Any]:
     stage: dict[str, Any] = dict.fromkeys((*names, "node_residual_rms_mm"), figure)
     stage["backlash_y_mm"] = {"value": None, "sigma": None, "why": "approached from one side"}
     stage["residuals_mm"] = [[0.1 * k, -0.1, 0.05] for k in range(9)]
-    nodes = [{"node": [r, c], "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4} for r in range(3) for c in range(3)]
+    stage["doubts"] = []
+    nodes = [
+        {"node": [r, c], "rt_cam_ref": [0.0] * 6, "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4}
+        for r in range(3)
+        for c in range(3)
+    ]
+    lens = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 400.0) | {"distortion": [0.0], "sigma": [0.1] * 5}
+    known = dict.fromkeys(("rms_inlier_px", "rms_mrcal_px", "corner_sigma_px"), 0.018)
     return {
-        "nodes": nodes,
+        "lens": {"model": "opencv4", **lens},
+        "size_px": [800, 800],
         "reference_node": [1, 1],
-        "stage": stage,
-        "transfer_sigma_px": {"500": 0.0134},
-        "rms_inlier_px": 0.018,
+        "nodes": nodes,
+        **known,
         "corners": 5450,
         "outliers": 3,
+        "holdout_ratio": None,
+        "doubts": [],
+        "transfer_sigma_px": {"500": 0.0134},
+        "repeatability": None,
+        "boards": [],
+        "stage": stage,
+        "command": "geometry",
+        "options": {"lens": "opencv4", "depth_mm": [500.0], "limit_px": 0.5},
+        "inputs": {},
+        "versions": {},
     }
 
 
@@ -116,11 +137,13 @@ def test_planes_in_the_results_folder_of_a_session_are_titled_by_the_session(
 def test_what_boards_left_out_add_is_told_beside_its_limit(
     ratio: float | None, boards: int, said: list[tuple[str, str]]
 ) -> None:
-    rows = holdout_rows({"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [{}] * boards})
-    for row, (value, why) in zip(rows, said, strict=True):
-        assert row["value"] == value
-        assert why in row["why"]
-        assert ("waived" in row["why"]) == (why == "waived")
+    printed = {"columns": 9, "rows": 7, "square_mm": 40.0, "marker_mm": 30.0, "dictionary": "d", "first_marker_id": 0}
+    board = {"name": "b", **printed, "sweep": 0, "rt_ref_board": [0.0] * 6, "warp_mm": [0.0, 0.0]}
+    content = _geometry() | {"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [board] * boards}
+    for row, (value, why) in zip(holdout_rows(msgspec.convert(content, GeometryRecord)), said, strict=True):
+        assert row.value == value
+        assert why in row.why
+        assert ("waived" in row.why) == (why == "waived")
 
 
 def test_planes_of_a_session_are_named_by_their_method_alone(drawn: Path, tmp_path: Path, done: Command) -> None:
@@ -171,7 +194,7 @@ def test_a_damaged_calibration_is_named(name: str, session: Path, faintfield: Co
     ended = faintfield("report", session)
     assert ended.returncode == 1
     assert "BadValue" in ended.stderr
-    assert f"{name}: is not a result that can be shown" in ended.stderr
+    assert f"{name}: is not the result of `faintfield {name.removesuffix('.json')}`" in ended.stderr
 
 
 def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, done: Command) -> None:
@@ -184,44 +207,63 @@ def test_a_geometry_without_a_regular_grid_is_shown_all_the_same(session: Path, 
     assert "one column only" in text
 
 
-def _overview(**light: Any) -> dict[str, Any]:
-    brightness = {"mean_signal_e": 0.96, "electrons_linear": 1.92, "electrons_from_moments": 0.96} | light
-    whole = {"views": 49, "exposure_s": 0.1, "read_noise_e": 12**0.5, "quantum_efficiency": 0.5, "dark_e": 0.02}
-    return whole | {"brightness": brightness}
+def _overview(quantum_efficiency: float | None = 0.5, mean_signal_e: float = 0.96) -> Overview:
+    light = Brightness(
+        region="whole view",
+        noise_from="noise model",
+        snr=0.16,
+        electrons_linear=1.92,
+        electrons_from_moments=0.96,
+        mean_signal_e=mean_signal_e,
+        photons_linear=None,
+        photons_from_moments=None,
+    )
+    return Overview(
+        set="scene",
+        views=49,
+        grid=(7, 7),
+        poses="stated",
+        size_px=(640, 480),
+        exposure_s=0.1,
+        frames_per_view=1,
+        read_noise_e=12**0.5,
+        has_noise_reference=False,
+        quantum_efficiency=quantum_efficiency,
+        dark_e=0.02,
+        grey_scale_dn=(0.0, 1.0),
+        brightness=light,
+    )
 
 
 def test_the_photon_budget_is_that_of_the_papers_equations() -> None:
     budget = photon_budget(_overview())
     assert budget is not None
-    linear, moments, counted = budget["light"]
+    linear, moments, counted = budget.light
     # Eq. (7): 0.16 · 12 / 0.5 photons; at 0.1 s ten times as many per second; 49 views see 49 times as many
-    assert (linear["photons"], linear["flux"]) == pytest.approx((0.16 * 12 / 0.5, 38.4))
-    assert linear["all_views"] == pytest.approx(3.84 * 49)
+    assert (linear.photons, linear.flux) == pytest.approx((0.16 * 12 / 0.5, 38.4))
+    assert linear.all_views == pytest.approx(3.84 * 49)
     # (4) with a Poisson signal: μ² + μ = 0.16 · 12 e⁻², less the little that dark current does
-    mu_e = moments["electrons"]
+    mu_e = moments.electrons
     assert mu_e**2 + mu_e == pytest.approx(0.16 * 12, rel=0.03)
-    assert counted["photons"] == pytest.approx(0.96 / 0.5)
+    assert counted.photons == pytest.approx(0.96 / 0.5)
     # Eq. (6)
-    assert budget["variance_e2"] == pytest.approx(0.96 + 0.02 + 12)
-    assert {part["words"]: part["share"] for part in budget["shares"]} == pytest.approx(
+    assert budget.variance_e2 == pytest.approx(0.96 + 0.02 + 12)
+    assert {part.words: part.share for part in budget.shares} == pytest.approx(
         {"read noise": 12 / 12.98, "light": 0.96 / 12.98, "dark current": 0.02 / 12.98}
     )
 
 
-@pytest.mark.parametrize(
-    "overview",
-    [_overview(mean_signal_e=-0.1), {**_overview(), "dark_e": None}],
-)
-def test_without_light_there_is_no_budget(overview: dict[str, Any]) -> None:
-    assert photon_budget(overview) is None
+@pytest.mark.parametrize("mean_signal_e", [-0.1, 0.0])
+def test_without_light_there_is_no_budget(mean_signal_e: float) -> None:
+    assert photon_budget(_overview(mean_signal_e=mean_signal_e)) is None
 
 
 def test_without_a_quantum_efficiency_a_budget_has_electrons_only() -> None:
-    budget = photon_budget(_overview() | {"quantum_efficiency": None})
+    budget = photon_budget(_overview(quantum_efficiency=None))
     assert budget is not None
-    assert [row["electrons"] for row in budget["light"]] == [1.92, 0.96, 0.96]
-    assert {row[key] for row in budget["light"] for key in ("photons", "flux", "all_views")} == {None}
-    assert budget["variance_e2"] == pytest.approx(12.98)
+    assert [row.electrons for row in budget.light] == [1.92, 0.96, 0.96]
+    assert {number for row in budget.light for number in (row.photons, row.flux, row.all_views)} == {None}
+    assert budget.variance_e2 == pytest.approx(12.98)
 
 
 def test_a_page_says_no_photons_where_the_quantum_efficiency_is_unknown(session: Path, done: Command) -> None:

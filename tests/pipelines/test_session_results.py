@@ -94,7 +94,7 @@ class TestRun:
     """`faintfield run`: only what is out of date, by hash."""
 
     def ran(self, session: Path, depth_mm: float = 500.0) -> list[str]:
-        return [step["step"] for step in run(session, depth_mm=[depth_mm], passes=5)["steps"] if step["ran"]]
+        return [step.step for step in run(session, depth_mm=[depth_mm], passes=5).steps if step.ran]
 
     def test_exactly_the_dependent_steps_run_again(self, recorded: Path, tmp_path: Path) -> None:
         session = Path(shutil.copytree(recorded, tmp_path / "copy"))
@@ -152,13 +152,13 @@ class TestRun:
             patch.setattr("faintfield.pipelines.commands.reconstruct.write_report", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 run(copy, depth_mm=[700.0], passes=4)
-        assert [step["step"] for step in run(copy, depth_mm=[700.0], passes=4)["steps"] if step["ran"]] == ["report"]
+        assert [step.step for step in run(copy, depth_mm=[700.0], passes=4).steps if step.ran] == ["report"]
 
     def test_another_lens_is_another_geometry(self, session: Path, tmp_path: Path) -> None:
         copy = Path(shutil.copytree(session, tmp_path / "copy"))
-        assert run(copy, depth_mm=[700.0], passes=5, lens="opencv4")["steps"][1]["ran"]
+        assert run(copy, depth_mm=[700.0], passes=5, lens="opencv4").steps[1].ran
         assert json.loads((copy / "geometry.json").read_text())["lens"]["model"] == "opencv4"
-        assert not run(copy, depth_mm=[700.0], passes=5, lens="opencv4")["steps"][1]["ran"]
+        assert not run(copy, depth_mm=[700.0], passes=5, lens="opencv4").steps[1].ran
 
     def test_what_fails_leaves_the_rest_and_says_how_to_go_on(
         self, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

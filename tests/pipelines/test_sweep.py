@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from msgspec import UNSET
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.commands.reconstruct import Request, reconstruct_set
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.formats.files import UNFINISHED
+from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
+from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.request import Request
 from faintfield.recon.errors import GeometryMismatch
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -130,7 +134,7 @@ def test_a_failure_leaves_the_planes_before_it(
 
     monkeypatch.setattr("faintfield.pipelines.reconstruction.sweep.solve", failing)
     with pytest.raises(GeometryMismatch, match="made up"):
-        reconstruct_set(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
+        reconstruct_and_report(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
     assert {path.name for path in tmp_path.iterdir()} == {f"plane_00500.0.{kind}" for kind in ("tiff", "png", "json")}
     assert not (tmp_path / PARTS).exists()
 
@@ -144,15 +148,31 @@ def test_what_a_killed_call_with_several_methods_left_goes(scene: Path, tmp_path
 
 
 def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
-    files = PlaneFiles(
-        tmp_path, "occlusion", 500.0, ("red", "green", "blue"), {"inputs": {}, "options": {}, "versions": {}}
-    )
+    options = Request([500.0], ["occlusion"]).options("occlusion", "stated")
+    origin = provenance("reconstruct", options, {})
+    files = PlaneFiles(tmp_path, "occlusion", 500.0, ("red", "green", "blue"), origin)
     one = {"plane": np.ones((4, 5), np.float32)}
-    entry = {"record": {"file": files.path.name}, "focus": None}
-    files.save_part("red", one | {"sigma": one["plane"], "opacity": one["plane"]}, entry)
+    record = PlaneRecord(
+        depth_mm=500.0,
+        method="occlusion",
+        channel="red",
+        file=files.path.name,
+        shape=(4, 5),
+        pitch_mm=1.0,
+        origin_mm=(0.0, 0.0),
+        penalty_weight=None,
+        penalty_weight_chosen="given",
+        epsilon_e2=None,
+        passes=1,
+        objective=None,
+        certificate=None,
+        mean_e=1.0,
+        flux_e=20.0,
+    )
+    files.save_part("red", one | {"sigma": one["plane"], "opacity": one["plane"]}, record, None)
     for colour in ("green", "blue"):
-        files.save_part(colour, one | {"sigma": one["plane"]}, entry)
-    for record in files.finish(1.0)["planes"]:
-        assert record["sigma_file"] == "plane_00500.0_sigma.tiff"
-        assert "opacity_file" not in record
+        files.save_part(colour, one | {"sigma": one["plane"]}, record, None)
+    for written in files.finish(1.0).planes:
+        assert written.sigma_file == "plane_00500.0_sigma.tiff"
+        assert written.opacity_file is UNSET
     assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["plane_00500.0.tiff", "plane_00500.0_sigma.tiff"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.planes import Objective, Settings, certified, solve
+from faintfield.pipelines.reconstruction.planes import Objective, Settings, solve, solve_pmlem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
@@ -71,7 +71,7 @@ def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
     for seed in range(3):
         operator, images = dark_views(truth, seed)
         found = solve(operator, images, "pmlem", Settings(uncertainty=True))
-        held.append(np.mean((np.abs(found.plane - truth) <= 1.645 * found.beside["sigma"])[8:-8, 8:-8]))
+        held.append(np.mean((np.abs(found.plane - truth) <= 1.645 * found.sidecars["sigma"])[8:-8, 8:-8]))
     assert 0.85 <= np.mean(held) <= 0.995
 
 
@@ -79,10 +79,10 @@ def test_each_plane_of_a_scene_has_its_own_as_if_the_others_were_known() -> None
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
     settings = Settings(penalty_weight=0.8, uncertainty=True)
-    found = certified(Objective.of(PosedScene(posed.operator, images), settings), settings)
+    found = solve_pmlem(Objective.of(PosedScene(posed.operator, images), settings), settings)
     for solution, grid in zip(found, posed.operator.grids, strict=True):
-        assert solution.beside["sigma"].shape == grid.shape
-        assert solution.beside["sigma"].min() > 0
+        assert solution.sidecars["sigma"].shape == grid.shape
+        assert solution.sidecars["sigma"].min() > 0
     samples = posed.operator.samples_of([solution.plane for solution in found])
     fit = posed.fit(1.0)
     own = posed.operator.samples_of(fit.metric_of_each(samples))

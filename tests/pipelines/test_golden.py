@@ -1,0 +1,100 @@
+"""Results as they were first written: files that others read stay the same, key by key."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import msgspec
+import pytest
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.results.records import (
+    DepthMapFileRecord,
+    Metrics,
+    Overview,
+    PlaneFileRecord,
+    ReconstructionRecord,
+)
+
+type Command = Callable[..., CompletedProcess[str]]
+
+GOLDEN = Path(__file__).parent / "golden"
+
+# By the first word of the file's name.
+KINDS: dict[str, type[msgspec.Struct]] = {
+    "reconstruction": ReconstructionRecord,
+    "plane": PlaneFileRecord,
+    "depth_map": DepthMapFileRecord,
+    "metrics": Metrics,
+    "overview": Overview,
+}
+
+PAIR = ("--depth-mm", 500, "--depth-mm", 700)
+SWEEP = ("--sweep-mm", "400:800:9", "--method", "backprojection")
+
+# Options that make a result of the same kind from the small scene, and the name of its file.
+FRESH: dict[str, tuple[str, tuple[object, ...]]] = {
+    "reconstruction_pmlem": ("reconstruction.json", PAIR),
+    "reconstruction_pmlem-osl": ("reconstruction.json", ("--depth-mm", 500, "--method", "pmlem-osl")),
+    "reconstruction_sweep": ("reconstruction.json", SWEEP),
+    "reconstruction_auto": ("reconstruction.json", ("--depth-mm", "auto")),
+    "depth_map_sweep": ("depth_map.json", (*SWEEP, "--depth-map")),
+    "plane_pmlem": ("plane_00500.0.json", PAIR),
+    "metrics_set": ("metrics.json", PAIR),
+    "overview_set": ("overview.json", PAIR),
+}
+
+
+def _kinds_of_files() -> list[tuple[Path, type[msgspec.Struct]]]:
+    return [(path, kind) for name, kind in KINDS.items() for path in sorted(GOLDEN.glob(f"{name}_*.json"))]
+
+
+def _form(value: Any) -> Any:
+    """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements."""
+    if isinstance(value, dict):
+        return [(key, _form(one)) for key, one in value.items()]
+    if isinstance(value, list):
+        forms = [_form(one) for one in value]
+        return [form for index, form in enumerate(forms) if form not in forms[:index]]
+    return type(value).__name__
+
+
+def _comparable(path: Path) -> Any:
+    """Return the form of a result, without the names of its inputs."""
+    content = json.loads(path.read_bytes())
+    if "inputs" in content:
+        content["inputs"] = sorted({type(digest).__name__ for digest in content["inputs"].values()})
+    return _form(content)
+
+
+@pytest.mark.parametrize(("path", "kind"), [pytest.param(*pair, id=pair[0].stem) for pair in _kinds_of_files()])
+def test_a_result_that_is_read_and_written_again_is_the_same_byte_for_byte(
+    path: Path, kind: type[msgspec.Struct]
+) -> None:
+    content = path.read_bytes()
+    record = msgspec.json.decode(content, type=kind)
+    assert msgspec.json.format(msgspec.json.encode(record)) + b"\n" == content
+
+
+def test_every_golden_file_has_a_kind_here_or_in_a_test_of_its_own() -> None:
+    others = {"noise.json", "geometry.json"}
+    assert {path.name for path in GOLDEN.iterdir()} - others == {path.name for path, _ in _kinds_of_files()}
+
+
+@pytest.fixture(scope="module")
+def golden_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small set with as many views as the golden one, and a part of its pixels."""
+    folder = tmp_path_factory.mktemp("golden") / "set"
+    assert run([str(word) for word in ("simulate", folder, "--seed", 3, "--size-px", 96, 72)]) == 0
+    return folder
+
+
+@pytest.mark.parametrize("name", FRESH)
+def test_a_fresh_result_has_the_form_of_its_golden_file(
+    name: str, golden_scene: Path, tmp_path: Path, done: Command
+) -> None:
+    file, options = FRESH[name]
+    done("reconstruct", golden_scene, "--out", tmp_path, *options)
+    assert _comparable(tmp_path / file) == _comparable(GOLDEN / f"{name}.json")
