@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from faintfield.calib.board import Board
 from faintfield.calib.detection import BoardCorners, detect_all, detect_boards
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.simulation.boards import standing_board
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import render
+from tests.simulated_boards import standing_board
 
 EXPERIMENT = paper_experiment(1200, 900)
 BOARD = Board("a", 8, 6, 40.0, 29.0, "DICT_5X5_1000", 100)

@@ -13,8 +13,8 @@ from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
-from faintfield.pipelines.simulation.boards import simulate_board_set
 from faintfield.rig.simulation.experiment import paper_experiment
+from tests.simulated_boards import simulate_board_set
 
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(3)]
 

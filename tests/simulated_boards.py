@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board, black_rectangles_mm
-from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.board_set import BoardEntry, BoardSetFile, ImageEntry, write_board_set
 from faintfield.rig.grid import grid_nodes
@@ -78,9 +77,8 @@ def simulate_board_set(
     rows, columns = boards[0].corner_shape
     places = six_boards(rows, columns, boards[0].square_mm)
     nodes = grid_nodes(experiment.rows, experiment.columns)
-    tasks = list(zip(boards, places, strict=False))
     images = []
-    for board, place in progress(tasks, "photographing boards"):
+    for board, place in zip(boards, places, strict=False):
         plane = standing_board(board, place, experiment)
         views = render([plane], experiment.optics, poses_rt_cam_ref, samples_per_px=1)  # blurred: nothing to alias
         for node, view in zip(nodes, views, strict=True):
