@@ -14,11 +14,11 @@ from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
-from faintfield.pipelines.simulation.boards import simulate_board_set
 from faintfield.rig.grid import nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import take_set, write_frames
+from tests.simulated_boards import simulate_board_set
 
 GOLDEN = Path(__file__).parent / "golden"
 BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
