@@ -1,6 +1,7 @@
 """The command line: help, exit codes, and which words go where."""
 
 import json
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -51,7 +52,8 @@ def test_the_help_names_every_command(faintfield: Command) -> None:
 
 def test_the_version_is_printed(faintfield: Command) -> None:
     ended = faintfield("--version")
-    assert (ended.returncode, ended.stdout) == (0, "0.1.0\n")
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    assert (ended.returncode, ended.stdout) == (0, f"{project['version']}\n")
 
 
 @pytest.mark.parametrize(
