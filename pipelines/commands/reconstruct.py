@@ -60,62 +60,62 @@ def reconstruct(
     """Reconstruct planes of the scene at chosen depths.
 
     Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
-    entry in reconstruction.json; report.html shows them all. With several methods each has a folder of its own in OUT.
-    Planes that are there, made of the same files with the same options, stay: a sweep that was cut short goes on.
+    entry in reconstruction.json; report.html shows them all. With several methods, each has its own folder in OUT.
+    Planes that were already made of the same files with the same options are kept, so an interrupted sweep resumes.
 
     Parameters
     ----------
     elemental_set
         A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
-        Folder for the results; planes of the same depth are replaced. For a session, its folder reconstructions by
-        default.
+        Folder for the results; planes of the same depth are replaced. By default, for a session, its folder
+        reconstructions.
     depth_mm
-        Depth of a plane; give it once per plane. auto: the depths at which something stands, found by comparing the
-        views; --sweep-mm or --sweep-px then only say between which depths, otherwise all that the views share.
+        Depth of a plane; repeat it for further planes. auto: find the depths of the objects by comparing the views,
+        in the range of --sweep-mm or --sweep-px if given, else at all depths that the views share.
     sweep_mm
-        FIRST:LAST:COUNT, that many planes in equal steps, with a curve of focus against depth.
+        FIRST:LAST:COUNT: COUNT planes in equal steps of depth, with a curve of focus against depth.
     disparity_px
-        Instead of a depth: by how many pixels a point of the plane moves from one node to the next, right or down;
-        negative for near points, unless the pictures are aligned on a nearer plane.
+        Plane by disparity instead of depth: how many pixels a point of the plane moves from one node to the next, right
+        or down; negative for near points, unless the pictures are aligned on a nearer plane.
     sweep_px
-        FIRST:LAST:COUNT, a sweep in equal steps of disparity instead of depth, such as -3.5:0.8:40.
+        FIRST:LAST:COUNT: a sweep in equal steps of disparity instead of depth, such as -3.5:0.8:40.
     plane_pose
-        TOML file of planes of any pose, each with a name and either rt_ref_plane, or point_mm and normal.
+        TOML file of planes of any pose, each with a name and either rt_ref_plane or point_mm and normal.
     depth_map
-        From the sweep also how far away each pixel is, with the probability of that, and a picture that is sharp
-        everywhere.
+        Also compute, from the sweep, the depth of each pixel, the probability that it is right, and an all-in-focus
+        picture.
     method
-        pmlem (the default; to its optimum, certified), joint and occlusion (the same for all planes together),
-        pmlem-osl and mlem (the paper's iterations), or backprojection; give it once per method.
+        pmlem (the default; iterates to a certified optimum), joint or occlusion (pmlem for all planes together),
+        pmlem-osl or mlem (the iterations of the paper), or backprojection; repeat it for further methods.
     joint
-        Short for --method joint: all planes are found together, so that none holds the blur of what stands in another.
+        Short for --method joint: solve all planes together, so that no plane shows the blur of objects in another.
     occlusion
-        Short for --method occlusion: all planes together, and the nearer ones hide what is behind them.
+        Short for --method occlusion: solve all planes together, with nearer objects hiding farther ones.
     penalty_weight
-        The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
-        predict those held out, for pmlem-osl one from the noise level.
+        β of the paper, in the unit of the number of views. auto: for pmlem, the weight that best predicts held-out
+        views; for pmlem-osl, a weight computed from the noise level.
     penalty
-        What pmlem holds against rough planes: total variation, the same with small differences squared (huber-tv),
-        squared differences (quadratic), or nothing.
+        Penalty of pmlem on differences between neighbouring samples: total variation (tv), total variation with small
+        differences squared (huber-tv), squared differences (quadratic), or none.
     likelihood
-        How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
-        above, which is faster. poisson ignores read noise; least-squares knows no counts.
+        Noise model of a pixel. auto: poisson-gaussian (exact) for read noise below 3 electrons, shifted-poisson
+        (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
     uncertainty
         Save the standard deviation of each sample beside the planes of pmlem and joint; see docs/physics.md for what
         it covers.
     passes
-        At most this many passes over the data.
+        Largest number of passes over the data.
     pitch_mm
-        Distance of the plane's samples; by default one detector pixel of the reference view.
+        Distance between samples of a plane; by default one detector pixel of the reference view.
     geometry
-        geometry.json, or the folder that holds it: its lens and measured poses replace those of the set, by node.
+        geometry.json, or its folder; its lens and measured poses replace those of the set, node by node.
     scene
-        Which of a session's sets: the dark scene, or the bright one.
+        Set of the session to reconstruct: the dark scene or the bright scene.
     workers
-        Have the planes made by so many processes of one thread each; needs the extra faintfield[cluster].
+        Number of processes, of one thread each, that make the planes; needs the extra faintfield[cluster].
     scheduler
-        Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
+        Address of a dask scheduler whose workers make the planes; they must see OUT under the same path.
     """
     runner = make_runner(workers, scheduler)
     selection = select_planes(

@@ -38,31 +38,31 @@ def run(
     lens: LensName = "opencv5",
     limit_px: Positive = 0.5,
 ) -> RunOutcome:
-    """Do everything after the capture: noise, geometry, reconstruction, report; only what is out of date.
+    """Do everything after the capture: noise, geometry, reconstruction, report; skip what is up to date.
 
-    A result is up to date while the files that it was made from, its options and the versions of what made it are
-    those that it names; files are compared by their hashes. What fails leaves the results of the rest in place.
+    A result is up to date while its input files (by hash), its options and the versions of the software are those that
+    it records. If a step fails, the results of the others are kept.
 
     Parameters
     ----------
     session
-        Its folder.
+        Folder of the session.
     depth_mm
-        Depth of a plane; give it once per plane. By default those under [scene] in the rig.toml.
+        Depth of a plane; repeat it for further planes. By default, the depths under [scene] in the rig.toml.
     sweep_mm
-        FIRST:LAST:COUNT, that many planes in equal steps, with a curve of focus against depth.
+        FIRST:LAST:COUNT: COUNT planes in equal steps of depth, with a curve of focus against depth.
     method
-        How planes are reconstructed, as for `reconstruct`; give it once per method.
+        Method of reconstruction, as for `reconstruct`; repeat it for further methods.
     penalty_weight
-        The paper's β; by default pmlem chooses it by cross-validation, pmlem-osl from the noise level.
+        β of the paper; by default pmlem chooses it by cross-validation, pmlem-osl from the noise level.
     passes
-        At most this many passes over the data.
+        Largest number of passes over the data.
     pitch_mm
-        Distance of the plane's samples; by default one detector pixel of the reference view.
+        Distance between samples of a plane; by default one detector pixel of the reference view.
     lens
         Distortion model, as for `geometry`.
     limit_px
-        How well the transfer between views must be known, as for `geometry`.
+        Largest accepted standard deviation of the transfer between views, as for `geometry`.
     """
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
