@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.depth.agreement import Agreement, agreement, bins_for, depth_map
-from faintfield.recon.depth.best_focus import SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.focus import SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator

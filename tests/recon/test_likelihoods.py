@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm, poisson
 
-from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName
-from faintfield.recon.likelihood.pixel_models import WORK_ROWS, form_ratio
-from faintfield.recon.likelihood.selection import read_noise_share, select_likelihood
+from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName, read_noise_share, select_likelihood
+from faintfield.recon.likelihood.pixel_models import WORK_ROWS
+from tests.recon.pixels import form_ratio
 
 SIGMAS_E = [0.3, 1.0, 2.0, 3.46, 7.0]
 

@@ -8,15 +8,15 @@ import pytest
 from scipy.special import gammaln, logsumexp
 from scipy.stats import norm, poisson
 
-from faintfield.recon import elementary
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.likelihood.pixel_models import (
     LEAST_SQUARES,
     POISSON_GAUSSIAN,
     SHIFTED_POISSON,
     WORK_ROWS,
-    form_ratio,
 )
+from faintfield.recon.numba_tools import compiled, exponential, logarithm
+from tests.recon.pixels import form_ratio
 
 PIXELS = 100
 PRECISIONS = [(np.float32, 3e-6), (np.float64, 1e-10)]
@@ -128,8 +128,8 @@ def test_logarithm_and_exponential_are_good_to_the_last_digits(dtype: Any, accur
     np.testing.assert_allclose(logarithms, np.log(powers.astype(float)), rtol=accuracy / 5, atol=accuracy / 10)
 
 
-@elementary.compiled
+@compiled
 def _both(x: Image, powers: Image, logarithms: Image) -> None:
     for k in range(x.size):
-        powers[k] = elementary.exponential(x[k])
-        logarithms[k] = elementary.logarithm(powers[k])
+        powers[k] = exponential(x[k])
+        logarithms[k] = logarithm(powers[k])

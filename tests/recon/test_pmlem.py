@@ -130,18 +130,14 @@ def test_the_objective_never_rises(
 
 def test_a_metric_that_is_too_small_is_made_larger_until_the_objective_falls() -> None:
     posed = problem()
-    fit, start = started(posed)
+    start = smooth_start(posed.operator, posed.images)
 
-    class TooBold:
-        may_reach_zero = True
+    class TooBold(DataFit):
+        def metric(self, samples: Image) -> Image:
+            return super().metric(samples) / 16
 
-        def value_and_gradient(self, plane: Image) -> tuple[float, Image]:
-            return fit.value_and_gradient(plane)
-
-        def metric(self, plane: Image) -> Image:
-            return fit.metric(plane) / 16
-
-    iterates = list(islice(pmlem(TooBold(), start, penalty_weight=WEIGHT, tolerance=1e-4), 60))
+    bold = TooBold(posed.operator, posed.images, float(start.mean()))
+    iterates = list(islice(pmlem(bold, start, penalty_weight=WEIGHT, tolerance=1e-4), 60))
     assert iterates[1].passes > 2  # steps were undone
     assert all(after.objective <= before.objective * (1 + 1e-6) for before, after in pairwise(iterates))
     assert distance(iterates[-1].plane, solved(posed, WEIGHT, Penalty()).plane) < 2e-3
@@ -171,17 +167,13 @@ def test_arguments_out_of_range_are_refused_before_the_first_pass(weight: float,
 
 
 def test_numbers_that_leave_the_finite_are_refused() -> None:
-    class Overflowing:
-        may_reach_zero = True
+    class Overflowing(DataFit):
+        def value_and_gradient(self, samples: Image) -> tuple[float, Image]:
+            return float("nan"), samples
 
-        def value_and_gradient(self, plane: Image) -> tuple[float, Image]:
-            return float("nan"), plane
-
-        def metric(self, plane: Image) -> Image:
-            return np.ones_like(plane)
-
+    posed = problem()
     with pytest.raises(NotConverged, match="pass 1 left the finite numbers"):
-        next(pmlem(Overflowing(), np.ones(SHAPE), penalty_weight=1.0))
+        next(pmlem(Overflowing(posed.operator, posed.images, 1.0), np.ones(SHAPE), penalty_weight=1.0))
 
 
 def test_where_nothing_shines_the_optimum_is_black_and_certain() -> None:

@@ -15,8 +15,8 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.block_layout import BLOCK_PX
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.placement import BLOCK_PX
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 

@@ -17,7 +17,6 @@ from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.one_step_late import (
     Iterate,
     IterationStep,
-    mlem,
     oscillates,
     pmlem_one_step_late,
     settled,
@@ -51,6 +50,10 @@ def drawn(
     counts = generator.poisson(operator.forward(plane) + background_e)
     read_noise = generator.normal(0, np.sqrt(variance_e2), operator.images_shape)
     return ElementalImages(counts + read_noise, background_e, variance_e2)
+
+
+def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
+    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
 
 
 def after(iterates: Iterator[Iterate], passes: int) -> Iterate:

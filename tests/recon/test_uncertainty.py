@@ -6,8 +6,8 @@ import pytest
 from faintfield.pipelines.reconstruction.planes import Objective, Settings, solve, solve_pmlem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
-from faintfield.recon.solver.problem import SceneProblem
 from faintfield.recon.solver.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_cross_validation import dark_views
