@@ -1,4 +1,4 @@
-"""The numbers of the paper, eqs. (4), (6), (7), and Monte Carlo checks of the expectations."""
+"""The paper's numbers from eqs. (4), (6) and (7), and Monte Carlo checks of expectations."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def test_the_papers_camera_sees_3_84_photons_at_snr_0_16_by_its_linear_formula()
     assert 0.5 * photons / READ_NOISE_E**2 == pytest.approx(0.16, rel=1e-12)
 
 
-def test_it_sees_half_as_many_by_moments() -> None:
+def test_by_moments_it_sees_half_as_many_photons() -> None:
     photons = photons_from_moments(0.16, quantum_efficiency=0.5, read_noise_e=READ_NOISE_E)
     mean_e = 0.5 * photons
     assert mean_e**2 + mean_e == pytest.approx(0.16 * 12, rel=1e-12)

@@ -97,7 +97,7 @@ def primal_dual(posed: SceneProblem, weight: float, passes: int) -> Image:
 @pytest.mark.parametrize(
     ("likelihood", "occluded"), [("shifted-poisson", False), ("shifted-poisson", True), ("least-squares", False)]
 )
-def test_planes_together_are_what_a_primal_dual_method_finds(likelihood: LikelihoodName, occluded: bool) -> None:
+def test_planes_solved_together_agree_with_a_primal_dual_method(likelihood: LikelihoodName, occluded: bool) -> None:
     posed = scene(likelihood, occluded=occluded)
     best = primal_dual(posed, WEIGHT, 5000)
     found = solved(posed, WEIGHT).plane
@@ -115,7 +115,7 @@ def test_the_objective_never_rises() -> None:
     assert objectives[-1] < objectives[0] - 10
 
 
-def test_a_scene_of_one_plane_is_that_plane() -> None:
+def test_a_scene_of_one_plane_equals_that_plane() -> None:
     posed = problem()
     plane = posed.operator
     homographies, rays = posed.homographies[np.newaxis], posed.rays
