@@ -69,9 +69,7 @@ def test_the_depth_of_each_half_is_found(halves: list[Agreement]) -> None:
 def test_the_squares_of_agreeing_views_equal_their_degrees_of_freedom(halves: list[Agreement]) -> None:
     plane, inner = halves[NEAR], np.s_[8:-8, 12:36]
     per_freedom = plane.squares[inner].sum() / (plane.sensitivity[inner] - 1).sum()
-    assert (
-        0.75 < per_freedom < 1.1
-    )  # interpolation removes noise, and the variance allows for model error
+    assert 0.75 < per_freedom < 1.1  # interpolation removes noise, and the variance allows for model error
     assert halves[FAR].squares[inner].sum() > 1.5 * plane.squares[inner].sum()
 
 
