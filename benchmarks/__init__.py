@@ -1,1 +1,1 @@
-"""Speed against peers, as ratios measured in one run: `python -m benchmarks`, or `make bench`."""
+"""Speed against other libraries, as ratios within one run: `python -m benchmarks`, or `make bench`."""

@@ -1,6 +1,6 @@
-"""Speed against peers, as ratios within one run: a pass over the data, what it grows with, memory, and solvers.
+"""Speed against other libraries, as ratios within one run: a pass over the data, its scaling, memory, and solvers.
 
-The machine may be busy: times are taken in turns, and reported are medians over rounds.
+The machine may be busy, so contenders run in turns, and medians over rounds are reported.
 """
 
 import argparse
@@ -23,7 +23,7 @@ _MEANING = {
     "pass_s": "one pass over the data: H, ratio, Hᵀ (s)",
     "scipy_csr_over_ours": "scipy CSR matrices over ours",
     "cv2_warp_pair_over_ours": "a pair of OpenCV warps (no lens, no mask, no adjoint) over ours",
-    "scipy_csr_over_ours_computing": "scipy CSR over ours, in computing seconds of all threads together",
+    "scipy_csr_over_ours_computing": "scipy CSR over ours, in CPU seconds of all threads",
     "cv2_warp_pair_over_ours_computing": "a pair of OpenCV warps over ours, likewise",
     "ours_over_reading_the_images": "ours over the floor: reading the images once with all threads",
     "with_likelihood_over_pass": "a pass that also returns the likelihood, as PMLEM's do, over one that does not",
@@ -64,7 +64,7 @@ def measure(size_px: int, solvers_size_px: int, rounds: int) -> dict[str, Any]:
 
 
 def machine() -> str:
-    """Return what the figures were taken on, without naming it."""
+    """Describe the machine, without its name."""
     information = Path("/proc/cpuinfo")
     found = re.search(r"model name\s*:\s*(.*)", information.read_text()) if information.exists() else None
     model = found[1] if found else platform.machine()

@@ -1,4 +1,4 @@
-"""How true the geometry and its stated uncertainty are, over many seeds: `python -m benchmarks.geometry_accuracy`.
+"""How accurate the geometry and its stated uncertainty are, over many seeds: `python -m benchmarks.geometry_accuracy`.
 
 Per seed: 49 nodes with errors of 0.3 mm and 0.2 degrees, six boards, corners with noise of 0.2 px at 1600 x 1200 px.
 """
@@ -36,7 +36,7 @@ _REFERENCE = (3, 3)
 
 
 def boards() -> dict[str, Board]:
-    """Return six A3 boards with markers of their own."""
+    """Return six A3 boards, each with its own markers."""
     columns, rows = _CORNER_COLUMNS + 1, _CORNER_ROWS + 1
     named = [Board(f"b{k}", columns, rows, _SQUARE_MM, 20.0, "DICT_5X5_1000", 75 * k) for k in range(6)]
     return {board.name: board for board in named}
@@ -97,7 +97,7 @@ def per_view_pnp_um(
 ) -> float:
     """Return the error of the centres when each view is solved alone, with the true lens, from its best board.
 
-    The board's place is what the reference view alone says of it.
+    The board's pose comes from the reference view alone.
     """
     optics = experiment.optics
     lens = Lens(optics.size_px, optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, optics.distortion)

@@ -1,4 +1,4 @@
-"""What it costs to record a frame of 24 MB: intent, file, commit. `python -m benchmarks.journal [FOLDER]`."""
+"""Time to record a frame of 24 MB (intent, file, commit): `python -m benchmarks.journal [FOLDER]`."""
 
 import sys
 import tempfile
@@ -24,7 +24,7 @@ SHAPE = (3000, 4000)
 
 
 def main() -> None:
-    """Print the median, the 90 % quantile and the worst of frames given as a file and as an array."""
+    """Print the median, 90 % quantile and maximum of the times of frames given as a file and as an array."""
     settings = RigSettings(
         stage=StageSettings("simulated"),
         camera=SimulatedSettings(),

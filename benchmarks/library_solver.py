@@ -20,8 +20,8 @@ def primal_dual(
 ) -> Iterator[Image] | None:
     """Return iterates of Chambolle and Pock's algorithm for `min L(f) + β TV(f), f ≥ 0`; None without pyproximal.
 
-    The data and the gradient of the plane are two blocks of one linear operator, scaled to norms alike. The ratio of
-    its step lengths, which decides about its speed, is the best that theory knows: ‖f*‖/‖y*‖ of the solution itself.
+    The data and the gradient of the plane are two blocks of one linear operator, scaled to equal norms. The ratio
+    of its step lengths, which determines its speed, is the best in theory: ‖f*‖/‖y*‖ of the solution itself.
     """
     if not (find_spec("pyproximal") and find_spec("pylops")):
         return None
@@ -31,7 +31,7 @@ def primal_dual(
 def _in_thread(
     operator: PlaneOperator, images: ElementalImages, start: Image, weight: float, optimum: Image
 ) -> Iterator[Image]:
-    """Yield what the library hands to its callback; it waits until the iterate before is taken."""
+    """Yield the iterates that the library passes to its callback; it waits until the last one is taken."""
     made: Queue[Image] = Queue(1)
     stopped: list[bool] = []
 

@@ -13,13 +13,13 @@ _MB = 1e6
 
 
 def _peak_mb() -> float:
-    """Return the most this process has held; what `resource` tells begins with the peak of the process before it."""
+    """Return the peak memory of this process; that from `resource` would include the process that started it."""
     found = re.search(r"VmHWM:\s*(\d+) kB", Path("/proc/self/status").read_text())
     return int(found[1]) * 1024 / _MB if found else float("nan")
 
 
 def main() -> None:
-    """Print the peak before and after, and what there was in between beside six planes."""
+    """Print the peak before the passes, and how much they add to it, in all and beyond six planes."""
     problem = BenchmarkProblem.of_size(int(sys.argv[1]))
     before = _peak_mb()
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)

@@ -28,7 +28,7 @@ def take(seed: int, exposures_s: tuple[float, ...] = EXPOSURES_S, frames: int = 
 
 
 def _split(made: tuple[Any, Any], exposures_s: tuple[float, ...], frames: int) -> tuple[Any, Any, int, Any]:
-    """Put a chip and its generator in the order that `darks` takes."""
+    """Return the arguments of `darks` for a chip and its generator."""
     return made[0], exposures_s, frames, made[1]
 
 
@@ -69,10 +69,10 @@ def rough(repeats: int) -> None:
 
 
 def clipped(repeats: int) -> None:
-    """Study values cut off at black."""
+    """Study values clipped at black."""
     for offset_dn in (0.0, 5.0):
         bound = _bound_of_values(12**0.5, floor_dn=0, offset_dn=offset_dn)
-        study(f"cut off at black, offset {offset_dn:g} DN, 64 x 64", repeats, bound, offset_dn=offset_dn)
+        study(f"clipped at black, offset {offset_dn:g} DN, 64 x 64", repeats, bound, offset_dn=offset_dn)
 
 
 def subtle(repeats: int) -> None:
@@ -93,7 +93,7 @@ def _bound_of_values(read_noise_e: float, floor_dn: int | None = None, offset_dn
 
 
 def hot(repeats: int) -> None:
-    """Study which hot pixels are found."""
+    """Study the detection of hot pixels."""
     true = found = both = 0
     for seed in range(max(repeats // 20, 5)):
         chip, rng = specimen(seed, shape=(256, 256), hot_fraction=0.005, dcnu=0.1)
@@ -106,7 +106,7 @@ def hot(repeats: int) -> None:
 
 
 def short(repeats: int) -> None:
-    """Study darks of at most a second, which cannot tell the gain."""
+    """Study darks of at most a second, which do not determine the gain."""
     numbers = 0
     for seed in range(repeats):
         result = calibrate(take(seed, (0.1, 0.3, 1.0), shape=(128, 128)))

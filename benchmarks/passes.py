@@ -1,4 +1,4 @@
-"""One pass over the data, H, ratio and Hᵀ, by us and by peers; what it costs when the problem grows; its memory."""
+"""A pass over the data (H, ratio, Hᵀ) compared with other libraries, its scaling, and its memory."""
 
 import json
 import statistics
@@ -21,8 +21,8 @@ type Run = Callable[[], object]
 
 
 def compare_passes(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
-    """Return how many times longer than ours each peer takes, and how many times ours the reading of the data."""
-    # All matrices are 3 GB and take two minutes to build; what they cost is proportional to the views, within 5 %
+    """Return the time of our pass, that of other libraries relative to it, and its own relative to reading the data."""
+    # The matrices of all views take 3 GB and two minutes to build; their time is proportional to the views within 5 %
     few = np.arange(0, len(problem.poses), 4)
     all_over_few = len(problem.poses) / len(few)
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
@@ -47,7 +47,7 @@ def compare_passes(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
 
 
 def scaling(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
-    """Return how much longer a pass takes with more of something, over what proportion would make of it."""
+    """Return how the time of a pass grows with threads, views, pixels and planes, relative to proportional growth."""
     operator, plane = problem.operator(), np.ones(problem.grid().shape, np.float32)
     single, few = problem.operator(workers=1), np.arange(0, len(problem.poses), 4)
     half = BenchmarkProblem.of_size(problem.lens.size_px[0] // 2)
@@ -72,7 +72,7 @@ def scaling(problem: BenchmarkProblem, rounds: int) -> dict[str, float]:
 def interleaved(
     contenders: Mapping[str, Run], rounds: int, clock: Callable[[], float] = time.perf_counter
 ) -> dict[str, float]:
-    """Return the median seconds of each, run in turns: the machine may be busy, and then is for all of them."""
+    """Return the median seconds of each contender; they run in turns, so that other load affects all of them alike."""
     seconds: dict[str, list[float]] = {name: [] for name in contenders}
     for _ in range(rounds + 1):  # the first round compiles and warms up
         for name, run in contenders.items():
@@ -136,7 +136,7 @@ def warp_pass(problem: BenchmarkProblem) -> Run:
 
 
 def reading(images: NDArray[np.float32]) -> Run:
-    """Return the least that any pass must do: read the images once, with as many threads as the pass has."""
+    """Return the lower bound of any pass: reading the images once, with as many threads as a pass has."""
     parts = np.array_split(images.reshape(-1), int(numba.config.NUMBA_NUM_THREADS))
 
     def run() -> list[float]:
@@ -187,6 +187,6 @@ def _bilinear_matrix(problem: BenchmarkProblem, view: int) -> scipy.sparse.csr_a
 
 
 def memory(size_px: int) -> dict[str, float]:
-    """Return what passes over the data need at most beside them, measured in a process of its own."""
+    """Return the memory that passes over the data need beside them, measured in a separate process."""
     command = [sys.executable, "-m", "benchmarks.memory", str(size_px)]
     return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))

@@ -1,6 +1,6 @@
-"""Which penalty is best: each with the weight that the true picture would choose, on four objects at SNR 0.16.
+"""Compare penalties, each at its best weight for the true picture, on four objects at SNR 0.16.
 
-The paper's claim is that total variation is. Run `python -m benchmarks.penalties`; it prints one JSON object of mean
+The paper claims that total variation is best. Run `python -m benchmarks.penalties`; it prints one JSON object of mean
 square errors, the object scaled to run from 0 to 1.
 """
 
@@ -39,8 +39,8 @@ def pictures() -> dict[str, Image]:
     return scaled
 
 
-def least_errors(picture: Image, seed: int = 1) -> dict[str, float]:
-    """Return the least error of each penalty over the weights."""
+def smallest_errors(picture: Image, seed: int = 1) -> dict[str, float]:
+    """Return the smallest error of each penalty over the weights."""
     generator = np.random.default_rng(seed)
     homographies = np.stack([np.eye(3)] * _VIEWS)
     homographies[:, :2, 2] = generator.uniform(-0.5, 0.5, (_VIEWS, 2))
@@ -71,4 +71,4 @@ def least_errors(picture: Image, seed: int = 1) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    sys.stdout.write(json.dumps({name: least_errors(picture) for name, picture in pictures().items()}) + "\n")
+    sys.stdout.write(json.dumps({name: smallest_errors(picture) for name, picture in pictures().items()}) + "\n")

@@ -1,4 +1,4 @@
-"""The problem that the engine is measured on: the paper's grid, a distorted lens, maps of everything, dark data."""
+"""The benchmark problem: the paper's grid, a distorted lens, maps of every pixel property, dark data."""
 
 from dataclasses import dataclass
 
@@ -17,7 +17,7 @@ DEPTH_MM = 500.0
 
 @dataclass(frozen=True)
 class BenchmarkProblem:
-    """Views of a square detector: each pixel has a response, background and noise of its own, and some are bad."""
+    """Views of a square detector: each pixel has its own response, background and noise, and some are bad."""
 
     lens: Lens
     poses: NDArray[np.float64]
@@ -41,7 +41,7 @@ class BenchmarkProblem:
         return cls(lens, poses[:views], flat, ElementalImages(electrons, background, variance, valid))
 
     def homographies(self, depth_mm: float = DEPTH_MM) -> NDArray[np.float64]:
-        """Return the way from rays to the plane at a depth, (view, 3, 3)."""
+        """Return the homographies (view, 3, 3) from rays to the plane at a depth."""
         return plane_from_ray(self.poses, fronto_parallel_rt_ref_plane(depth_mm))
 
     def grid(self, depth_mm: float = DEPTH_MM) -> PlaneGrid:
@@ -50,7 +50,7 @@ class BenchmarkProblem:
         return PlaneGrid((size_px, size_px), pitch_mm, (-size_px / 2 * pitch_mm, -size_px / 2 * pitch_mm))
 
     def operator(self, workers: int | None = None) -> PlaneOperator:
-        """Return our own H."""
+        """Return H."""
         return PlaneOperator(
             self.homographies(),
             self.lens.rays(),

@@ -1,7 +1,7 @@
-"""Passes and seconds until a plane stays close to the converged one: PMLEM, one-step-late, and a library's solver.
+"""Passes and seconds until the plane stays close to the optimum: PMLEM, one-step-late PMLEM, and a library's solver.
 
 The criterion is that of the PETRIC challenge: the whole plane within 1 % (root of the mean square, relative) and the
-mean of a region within 0.5 % of the converged solution, ten checks in a row; what counts is the first of the ten.
+mean of a region within 0.5 % of the converged solution, ten checks in a row; the first of the ten counts.
 """
 
 import itertools
@@ -20,12 +20,13 @@ from faintfield.recon.solver.initialization import smooth_start, universal_penal
 from faintfield.recon.solver.one_step_late import pmlem_one_step_late
 from faintfield.recon.solver.pmlem import pmlem
 
+# Consecutive checks that must hold, and the time after which a solver is given up.
 _IN_A_ROW = 10
 _LIMIT_S = 15.0
 
 
 def compare_solvers(size_px: int) -> dict[str, float | None]:
-    """Return passes and seconds to the criterion, and how many times longer than PMLEM the others take."""
+    """Return passes and seconds to the criterion, and the time of the others relative to PMLEM."""
     operator, images = _scene(size_px)
     start = smooth_start(operator, images)
     weight = universal_penalty_weight(operator, images, start)
@@ -72,7 +73,7 @@ def _scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
 
 
 def _to_criterion(iterate: Callable[[], Iterable[Image] | None], converged: Image) -> tuple[float | None, float | None]:
-    """Return after how many passes and seconds the criterion holds; None where it does not within the limit."""
+    """Return the passes and seconds until the criterion holds; None if it does not within the limit."""
     planes = iterate()
     if planes is None:
         return None, None

@@ -1,9 +1,9 @@
 """How often the 90 % interval of a sample holds the truth: `python -m benchmarks.uncertainty [SETS]`.
 
 Each set has one object of the demo scene alone, its expected light that of SNR 0.16, in 49 views displaced by up to
-three samples, and noise of its own; half of the sets have the truck and half the airplane. Reconstructed with the
+three samples, with its own noise; half of the sets have the truck and half the airplane. Reconstructed with the
 weight that held-out views choose. Printed as JSON: the share of samples whose interval f ± 1.645 σ holds the truth,
-where the object is, where there is nothing, and of all.
+on the object, beside it, and everywhere.
 """
 
 import json
@@ -32,7 +32,7 @@ def texture(index: int, size_px: tuple[int, int]) -> Image:
 
 
 def covered(truth: Image, seed: int) -> tuple[float, float, float]:
-    """Return the share of samples whose interval holds the truth: on the object, beside it, and of all."""
+    """Return the share of samples whose interval holds the truth: on the object, beside it, and everywhere."""
     generator = np.random.default_rng(seed)
     homographies = np.stack([np.eye(3)] * _VIEWS)
     homographies[:, :2, 2] = generator.uniform(-3, 3, (_VIEWS, 2))

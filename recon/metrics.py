@@ -65,13 +65,11 @@ def noise_variance_e2(
     return light_e + dark_current_e_per_s * exposure_s + read_noise_e**2
 
 
-def snr_linear(photons: float, *, quantum_efficiency: float, read_noise_e: float) -> float:
-    """Return eq. (7), the paper's linear SNR `η Φ_o t / σ²`, for `photons` = Φ_o t per pixel and exposure."""
-    return quantum_efficiency * photons / read_noise_e**2
-
-
 def photons_from_linear_snr(snr: float, *, quantum_efficiency: float, read_noise_e: float) -> float:
-    """Return the photons per pixel from an SNR by eq. (7), as in the paper (3.84 at SNR 0.16)."""
+    """Return the photons per pixel and exposure, Φ_o t, from an SNR by eq. (7), `SNR = η Φ_o t / σ²`, as in the paper.
+
+    It gives 3.84 at SNR 0.16.
+    """
     return snr * read_noise_e**2 / quantum_efficiency
 
 

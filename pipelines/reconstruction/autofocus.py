@@ -11,7 +11,7 @@ from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.depth_map import Compared, compared_depths
 from faintfield.recon.depth.agreement import DepthEstimate
-from faintfield.recon.depth.best_focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus
 
 # Depths of a search; depths around a plane that it found; searches, each in the range in which the last found anything.

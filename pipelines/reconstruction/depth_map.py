@@ -24,7 +24,7 @@ from faintfield.pipelines.reconstruction.channels import channel_layouts, load_c
 from faintfield.pipelines.reconstruction.grids import plane_grid
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
-from faintfield.recon.depth.best_focus import SURE
+from faintfield.recon.depth.focus import SURE
 
 # Fewer depths leave nothing to interpolate between.
 MIN_DEPTHS = 5

@@ -16,7 +16,7 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity, transmission
-from faintfield.recon.solver.problem import SceneProblem
+from faintfield.recon.solver.data_fit import SceneProblem
 
 # Arrays as large as the images that a fit of all planes needs: forward images of ones and of light, and ratios.
 _ARRAYS_OF_IMAGES = 5

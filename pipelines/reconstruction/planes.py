@@ -7,15 +7,15 @@ import numpy as np
 from msgspec import structs
 
 from faintfield.pipelines.formats.results.records import Certificate, Method, PenaltyRecord, SolveRecord, WeightScore
-from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName
-from faintfield.recon.likelihood.selection import select_likelihood
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, select_likelihood
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_weight
+from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import (
     back_projection,
+    mean_light_e,
     smooth_start,
     universal_penalty_weight,
-    well_seen_samples,
 )
 from faintfield.recon.solver.one_step_late import (
     IterationStep,
@@ -26,7 +26,6 @@ from faintfield.recon.solver.one_step_late import (
 )
 from faintfield.recon.solver.penalties import Penalty, PenaltyName, total_variation
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
-from faintfield.recon.solver.problem import SceneProblem
 from faintfield.recon.solver.proximal import DualField
 from faintfield.recon.solver.uncertainty import standard_deviation
 
@@ -114,8 +113,8 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
     if method == "pmlem":
         return solve_pmlem(Objective.of(SceneProblem(operator, images), settings), settings)[0]
     start = smooth_start(operator, images)
-    level_e = float(start[well_seen_samples(operator.sensitivity())].mean(dtype=np.float64))
-    images = replace(images, likelihood=select_likelihood(images, settings.likelihood, level_e))
+    likelihood = select_likelihood(images, settings.likelihood, mean_light_e(operator, start))
+    images = replace(images, likelihood=likelihood)
     return _solve_one_step_late(operator, images, start, method, settings)
 
 
@@ -144,7 +143,7 @@ class Objective:
     def of(cls, posed: SceneProblem, settings: Settings) -> "Objective":
         """Choose likelihood and penalty according to the settings, the light and the noise."""
         start = posed.start()
-        level_e = posed.level_e(start)
+        level_e = mean_light_e(posed.operator, start)
         likelihood = select_likelihood(posed.images, settings.likelihood, level_e)
         posed = replace(posed, images=replace(posed.images, likelihood=likelihood))
 
@@ -182,12 +181,12 @@ def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
         penalty=PenaltyRecord(penalty.name, penalty.smoothing_e),
         likelihood=posed.images.likelihood.name,
     )
-    planes = posed.planes_of(iterate.plane)
+    planes = posed.operator.planes_of(iterate.plane)
     solutions = [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
     if not settings.uncertainty:
         return solutions
     generator = np.random.default_rng(_SEED)
-    metrics = posed.metrics(level_e, iterate.plane)
+    metrics = posed.fit(level_e).metric_of_each(iterate.plane)
     sigmas = [
         standard_deviation(p, metric, choice.weight, penalty, generator)
         for p, metric in zip(planes, metrics, strict=True)
@@ -228,11 +227,11 @@ def _choose_weight(posed: SceneProblem, start: Image, penalty: Penalty, settings
         return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
         return _Choice(settings.penalty_weight, "given", start, posed.dual())
-    guess = posed.usual_weight(start)
-    if len(posed.views) < MIN_VIEWS:
+    guess = universal_penalty_weight(posed.operator, posed.images, start)
+    if len(posed.operator.seeing_views) < MIN_VIEWS:
         return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
     found = cross_validated_weight(posed, guess, penalty)
-    curve = [WeightScore(tried.weight, tried.loss) for tried in found.candidates]
+    curve = [WeightScore(weight, loss) for weight, loss in found.candidates.items()]
     nearest = np.maximum(found.solution.plane, 1e-3 * start)
     return _Choice(found.weight, "predicts held-out views best", nearest, found.solution.dual, found.passes, curve)
 

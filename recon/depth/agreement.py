@@ -93,17 +93,18 @@ def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
     """
     f = back_projection(operator, images)
     seen, smooth = operator.forward(f), operator.forward(np.maximum(blurred(f, _WINDOW), 0))
-    known_e2 = _of_views(operator, images.background_e) + _of_views(operator, images.read_variance_e2)
-    variance = smooth + known_e2 + (_MODEL_ERROR * smooth) ** 2
+    background_e, read_variance_e2 = (
+        operator.map_of_views(value, operator.all_views) for value in (images.background_e, images.read_variance_e2)
+    )
+    variance = smooth + (background_e + read_variance_e2) + (_MODEL_ERROR * smooth) ** 2
     np.maximum(variance, 1e-6, out=variance)
     squares = images.electrons - seen
-    squares -= _of_views(operator, images.background_e)
+    squares -= background_e
     np.square(squares, out=squares)
     squares /= variance
     np.minimum(squares, _MAX_SQUARES, out=squares)
-    sensitivity = operator.sensitivity()
     light_variance = operator.adjoint(variance) / np.maximum(operator.coverage(), 1e-6) ** 2
-    return Agreement(operator.adjoint(squares), sensitivity, f, light_variance)
+    return Agreement(operator.adjoint(squares), operator.sensitivity(), f, light_variance)
 
 
 def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> DepthEstimate:
@@ -125,13 +126,6 @@ def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> Depth
     within = (best > 0) & (best < len(planes) - 1)  # the most likely depth may lie beyond the sweep
     confidence[~(within & comparable & _lit(planes, best))] = 0
     return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
-
-
-def _of_views(operator: SceneOperator, value: float | Image) -> float | Image:
-    """Return a number, or a map (lattice, row, column), for all views."""
-    if np.ndim(value) == 0:
-        return float(value)
-    return np.asarray(np.broadcast_to(value, operator.maps_shape))[operator.lattice_of_view]
 
 
 def _evidence(planes: list[Agreement]) -> tuple[Image, NDArray[np.bool_]]:

@@ -1,4 +1,4 @@
-"""A focus measure that noise does not bias, and the depths at which it peaks."""
+"""Depths in focus: those where detail peaks, and those where much of the picture lies by the views' agreement."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.depth.agreement import Agreement, DepthEstimate
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.smoothing import blurred
@@ -15,8 +16,19 @@ from faintfield.recon.solver.initialization import back_projection
 _FINE = (1, 1)
 _COARSE = (1, 1, 1, 1, 2, 2, 2, 4)
 
-# Smallest prominence of a peak, relative to the range of the curve and in standard deviations of the noise.
+# Smallest prominence of a peak: relative to the range of a focus curve or to the highest peak of a distribution over
+# depth, and in standard deviations of a focus curve's noise.
 _MIN_PROMINENCE, _MIN_SIGMAS = 0.1, 5.0
+
+# Smallest probability of a sample's depth for the sample to count.
+SURE = 0.9
+
+# Fewest samples of a plane: a number, and a fraction of the sure samples.
+MIN_SAMPLES = 12
+_MIN_SHARE = 0.02
+
+# Largest distance of a plane's samples from it, in steps of the sweep.
+_REACH = 1.5
 
 # Correlated samples of a product of two smoothed noises: 2π times the fine scale squared.
 _CORRELATED_SAMPLES = 2 * np.pi
@@ -69,6 +81,54 @@ def sharp_depths_mm(depths_mm: Sequence[float], curve: Sequence[FocusMeasure]) -
     threshold = max(_MIN_PROMINENCE * float(np.ptp(detail)), _MIN_SIGMAS * noise_e2)
     peaks = [index for index in range(len(detail)) if prominence(detail, index) > threshold]
     return [_vertex(depth, detail, peak) for peak in peaks]
+
+
+def places_of_focus(found: DepthEstimate, planes: int) -> list[NDArray[np.bool_]]:
+    """Return the samples (row, column) of each depth at which much of the picture lies, in the order of depths.
+
+    These are the peaks of the sure samples' distribution over depth that stand out by a tenth of the highest and hold
+    at least one in fifty of these samples. There are none if fewer than `MIN_SAMPLES` samples are sure.
+
+    Parameters
+    ----------
+    found : DepthEstimate
+        Depths from a sweep.
+    planes : int
+        Number of planes of the sweep.
+    """
+    sure = found.confidence >= SURE
+    if np.count_nonzero(sure) < MIN_SAMPLES:
+        return []
+    counts = np.convolve(np.bincount(np.rint(found.index[sure]).astype(int), minlength=planes), (0.25, 0.5, 0.25))[1:-1]
+    fewest = max(MIN_SAMPLES, _MIN_SHARE * np.count_nonzero(sure))
+    peaks = [peak for peak in range(planes) if prominence(counts, peak) > _MIN_PROMINENCE * counts.max()]
+    places = [sure & (np.abs(found.index - peak) <= _REACH) for peak in peaks]
+    return [place for place in places if np.count_nonzero(place) >= fewest]
+
+
+def likeliest_depth_mm(planes: Sequence[Agreement], depths_mm: Sequence[float], place: NDArray[np.bool_]) -> float:
+    """Return the depth at which the views agree best on all samples of a place, by a parabola between depths.
+
+    Parameters
+    ----------
+    planes : sequence of Agreement
+        Agreement at each depth, on samples of the same angular pitch.
+    depths_mm : sequence of float
+        The depths, in equal steps of 1/depth.
+    place : bool array (row, column)
+        The samples.
+    """
+    squares = np.array([plane.squares[place].sum(dtype=np.float64) for plane in planes])
+    degrees = np.array([(plane.sensitivity[place] - 1).sum(dtype=np.float64) for plane in planes])
+    reduced = squares / np.maximum(degrees, 1e-9)
+    inverse = 1 / np.asarray(depths_mm)
+    best = int(reduced.argmin())
+    if not 0 < best < len(planes) - 1:
+        return float(depths_mm[best])
+    before, here, after = reduced[best - 1 : best + 2]
+    bend = before - 2 * here + after
+    offset = 0.5 * (before - after) / bend if bend > 0 else 0.0
+    return float(1 / (inverse[best] + offset * (inverse[best + 1] - inverse[best])))
 
 
 def prominence(curve: NDArray[np.floating], peak: int) -> float:

@@ -13,12 +13,11 @@ negative log-likelihood with respect to (H f) is 1 − r, and that negative log-
 
 import numpy as np
 
-from faintfield.recon.elementary import compiled, exponential, logarithm
-from faintfield.recon.pointers import advanced, index, pointer
+from faintfield.recon.numba_tools import advanced, compiled, exponential, index, logarithm
 
 SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES = 0, 1, 2
 
-# Rows of the workspace that `form_ratio` needs, each of a block's length.
+# Rows of scratch that `form_ratio_of_block` needs, each of a block's length.
 WORK_ROWS = 8
 
 # Smallest variance of the read noise (0.03 electrons): less makes no difference, and would overflow.
@@ -36,41 +35,28 @@ _NEWTON_STEPS = 6
 
 
 @compiled
-def form_ratio(model, expected, observed, background, variance, response, level, work):
+def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work, with_value):
     """Replace H f of some pixels by the ratio; return their negative log-likelihood.
 
     Parameters
     ----------
     model : int
         One of the constants above.
-    expected : array (pixel,)
+    count : int
+        Number of pixels.
+    expected : pointer
         H f on entry, the ratio on return.
-    observed, background, variance : array (pixel,)
-        g, b and σ².
-    response : array (pixel,)
+    observed, background, variance : pointer
+        g, b and σ² of each pixel.
+    response : pointer
         Relative response; a pixel of response zero does not count, and its ratio is meaningless.
     level : number
         Expected light of a pixel of response one, for the variance of least squares.
-    work : array (WORK_ROWS, pixels or more)
-        Scratch.
+    work : pointer
+        Scratch, `WORK_ROWS` rows of `count` numbers.
+    with_value : bool
+        False if the value is not needed; it is then left out where that saves time.
     """
-    return form_ratio_of_block(
-        model,
-        index(expected.size),
-        pointer(expected),
-        pointer(observed),
-        pointer(background),
-        pointer(variance),
-        pointer(response),
-        level,
-        pointer(work),
-        True,
-    )
-
-
-@compiled
-def form_ratio_of_block(model, count, expected, observed, background, variance, response, level, work, with_value):
-    """Do what `form_ratio` does, with pointers to `count` numbers each; without the value where that saves time."""
     if model == POISSON_GAUSSIAN:
         return _poisson_gaussian(count, expected, observed, background, variance, response, work)
     if model == LEAST_SQUARES:
@@ -209,9 +195,8 @@ def _log_factorial_over_power(n, mean):
     at_least_one = max(n, one)
     inverse = one / at_least_one
     square = inverse * inverse
-    series = inverse * (
-        number(1 / 12) - square * (number(1 / 360) - square * (number(1 / 1260) - square / number(1680)))
-    )
+    series = number(1 / 360) - square * (number(1 / 1260) - square / number(1680))
+    series = inverse * (number(1 / 12) - square * series)
     series = number(0.08106146679532726) if n == one else series
     root = number(0.5) * logarithm(number(2 * np.pi) * at_least_one)
     return n * logarithm(at_least_one / mean) - n + root + series if n > number(0) else number(0)

@@ -15,19 +15,28 @@ done pixel by pixel.
 All arrays are flat and indexed with offsets: making a slice per block would cost more than the block's arithmetic.
 """
 
-from faintfield.recon.elementary import compiled, inlined
-from faintfield.recon.operator.block_layout import (
+import numpy as np
+
+from faintfield.recon.numba_tools import advanced, compiled, index, inlined, prefetch
+from faintfield.recon.operator.placement import (
     BLOCK_PX,
+    COLUMN,
     COUNTED,
     EXPECTED,
+    IN_STEP_2_2,
+    IN_STEP_2_3,
+    IN_STEP_3_3,
+    MARGIN,
+    OUTSIDE,
+    PRODUCT_PX,
+    PRODUCTS,
+    ROW,
     ROW_TAPS,
+    SCATTERED,
     WEIGHT,
     place_of,
     weights_of,
 )
-from faintfield.recon.operator.interpolation import gather_in_step, gather_scattered, scatter_in_step, scatter_scattered
-from faintfield.recon.operator.placement import OUTSIDE, SCATTERED
-from faintfield.recon.pointers import index, prefetch
 
 # Numbers per cache line of 64 bytes in float32.
 _LINE_PX = 16
@@ -98,3 +107,153 @@ def copy(source, at, target, to, count):
     """Copy `count` numbers from an offset of one array to an offset of another."""
     for k in range(count):
         target[to + k] = source[at + k]
+
+
+@compiled
+def gather_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Interpolate with as few taps as the block needs; each number of taps is compiled separately."""
+    samples = advanced(samples, index(start))
+    if how == IN_STEP_2_2:
+        _gather_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == IN_STEP_2_3:
+        _gather_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == IN_STEP_3_3:
+        _gather_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _gather_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+
+
+@compiled
+def scatter_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
+    """Scatter with the taps of `gather_in_step`."""
+    samples = advanced(samples, index(start))
+    if how == IN_STEP_2_2:
+        _scatter_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+    elif how == IN_STEP_2_3:
+        _scatter_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+    elif how == IN_STEP_3_3:
+        _scatter_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+    else:
+        _scatter_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+
+
+@inlined
+def _tent(distance):
+    height = type(distance)(1) - abs(distance)
+    return height if height > type(distance)(0) else type(distance)(0)
+
+
+@inlined
+def _row_weights(down, rows):
+    """Return the tent weights of the rows, which sum to one."""
+    number = type(down)
+    zero, one = number(0), number(1)
+    if rows == 2:
+        return one - down, down, zero
+    upper = one - down if down < one else zero
+    lower = down - one if down > one else zero
+    return upper, one - upper - lower, lower
+
+
+@inlined
+def _gather_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
+    """Add to `EXPECTED` what the block's pixels see: the plane, interpolated bilinearly, times the weight."""
+    number = type(scratch[0])
+    row, column = number(row_from), number(column_from)
+    across, down = advanced(scratch, place + index(COLUMN)), advanced(scratch, place + index(ROW))
+    weights = advanced(scratch, place + index(WEIGHT))
+    for k in range(index(BLOCK_PX)):
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        seen = u0 * _along_row(columns, along, samples, k)
+        seen += u1 * _along_row(columns, along, samples, index(stride) + k)
+        if rows > 2:
+            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + k)
+        scratch[index(EXPECTED) + k] += weights[k] * seen
+
+
+@inlined
+def _along_row(columns, along, samples, at):
+    """Return the value of a row of the plane, interpolated along it."""
+    number = type(along)
+    if columns == 2:
+        return samples[at] + along * (samples[at + index(1)] - samples[at])
+    seen = _tent(along) * samples[at] + _tent(along - number(1)) * samples[at + index(1)]
+    seen += _tent(along - number(2)) * samples[at + index(2)]
+    if columns > 3:
+        seen += _tent(along - number(3)) * samples[at + index(3)]
+    return seen
+
+
+@inlined
+def _scatter_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
+    """Add `EXPECTED` to the plane with the weights that `_gather_taps` reads it with.
+
+    The products of all taps are formed first and then added, shifted, once per row of samples: the processor would
+    have to wait for stores that overlap with loads soon after. A pixel that does not count may hold anything, even NaN.
+    """
+    number = type(scratch[0])
+    row, column, zero = number(row_from), number(column_from), number(0)
+    across, down = advanced(scratch, place + index(COLUMN)), advanced(scratch, place + index(ROW))
+    weights = advanced(scratch, place + index(WEIGHT))
+    size = index(PRODUCT_PX)
+    upper = advanced(scratch, index(PRODUCTS))
+    middle, lower = advanced(upper, index(columns) * size), advanced(upper, index(2 * columns) * size)
+    for k in range(index(BLOCK_PX)):
+        value = weights[k] * scratch[index(EXPECTED) + k] if weights[k] != zero else zero
+        along = across[k] - column
+        u0, u1, u2 = _row_weights(down[k] - row, rows)
+        for tap in range(columns):
+            share = value * _tent(along - number(tap))
+            upper[index(tap) * size + k] = u0 * share
+            middle[index(tap) * size + k] = u1 * share
+            if rows > 2:
+                lower[index(tap) * size + k] = u2 * share
+    for r in range(rows):
+        products, target = advanced(upper, index(r * columns) * size), advanced(samples, index(r * stride))
+        for k in range(index(BLOCK_PX + MARGIN)):
+            added = products[k]
+            for tap in range(1, columns):
+                added += products[index(tap) * (size - index(1)) + k]
+            target[k] += added
+
+
+@inlined
+def _corner(scratch, place, k, start, height, stride):
+    """Return the upper left of the four samples around a pixel's point, and the point's distances down and right."""
+    number = type(scratch[0])
+    column = scratch[place + index(COLUMN) + k] + number(np.int32(k))
+    row = scratch[place + index(ROW) + k]
+    left, upper = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
+    return index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
+
+
+@compiled
+def gather_scattered(samples, start, height, stride, scratch, place):
+    """Add to `EXPECTED` what the block's pixels see, pixel by pixel."""
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(WEIGHT) + k]
+        if weight != zero:
+            at, down, right = _corner(scratch, place, k, start, height, stride)
+            upper, lower = samples[at], samples[at + below]
+            upper += right * (samples[at + one] - upper)
+            lower += right * (samples[at + below + one] - lower)
+            scratch[index(EXPECTED) + k] += weight * (upper + down * (lower - upper))
+
+
+@compiled
+def scatter_scattered(samples, start, height, stride, scratch, place):
+    """Add `EXPECTED` to the plane with the same weights, pixel by pixel."""
+    zero, one, below = type(scratch[0])(0), index(1), index(stride)
+    for k in range(index(BLOCK_PX)):
+        weight = scratch[place + index(WEIGHT) + k]
+        if weight != zero:
+            at, down, right = _corner(scratch, place, k, start, height, stride)
+            value = weight * scratch[index(EXPECTED) + k]
+            lower = value * down
+            upper = value - lower
+            samples[at] += upper - upper * right
+            samples[at + one] += upper * right
+            samples[at + below] += lower - lower * right
+            samples[at + below + one] += lower * right

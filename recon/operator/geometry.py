@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.operator.block_layout import BLOCK_PX
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
+from faintfield.recon.operator.placement import BLOCK_PX
 
 
 def scene_geometry(
@@ -39,82 +39,59 @@ def scene_geometry(
     flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     transmission = np.zeros((0, 0, 0, 0), dtype) if transmission is None else np.ascontiguousarray(transmission, dtype)
-    _check_pixels(flat, valid, transmission, (planes, views, lattices, *detector))
-    lattice_of_view = _checked_lattices(lattice_of_view, views, lattices)
-    _check_finite(plane_from_ray, rays, flat, transmission)
+    lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
+    _check_shapes(flat, valid, transmission, lattice_of_view, (planes, views, lattices, *detector))
+    _check_numbers(plane_from_ray, rays, flat, transmission)
+    rows, columns = (int(size) for size in detector)
+    padded = -(-columns // BLOCK_PX) * BLOCK_PX
+    maps = np.full((3, lattices, rows, padded), np.nan, dtype)
+    maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
+    homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
+    starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
     return SceneGeometry(
-        _homographies(plane_from_ray, grids, dtype),
-        _layout(grids),
+        np.ascontiguousarray(homographies, dtype).reshape(-1),
+        np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp),
         lattice_of_view,
-        (int(detector[0]), int(detector[1]), _padded(detector[1])),
-        _maps(rays, flat, dtype),
+        (rows, columns, padded),
+        maps.reshape(-1),
         valid.reshape(-1).view(np.uint8),
         transmission.reshape(-1),
-        np.broadcast_to(np.array([0, _padded(detector[1])], np.intp), (views, int(detector[0]), 2)).copy(),
+        np.tile(np.array([0, padded], np.intp), (views, rows, 1)),
     )
 
 
-def _check_finite(*parts: NDArray[Any]) -> None:
-    """Refuse numbers that are not finite."""
-    if not all(np.isfinite(part).all() for part in parts):
+def _check_shapes(
+    flat: NDArray[Any],
+    valid: NDArray[Any],
+    transmission: NDArray[Any],
+    lattice_of_view: NDArray[np.intp],
+    sizes: tuple[int, int, int, int, int],
+) -> None:
+    """Refuse maps of pixels of the wrong shape, and lattices that do not exist."""
+    planes, views, lattices, *detector = sizes
+    shapes = {"valid": (valid, (views, *detector)), "transmission": (transmission, (planes, views, *detector))}
+    for name, (part, shape) in shapes.items():
+        if part.size and part.shape != shape:
+            raise GeometryMismatch(f"{name} has shape {part.shape}, the pixels {shape}; give it that shape")
+    if flat.shape not in ((1, *detector), (lattices, *detector)):
         raise GeometryMismatch(
-            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
+            f"flat {flat.shape} does not fit rays {(lattices, *detector, 2)}; give one per lattice, or one"
         )
-
-
-def _padded(columns: int) -> int:
-    """Return the columns of whole blocks."""
-    return -(-columns // BLOCK_PX) * BLOCK_PX
-
-
-def _homographies(plane_from_ray: NDArray[Any], grids: Sequence[PlaneGrid], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return the homographies from rays to sample indices (plane × view × 9,)."""
-    homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
-    return np.ascontiguousarray(homographies, dtype).reshape(-1)
-
-
-def _layout(grids: Sequence[PlaneGrid]) -> NDArray[np.intp]:
-    """Return the first sample, rows and columns of each plane (plane, 3)."""
-    starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
-    return np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp)
-
-
-def _maps(rays: NDArray[Any], flat: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return rays and response, padded to whole blocks (3 × lattice × row × padded column,)."""
-    lattices, rows, columns = rays.shape[:3]
-    maps = np.full((3, lattices, rows, _padded(columns)), np.nan, dtype)
-    maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
-    return maps.reshape(-1)
-
-
-def _checked_lattices(lattice_of_view: NDArray[np.intp] | None, views: int, lattices: int) -> NDArray[np.intp]:
-    """Return the lattice of each view (view,), and refuse lattices that do not exist."""
-    lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(
             f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} "
             "lattices, counted from 0"
         )
-    return lattice_of_view
 
 
-def _check_pixels(
-    flat: NDArray[Any], valid: NDArray[Any], transmission: NDArray[Any], sizes: tuple[int, int, int, int, int]
+def _check_numbers(
+    plane_from_ray: NDArray[Any], rays: NDArray[Any], flat: NDArray[Any], transmission: NDArray[Any]
 ) -> None:
-    """Refuse maps of pixels of the wrong shape or sign."""
-    planes, views, lattices, *detector = sizes
-    if valid.size and valid.shape != (views, *detector):
-        raise GeometryMismatch(f"valid has shape {valid.shape}, the views {(views, *detector)}; give it that shape")
-    if transmission.size and transmission.shape != (planes, views, *detector):
+    """Refuse numbers that are not finite, and negative light."""
+    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat, transmission)):
         raise GeometryMismatch(
-            f"transmission has shape {transmission.shape}, the planes' views {(planes, views, *detector)}; "
-            "give it that shape"
+            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
         )
-    if flat.shape not in ((1, *detector), (lattices, *detector)):
-        raise GeometryMismatch(
-            f"flat {flat.shape} does not fit rays {(lattices, *detector, 2)}; give one per lattice, or one"
-        )
-    if (flat < 0).any():
-        raise GeometryMismatch(f"the flat field is negative somewhere, {flat.min():.3g} at least; measure it again")
-    if (transmission < 0).any():
-        raise GeometryMismatch(f"a transmission is negative, {transmission.min():.3g}; it must not be below zero")
+    for name, part in (("flat field", flat), ("transmission", transmission)):
+        if (part < 0).any():
+            raise GeometryMismatch(f"the {name} is negative somewhere, {part.min():.3g} at least; measure it again")

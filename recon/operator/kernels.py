@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.elementary import compiled
 from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
-from faintfield.recon.operator.block_layout import BLOCK_PX, COUNTED, EXPECTED, weights_of
+from faintfield.recon.numba_tools import advanced, compiled, index, pointer, prefetch
 from faintfield.recon.operator.blocks import copy, gather, prefetch_block, scatter, weigh
-from faintfield.recon.operator.placement import locate_on_all
-from faintfield.recon.pointers import advanced, index, pointer, prefetch
+from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, weights_of
 
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
@@ -113,11 +111,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     scratch, blocks, layout = pointer(space.scratch), pointer(space.blocks), pointer(geometry.layout)
     expected, models = scratch, pointer(space.models)
     counted = advanced(scratch, index(COUNTED) if count_of_planes > 1 else weights_of(index(0)))
-    homographies, maps, layer = (
-        pointer(geometry.homographies),
-        pointer(geometry.maps),
-        index(geometry.maps.size // 3),
-    )
+    homographies, maps, layer = pointer(geometry.homographies), pointer(geometry.maps), index(geometry.maps.size // 3)
     planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
     background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
     valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.block_layout import make_workspace
 from faintfield.recon.operator.geometry import scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.placement import make_workspace
 from faintfield.recon.threads import run_in_threads
 
 type ViewSelection = Sequence[int] | NDArray[np.integer] | None
@@ -99,12 +99,14 @@ class SceneOperator:
         seen = np.zeros((len(chosen), *self.images_shape[1:]), self.dtype)
         image_of_view = np.zeros(self.images_shape[0], np.intp)
         image_of_view[chosen] = np.arange(len(chosen))
-        self._sweep(kernels.FORWARD, chosen, image_of_view, samples=self._flat(samples), seen=seen)
+        samples = self._checked("samples", samples, self.samples_shape)
+        self._sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=seen)
         return seen
 
     def adjoint(self, images: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images (view, row, column), summed over `views`."""
-        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=self._images(images))[1]
+        images = self._checked("images", images, self.images_shape)
+        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images)[1]
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
@@ -172,7 +174,7 @@ class SceneOperator:
 
     def map_of_views(self, value: float | Image, views: NDArray[np.intp]) -> float | Image:
         """Return a map (lattice, row, column) as each view has it, (view, row, column); a number as it is."""
-        return value if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
+        return float(value) if np.ndim(value) == 0 else self._map(value)[self.lattice_of_view[views]]
 
     def _check_seen(self) -> None:
         """Refuse planes that no pixel sees."""
@@ -197,8 +199,11 @@ class SceneOperator:
             _read_only(self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0)),
             likelihood.level_e,
         )
-        flat, electrons, chosen = self._flat(samples), self._images(images.electrons), self._views(views)
-        return self._sweep(operation, chosen, self.all_views, samples=flat, images=electrons, pixels=pixels)
+        samples = self._checked("samples", samples, self.samples_shape)
+        electrons = self._checked("images", images.electrons, self.images_shape)
+        return self._sweep(
+            operation, self._views(views), self.all_views, samples=samples, images=electrons, pixels=pixels
+        )
 
     def _sweep(
         self,
@@ -229,20 +234,11 @@ class SceneOperator:
             sums[0] += other
         return sum(values), sums[0].reshape(self.samples_shape) if scatters else sums[0]
 
-    def _flat(self, samples: Image) -> Image:
-        """Return samples (sample,) in the operator's dtype, copied only where they have to be."""
-        if samples.shape != self.samples_shape:
-            raise GeometryMismatch(
-                f"samples have shape {samples.shape}, the operator {self.samples_shape}; give samples of that shape"
-            )
-        return np.ascontiguousarray(samples, self.dtype).reshape(-1)
-
-    def _images(self, images: Image) -> Image:
-        if images.shape != self.images_shape:
-            raise GeometryMismatch(
-                f"images have shape {images.shape}, the operator {self.images_shape}; give images of that shape"
-            )
-        return np.ascontiguousarray(images, self.dtype)
+    def _checked(self, name: str, array: Image, shape: tuple[int, ...]) -> Image:
+        """Return samples or images in the operator's dtype, copied only where they have to be."""
+        if array.shape != shape:
+            raise GeometryMismatch(f"{name} have shape {array.shape}, the operator {shape}; give {name} of that shape")
+        return np.ascontiguousarray(array, self.dtype)
 
     def _map(self, value: float | Image) -> Image:
         try:

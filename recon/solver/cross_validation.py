@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
-from faintfield.recon.solver.problem import SceneProblem
 
 # Largest number of folds; each leaves out one view in as many.
 MAX_FOLDS = 7
@@ -27,22 +28,6 @@ _TOLERANCE, _MAX_PASSES = 0.02, 4
 
 
 @dataclass(frozen=True)
-class ScoredWeight:
-    """A weight that was tried.
-
-    Attributes
-    ----------
-    weight : float
-        β for all views.
-    loss : float
-        Negative log-likelihood of the validation views under the plane from the other views, summed over the folds.
-    """
-
-    weight: float
-    loss: float
-
-
-@dataclass(frozen=True)
 class CrossValidatedWeight:
     """The weight that predicts best.
 
@@ -50,8 +35,9 @@ class CrossValidatedWeight:
     ----------
     weight : float
         β for all views: the minimum of a parabola through the best candidates.
-    candidates : tuple of ScoredWeight
-        All weights that were tried, in ascending order.
+    candidates : dict of float to float
+        The weights that were tried, in ascending order, each with its loss: the negative log-likelihood of the
+        validation views under the plane from the other views, summed over the folds.
     passes : float
         Passes over all the data that the search took; passes over some of the views count in proportion.
     solution : PmlemIterate
@@ -59,7 +45,7 @@ class CrossValidatedWeight:
     """
 
     weight: float
-    candidates: tuple[ScoredWeight, ...]
+    candidates: dict[float, float]
     passes: float
     solution: PmlemIterate
 
@@ -106,38 +92,37 @@ def cross_validated_weight(problem: SceneProblem, guess: float, penalty: Penalty
     The data's part of the objective grows with the number of views n, and its noise with √n. A weight that balances
     that noise is therefore scaled by the ratio of the roots, from the training views to all views.
     """
-    search = _Search(_needed_folds(problem, penalty), guess)
-    step = 1
-    search.score(step)
-    while step > -_MAX_STEPS and search.best() <= step + 1:
-        step -= 1
-        search.score(step)
-    step = max(search.losses)
-    while step < _MAX_STEPS and search.best() == step:
-        step += 1
-        search.score(step)
-    return search.result()
+    folds = _needed_folds(problem, penalty)
+    losses = _losses(folds, guess)
+    best = min(losses, key=losses.__getitem__)
+    offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
+    candidates = {guess * _CANDIDATE_RATIO**step: loss for step, loss in sorted(losses.items())}
+    passes = sum(fold.passes for fold in folds)
+    weight = guess * _CANDIDATE_RATIO ** (best + offset)
+    return CrossValidatedWeight(weight, candidates, passes, folds[0].solutions[best])
 
 
 def _needed_folds(problem: SceneProblem, penalty: Penalty) -> list["_Fold"]:
     """Return as many folds as it takes to predict `MIN_SCORED_PIXELS`."""
-    count = len(problem.views)
+    views = problem.operator.seeing_views
+    count = len(views)
     if count < MIN_VIEWS:
         raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {count}")
     pixels_per_fold = problem.images.electrons[0].size * count / _folds(count)
     needed = min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
-    return [_Fold(problem, penalty, problem.views[validation_views(count, fold)]) for fold in range(needed)]
+    return [_Fold(problem, penalty, views[validation_views(count, fold)]) for fold in range(needed)]
 
 
 class _Fold:
     """A division into training and validation views, and the solutions so far."""
 
     def __init__(self, problem: SceneProblem, penalty: Penalty, validation: NDArray[np.intp]) -> None:
-        training = np.setdiff1d(problem.views, validation)
+        views = problem.operator.seeing_views
+        training = np.setdiff1d(views, validation)
         self._start = problem.start(training)
-        self._fit = problem.fit(problem.level_e(self._start), training)
+        self._fit = problem.fit(mean_light_e(problem.operator, self._start), training)
         self._problem, self._validation, self._penalty = problem, validation, penalty
-        self._share = len(training) / len(problem.views)
+        self._share = len(training) / len(views)
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
 
@@ -157,39 +142,33 @@ class _Fold:
                 break
         self.solutions[step] = iterate
         self.passes += iterate.passes * self._share + (1 - self._share)
-        return self._problem.value(iterate.plane, self._validation)
+        problem = self._problem
+        return problem.operator.negative_log_likelihood(iterate.plane, problem.images, self._validation)
 
 
-class _Search:
-    """Candidates β = guess · ratioⁿ and their losses."""
+def _losses(folds: list[_Fold], guess: float) -> dict[int, float]:
+    """Return the loss of each candidate `guess · ratioⁿ` that was tried, by n."""
+    losses: dict[int, float] = {}
 
-    def __init__(self, folds: list[_Fold], guess: float) -> None:
-        self._folds, self._guess = folds, guess
-        self.losses: dict[int, float] = {}
+    def best() -> int:
+        return min(losses, key=losses.__getitem__)
 
-    def score(self, step: int) -> None:
-        """Try the candidate of a step."""
-        weight = self._guess * _CANDIDATE_RATIO**step
-        self.losses[step] = sum(fold.score(step, weight) for fold in self._folds)
+    def score(step: int) -> None:
+        losses[step] = sum(fold.score(step, guess * _CANDIDATE_RATIO**step) for fold in folds)
         # The next candidate starts from this one, or from the best if there is none beyond it
-        for fold in self._folds:
-            fold.solutions = {kept: fold.solutions[kept] for kept in {step, self.best()}}
+        for fold in folds:
+            fold.solutions = {kept: fold.solutions[kept] for kept in {step, best()}}
 
-    def best(self) -> int:
-        """Return the step of the candidate that predicts best."""
-        return min(self.losses, key=lambda step: self.losses[step])
-
-    def result(self) -> CrossValidatedWeight:
-        """Return the weight at the minimum of a parabola through the best candidate and its neighbours."""
-        best = self.best()
-        offset = _lowest_offset([self.losses.get(best + n) for n in (-1, 0, 1)])
-        candidates = tuple(
-            ScoredWeight(self._guess * _CANDIDATE_RATIO**step, score) for step, score in sorted(self.losses.items())
-        )
-        weight = self._guess * _CANDIDATE_RATIO ** (best + offset)
-        return CrossValidatedWeight(
-            weight, candidates, sum(fold.passes for fold in self._folds), self._folds[0].solutions[best]
-        )
+    step = 1
+    score(step)
+    while step > -_MAX_STEPS and best() <= step + 1:
+        step -= 1
+        score(step)
+    step = max(losses)
+    while step < _MAX_STEPS and best() == step:
+        step += 1
+        score(step)
+    return losses
 
 
 def _lowest_offset(losses: Sequence[float | None]) -> float:

@@ -1,4 +1,6 @@
-"""The likelihood of a scene as solvers use it: value, gradient, and a diagonal that bounds its curvature."""
+"""What solvers need of a scene: the likelihood's value, its gradient, and a diagonal that bounds its curvature."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,6 +8,8 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
 from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.initialization import smooth_start, well_seen_samples
+from faintfield.recon.solver.proximal import DualField
 
 # Smallest value of the metric relative to its median over seen samples; samples below follow their neighbours.
 _MIN_METRIC = 1e-3
@@ -125,3 +129,28 @@ class DataFit:
 def _positive(metric: Image) -> Image:
     """Return a metric that is also positive where no view sees anything."""
     return np.maximum(metric, _MIN_METRIC * np.median(metric[metric > 0]))
+
+
+@dataclass(frozen=True)
+class SceneProblem:
+    """The images of one plane or several planes together, and the operator that explains them."""
+
+    operator: SceneOperator
+    images: ElementalImages
+
+    def start(self, views: ViewSelection = None) -> Image:
+        """Return the smooth start from some views."""
+        return smooth_start(self.operator, self.images, views)
+
+    def fit(self, level_e: float, views: ViewSelection = None) -> DataFit:
+        """Return L of some views."""
+        return DataFit(self.operator, self.images, level_e, views)
+
+    def dual(self) -> DualField:
+        """Return a dual field of zeros."""
+        return DualField.zero([grid.shape for grid in self.operator.grids], self.operator.dtype)
+
+    def well_seen(self) -> NDArray[np.bool_]:
+        """Return which samples represent the planes, each plane judged by its own best seen sample."""
+        seen = [well_seen_samples(plane).ravel() for plane in self.operator.planes_of(self.operator.sensitivity())]
+        return np.concatenate(seen).reshape(self.operator.samples_shape)

@@ -1,7 +1,7 @@
-"""MLEM and one-step-late PMLEM, the iterations of eq. (2) as published.
+"""One-step-late PMLEM, the iteration of eq. (2) as published; with a weight of zero it is MLEM.
 
-They are generators of iterates; the caller decides when to stop, what to show and what to save. They do not know
-whether they have converged (`recon.solver.pmlem` does): `settled` and `oscillates` judge the steps made so far.
+It is a generator of iterates; the caller decides when to stop, what to show and what to save. It does not know whether
+it has converged (`recon.solver.pmlem` does): `settled` and `oscillates` judge the steps made so far.
 """
 
 from collections.abc import Iterator, Sequence
@@ -55,11 +55,6 @@ class Iterate:
     step: IterationStep
 
 
-def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
-    """Yield iterates of MLEM, eq. (2) with β = 0: maximum likelihood, which fits the noise after many passes."""
-    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
-
-
 def pmlem_one_step_late(
     operator: PlaneOperator, images: ElementalImages, start: Image, *, penalty_weight: float, epsilon: float
 ) -> Iterator[Iterate]:
@@ -73,7 +68,7 @@ def pmlem_one_step_late(
     start : float array (row, column)
         Positive.
     penalty_weight : float
-        β ≥ 0, in the unit of s.
+        β ≥ 0, in the unit of s; zero for maximum likelihood, which fits the noise after many passes.
     epsilon : float
         ε > 0 of eq. (3), in the unit of f squared.
 

@@ -60,12 +60,12 @@ def total_variation(plane: Image, epsilon: float) -> float:
     `u[i,j] = sqrt( (f[i+1,j] − f[i,j])² + (f[i,j+1] − f[i,j])² + ε )` without differences across an edge
     (Panin, Zeng and Gullberg 1999, eq. (3) of the paper). `epsilon` has the unit of f squared.
     """
-    return float(_gradient_magnitude(*_differences(plane), epsilon).sum(dtype=np.float64))
+    return float(_gradient_magnitude(*differences(plane), epsilon).sum(dtype=np.float64))
 
 
 def total_variation_gradient(plane: Image, epsilon: float) -> Image:
     """Return P{f} of eq. (3), the derivative of `total_variation` with respect to each sample (row, column)."""
-    down, right = _differences(plane)
+    down, right = differences(plane)
     magnitude = _gradient_magnitude(down, right, epsilon)
     down /= magnitude
     right /= magnitude
@@ -75,7 +75,7 @@ def total_variation_gradient(plane: Image, epsilon: float) -> Image:
     return gradient
 
 
-def _differences(plane: Image) -> tuple[Image, Image]:
+def differences(plane: Image) -> tuple[Image, Image]:
     """Return the forward differences along rows and columns; zero at the last row and column."""
     down, right = np.zeros_like(plane), np.zeros_like(plane)
     np.subtract(plane[1:], plane[:-1], out=down[:-1])

@@ -7,12 +7,12 @@ work is thus done on the plane, where it is cheap, and few passes over the data 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from faintfield.recon.errors import NotConverged
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
 
@@ -36,20 +36,6 @@ _MAX_SCALE = 2.0**10
 
 # Smallest ratio of a sample to its last value, where samples must not become zero.
 _MIN_FALL = 0.05
-
-
-class DataTerm(Protocol):
-    """What PMLEM needs of the data; `recon.solver.data_fit.DataFit` provides it."""
-
-    @property
-    def may_reach_zero(self) -> bool:
-        """Whether L is finite wherever f ≥ 0."""
-
-    def value_and_gradient(self, plane: Image, /) -> tuple[float, Image]:
-        """Return L(f) up to a constant and ∇L(f), in one pass over the data."""
-
-    def metric(self, plane: Image, /) -> Image:
-        """Return a positive diagonal that is about as large as the curvature of L near a plane, or larger."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +89,7 @@ class PmlemIterate:
 
 
 def pmlem(
-    data_term: DataTerm,
+    fit: DataFit,
     start: Image,
     *,
     penalty_weight: float,
@@ -118,7 +104,7 @@ def pmlem(
 
     Parameters
     ----------
-    data_term, penalty : DataTerm, Penalty
+    fit, penalty : DataFit, Penalty
         L and φ; total variation by default.
     start : float array (samples)
         Positive.
@@ -136,38 +122,33 @@ def pmlem(
     NotConverged
         An iterate is not finite.
     """
-    _check_arguments(penalty_weight, start)
-    penalty = penalty or Penalty()
-    if penalty_weight == 0 or penalty.name == "none":
-        penalty_weight, penalty = 0.0, Penalty("none")
-    dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
-    return _Pmlem(data_term, penalty_weight, penalty, tolerance).iterates(start, dual)
-
-
-def _check_arguments(penalty_weight: float, start: Image) -> None:
-    """Refuse a negative weight, and a start that is not positive (ValueError)."""
     if not penalty_weight >= 0:
         raise ValueError(f"need penalty_weight >= 0, got {penalty_weight}")
     if not (start > 0).all():
         raise ValueError(f"start must be positive everywhere, its smallest value is {start.min()}")
+    penalty = penalty or Penalty()
+    if penalty_weight == 0 or penalty.name == "none":
+        penalty_weight, penalty = 0.0, Penalty("none")
+    dual = dual or DualField.zero([(start.shape[0], start.shape[1])], start.dtype)
+    return _Pmlem(fit, penalty_weight, penalty, tolerance).iterates(start, dual)
 
 
 class _Pmlem:
     """The iteration and its state."""
 
-    def __init__(self, data_term: DataTerm, weight: float, penalty: Penalty, tolerance: float) -> None:
-        self._data_term, self._weight, self._penalty, self._tolerance = data_term, weight, penalty, tolerance
+    def __init__(self, fit: DataFit, weight: float, penalty: Penalty, tolerance: float) -> None:
+        self._fit, self._weight, self._penalty, self._tolerance = fit, weight, penalty, tolerance
         self._scale = 1.0
         self._inner_steps = 0
 
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
         """Iterate without end."""
-        metric = self._data_term.metric(plane)
+        metric = self._fit.metric(plane)
         accepted: PmlemIterate | None = None
         gradient = np.zeros_like(plane)
         passes, lowest = 0, np.inf
         while True:
-            value, new_gradient = self._data_term.value_and_gradient(plane)
+            value, new_gradient = self._fit.value_and_gradient(plane)
             passes += 1
             objective = value + self._weight * dual.penalty_and_slack(plane, self._penalty)[0]
             if np.isnan(objective):
@@ -180,7 +161,7 @@ class _Pmlem:
                 yield accepted
                 self._scale = max(self._scale * _RELAXATION, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
-                    metric = self._data_term.metric(plane)
+                    metric = self._fit.metric(plane)
             else:
                 self._scale *= 2
             while self._scale > _MAX_SCALE:
@@ -204,7 +185,7 @@ class _Pmlem:
             found = dual.prox(point, scaled, self._weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane
             self._inner_steps += found.steps
-        if not self._data_term.may_reach_zero:
+        if not self._fit.may_reach_zero:
             np.maximum(plane, here.plane.dtype.type(_MIN_FALL) * here.plane, out=plane)
         return plane, dual
 

@@ -2,9 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from itertools import pairwise
-from typing import Any
 
 import numba
 import numpy as np
@@ -152,10 +150,10 @@ class _DualAscent:
         """Make the steps up to the next check of the gap."""
         for _ in range(_EXCHANGES_PER_CHECK):
             momenta, self._momentum = _momenta(self._momentum)
-            arrays = (self.vectors, self._ahead, *self._spare, self._point, self._reach, self._step_sizes)
-            options = (self._penalty.smoothing_e, self._penalty.bounded, momenta)
-            step = partial(_step_strip, (*arrays, *options))
-            uphill = sum(_on_strips(len(self._point), self._workers, step))
+            fields = (self.vectors, self._ahead, *self._spare)
+            known = (self._point, self._reach, self._step_sizes, self._penalty.smoothing_e, self._penalty.bounded)
+            arguments = (*fields, *known, momenta)
+            uphill = sum(_on_strips(proximal_kernels.step_strip, len(self._point), self._workers, *arguments))
             self._spare, (self.vectors, self._ahead) = (self.vectors, self._ahead), self._spare
             self.steps += momenta.size
             if uphill > 0:
@@ -168,10 +166,6 @@ class _DualAscent:
         return _penalty_and_slack(self.vectors, plane, self._penalty, self._workers)[1]
 
 
-def _step_strip(arguments: tuple[Any, ...], first: int, stop: int) -> float:
-    return float(proximal_kernels.step_strip(first, stop, *arguments))
-
-
 def step_sizes(reach: Image) -> Image:
     """Return the largest steps that are sure to lead downhill: 1/8 of the inverse of β/w, at its largest nearby."""
     largest = reach.copy()
@@ -182,23 +176,21 @@ def step_sizes(reach: Image) -> Image:
 
 def _set_primal(vectors: Image, point: Image, reach: Image, plane: Image, workers: int) -> None:
     """Set a plane (row, column) to `v − β/w ∇ᵀp`."""
-    _on_strips(len(plane), workers, lambda a, b: proximal_kernels.primal_of_dual(a, b, vectors, point, reach, plane))
+    _on_strips(proximal_kernels.primal_of_dual, len(plane), workers, vectors, point, reach, plane)
 
 
 def _penalty_and_slack(vectors: Image, plane: Image, penalty: Penalty, workers: int) -> tuple[float, float]:
     """Return the penalty and the slack of one plane (row, column)."""
-    shape = (penalty.smoothing_e, penalty.bounded)
-    sums = _on_strips(
-        len(plane), workers, lambda a, b: proximal_kernels.penalty_and_slack(a, b, plane, vectors, *shape)
-    )
+    arguments = (plane, vectors, penalty.smoothing_e, penalty.bounded)
+    sums = _on_strips(proximal_kernels.penalty_and_slack, len(plane), workers, *arguments)
     return sum(part[0] for part in sums), sum(part[1] for part in sums)
 
 
-def _on_strips[Result](rows: int, workers: int, work: Callable[[int, int], Result]) -> list[Result]:
-    """Call a function for the first and past-the-last row of every strip, in threads when there are several."""
+def _on_strips[Result](kernel: Callable[..., Result], rows: int, workers: int, *arguments: object) -> list[Result]:
+    """Call a kernel with the first and past-the-last row of every strip, in threads when there are several strips."""
     count = max(1, min(workers, rows // _MIN_STRIP_ROWS))
     edges = np.linspace(0, rows, count + 1).astype(int).tolist()
-    return run_in_threads(lambda strip: work(*strip), list(pairwise(edges)))
+    return run_in_threads(lambda strip: kernel(*strip, *arguments), list(pairwise(edges)))
 
 
 def _momenta(t: float) -> tuple[NDArray[np.float64], float]:

@@ -12,22 +12,18 @@ does not depend on their number.
 
 import numpy as np
 
-from faintfield.recon.elementary import compiled
+from faintfield.recon.numba_tools import compiled
 
 
 @compiled
 def _plane_row(row, down, right, centre, reach, values):
-    """Set `values` to a row of `v − β/w ∇ᵀp`; the fields begin with a row and a column of zeros."""
+    """Set `values` to a row of `( v − β/w ∇ᵀp )₊`, with its last value twice.
+
+    The fields begin with a row and a column of zeros.
+    """
     for j in range(centre.shape[1]):
         divergence = down[row + 1, j + 1] - down[row, j + 1] + right[row + 1, j + 1] - right[row + 1, j]
-        values[j] = centre[row, j] + reach[row, j] * divergence
-
-
-@compiled
-def _clip_row(values):
-    """Clip a row at zero, and repeat its last value after its end."""
-    for j in range(values.size - 1):
-        values[j] = max(values[j], values.dtype.type(0))
+        values[j] = max(centre[row, j] + reach[row, j] * divergence, values.dtype.type(0))
     values[values.size - 1] = values[values.size - 2]
 
 
@@ -78,14 +74,12 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
     top, bottom = max(first - momenta.size, 0), min(stop + momenta.size, centre.shape[0])
     local = _with_halo(top, bottom, dual, ahead)
     against = 0.0
+    planes = centre[top:bottom], reach[top:bottom], steps[top:bottom]
     for momentum in momenta:
         options = (centre.dtype.type(smoothing), bounded, centre.dtype.type(momentum))
-        against = _step_rows(
-            first - top, stop - top, local, centre[top:bottom], reach[top:bottom], steps[top:bottom], options
-        )
-    for part in range(2):
-        next_dual[part, first:stop] = local[part, 1 + first - top : 1 + stop - top, 1:]
-        next_ahead[part, first:stop] = local[2 + part, 1 + first - top : 1 + stop - top, 1:]
+        against = _step_rows(first - top, stop - top, local, planes, options)
+    next_dual[:, first:stop] = local[:2, 1 + first - top : 1 + stop - top, 1:]
+    next_ahead[:, first:stop] = local[2:, 1 + first - top : 1 + stop - top, 1:]
     return against
 
 
@@ -93,27 +87,25 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
 def _with_halo(top, bottom, dual, ahead):
     """Return a copy (4, row, column) of rows of both fields, after the row above and a column of zeros."""
     local = np.zeros((4, bottom - top + 1, dual.shape[2] + 1), dual.dtype)
-    for part in range(2):
-        local[part, 1:, 1:] = dual[part, top:bottom]
-        local[2 + part, 1:, 1:] = ahead[part, top:bottom]
+    local[:2, 1:, 1:] = dual[:, top:bottom]
+    local[2:, 1:, 1:] = ahead[:, top:bottom]
     if top > 0:
         local[2, 0, 1:] = ahead[0, top - 1]
     return local
 
 
 @compiled
-def _step_rows(first, stop, local, centre, reach, steps, options):
+def _step_rows(first, stop, local, planes, options):
     """Make one step on all rows of a copy; return how far rows `first` to `stop` oppose the momentum."""
+    centre, reach, steps = planes
     height, columns = centre.shape
     here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
     smoothing, bounded, momentum = options
     _plane_row(0, local[2], local[3], centre, reach, here)
-    _clip_row(here)
     against = 0.0
     for row in range(height):
         if row + 1 < height:
             _plane_row(row + 1, local[2], local[3], centre, reach, below)
-            _clip_row(below)
         else:
             below[:] = here
         fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])

@@ -10,7 +10,7 @@ import numpy as np
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.smoothing import blurred
-from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalties import Penalty, differences
 
 # Number of draws, and of updates of the penalty's curvature from their spread.
 _DRAWS, _ROUNDS = 10, 10
@@ -71,7 +71,8 @@ def _mean(planes: list[Image]) -> Image:
 
 def _squared_gradient(plane: Image) -> Image:
     """Return |∇x|² (row, column)."""
-    return np.asarray(np.sum(np.square(_differences(plane)), axis=0))
+    down, right = differences(plane)
+    return np.asarray(np.square(down) + np.square(right))
 
 
 def _curvature(length: Image, penalty: Penalty) -> Image:
@@ -121,14 +122,6 @@ def _precision(w, curvature, x, out):
             if j > 0:
                 total += curvature[i, j - 1] * (x[i, j] - x[i, j - 1])
             out[i, j] = total
-
-
-def _differences(plane: Image) -> Image:
-    """Return ∇x (2, row, column), zero across an edge."""
-    both = np.zeros((2, *plane.shape), plane.dtype)
-    np.subtract(plane[1:], plane[:-1], out=both[0, :-1])
-    np.subtract(plane[:, 1:], plane[:, :-1], out=both[1, :, :-1])
-    return both
 
 
 def _divergence(field: Image) -> Image:

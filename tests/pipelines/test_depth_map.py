@@ -15,7 +15,7 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.depth_map import compared_depths
-from faintfield.recon.depth.best_focus import SURE
+from faintfield.recon.depth.focus import SURE
 from tests.pipelines.conftest import Command, SetMaker
 
 SWEEP = ("--sweep-mm", "400:900:26", "--method", "backprojection", "--depth-map")

@@ -1,4 +1,4 @@
-"""The contract of a linear operator, which every operator and every case of it must keep."""
+"""The contract that every linear operator must keep."""
 
 from collections.abc import Callable
 

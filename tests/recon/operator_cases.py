@@ -22,7 +22,7 @@ FACING_AT_500_MM = fronto_parallel_rt_ref_plane(500.0)
 
 @dataclass(frozen=True)
 class Case:
-    """A camera at several poses before a plane, in terms of the world."""
+    """A camera at several poses before a plane."""
 
     rays: NDArray[np.float64]  # (lattice, row, column, 2)
     rt_cam_ref: NDArray[np.float64]
@@ -47,10 +47,10 @@ class Case:
 
 
 @st.composite
-def cases(draw: st.DrawFn, most_rows: int = 19, most_columns: int = 71) -> Case:
+def cases(draw: st.DrawFn, max_rows: int = 19, max_columns: int = 71) -> Case:
     """Odd sizes, near and far planes, turned and displaced cameras that see some of the plane, mosaics, masks."""
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed"))
-    rows, columns = draw(st.tuples(st.integers(2, most_rows), st.integers(2, most_columns)), label="detector")
+    rows, columns = draw(st.tuples(st.integers(2, max_rows), st.integers(2, max_columns)), label="detector")
     views = draw(st.integers(1, 4), label="views")
     depth_mm = draw(st.sampled_from([120.0, 500.0, 20_000.0]), label="depth_mm")
     turn_rad = draw(st.sampled_from([0.0, 0.02, 0.4]), label="turn_rad")
@@ -68,7 +68,7 @@ def cases(draw: st.DrawFn, most_rows: int = 19, most_columns: int = 71) -> Case:
     flat, masked = draw(st.booleans(), label="flat"), draw(st.booleans(), label="masked")
     lattice_of_view = generator.integers(0, len(rays), views)
     valid = generator.random((views, *rays.shape[1:3])) >= (0.1 if masked else 0.0)
-    poses[0], lattice_of_view[0], valid[0] = 0, 0, True  # so that something is seen for certain
+    poses[0], lattice_of_view[0], valid[0] = 0, 0, True  # so that the first view certainly sees the plane
     return Case(
         rays,
         poses,

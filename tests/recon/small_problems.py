@@ -1,4 +1,4 @@
-"""Problems of a hundred samples with a dense H made by hand, and solvers of the textbook for them, in float64."""
+"""Problems of a hundred samples with a dense matrix H, and textbook solvers for them, in float64."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -41,7 +41,7 @@ class DenseProblem:
         return np.asarray(np.exp(exponent - gammaln(_COUNTS + 1)))
 
     def value_and_gradient(self, f: Image) -> tuple[float, Image]:
-        """The negative log-likelihood and its gradient, by formulas of their own."""
+        """The negative log-likelihood and its gradient, from formulas independent of the code under test."""
         rows = self.matrix[self.counted()]
         g = self.images.electrons.ravel()[self.counted()]
         b, v = float(self.images.background_e), float(self.images.read_variance_e2)
@@ -85,10 +85,10 @@ def problem(
     truth[2:6, 3:9] = high
     mean = (matrix @ truth.ravel()).reshape(views, *DETECTOR)
     electrons = generator.poisson(mean + background_e) + generator.normal(0, np.sqrt(variance_e2), mean.shape)
-    judged_by = PixelLikelihood(likelihood, level_e=3.0 if likelihood == "least-squares" else 0.0)
+    pixel_likelihood = PixelLikelihood(likelihood, level_e=3.0 if likelihood == "least-squares" else 0.0)
     return DenseProblem(
         operator,
-        ElementalImages(electrons, background_e, variance_e2, likelihood=judged_by),
+        ElementalImages(electrons, background_e, variance_e2, likelihood=pixel_likelihood),
         matrix,
         homographies,
         rays,
@@ -96,7 +96,7 @@ def problem(
 
 
 def _bilinear(rows: Image, columns: Image) -> Image:
-    """What a view reads at points of the plane, as a matrix: hat functions of the distance to each sample."""
+    """The matrix from samples to points of the plane: hat functions of the distance to each sample."""
     down = np.maximum(1 - np.abs(rows[:, None] - np.arange(SHAPE[0])), 0)
     right = np.maximum(1 - np.abs(columns[:, None] - np.arange(SHAPE[1])), 0)
     inside = (rows >= 0) & (rows <= SHAPE[0] - 1) & (columns >= 0) & (columns <= SHAPE[1] - 1)

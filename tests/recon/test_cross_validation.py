@@ -1,4 +1,4 @@
-"""The weight that predicts held-out views, against the weight that the truth would choose."""
+"""The weight chosen by cross-validation, against the best weight for the truth."""
 
 import numpy as np
 import pytest
@@ -7,11 +7,10 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
-from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.problem import SceneProblem
 
 
 @pytest.mark.parametrize("views", [4, 5, 9, 13, 25, 49, 50, 81, 98])
@@ -22,7 +21,7 @@ def test_folds_are_disjoint_and_cover_all_views(views: int) -> None:
     assert all(0.5 <= len(fold) * count / views <= 2 for fold in folds)
 
 
-def test_in_a_grid_of_seven_by_seven_each_row_and_column_gives_one() -> None:
+def test_each_fold_of_a_7_by_7_grid_has_one_view_per_row_and_column() -> None:
     for fold in range(7):
         rows, columns = np.divmod(validation_views(49, fold), 7)
         assert sorted(rows.tolist()) == sorted(columns.tolist()) == list(range(7))
@@ -46,7 +45,7 @@ def dark_views(truth: Image, seed: int) -> tuple[PlaneOperator, ElementalImages]
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: int) -> None:
+def test_the_weight_is_nearly_as_good_as_the_best_for_the_truth(seed: int) -> None:
     truth = scene()
     operator, images = dark_views(truth, seed)
     start = smooth_start(operator, images)
@@ -59,13 +58,13 @@ def test_it_is_nearly_as_good_as_the_weight_that_the_truth_would_choose(seed: in
                 break
         return float(np.mean((iterate.plane - truth)[8:-8, 8:-8] ** 2))
 
-    chosen = cross_validated_weight(SceneProblem(operator, images), guess / 3, Penalty())  # a guess that is far off
+    chosen = cross_validated_weight(SceneProblem(operator, images), guess / 3, Penalty())  # a poor guess
     best = min(error(guess * 2 ** (step / 2)) for step in range(-3, 4))
     assert error(chosen.weight) <= 1.1 * best
-    scores = {tried.weight: tried.loss for tried in chosen.candidates}
+    scores = chosen.candidates
     assert min(scores) < chosen.weight < max(scores)
     assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
-    assert chosen.passes < 60 * 7  # each of seven folds: these views have few pixels
+    assert chosen.passes < 60 * 7  # seven folds, because these views have few pixels
 
 
 def test_too_few_views_are_refused() -> None:
@@ -74,17 +73,17 @@ def test_too_few_views_are_refused() -> None:
         cross_validated_weight(SceneProblem(few, ElementalImages(np.ones((3, 4, 4)))), 1.0, Penalty())
 
 
-def test_views_that_see_nothing_are_neither_kept_nor_held_out() -> None:
+def test_views_that_see_nothing_are_neither_trained_on_nor_held_out() -> None:
     operator, images = dark_views(scene(24), 1)
     aside = np.stack([np.eye(3)] * 49)
     aside[:, 0, 2] = np.where(np.arange(49) % 7 == 3, 0.5, 1000.0)
     rays = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1)
     posed = SceneProblem(PlaneOperator(aside, rays, operator.grid), images)
-    assert posed.views.tolist() == list(range(3, 49, 7))
-    assert np.isfinite([tried.loss for tried in cross_validated_weight(posed, 1.0, Penalty()).candidates]).all()
+    assert posed.operator.seeing_views.tolist() == list(range(3, 49, 7))
+    assert np.isfinite(list(cross_validated_weight(posed, 1.0, Penalty()).candidates.values())).all()
 
 
-def test_a_solver_that_finds_no_way_down_ends_the_candidate(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_candidate_ends_when_the_solver_cannot_descend(monkeypatch: pytest.MonkeyPatch) -> None:
     operator, images = dark_views(scene(24), 1)
     true = DataFit.value_and_gradient
 

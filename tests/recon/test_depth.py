@@ -1,4 +1,4 @@
-"""Depth maps and planes of best focus, on views that are evaluated from waves in closed form."""
+"""Depth maps and planes of best focus, on views of waves computed in closed form."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.depth.agreement import Agreement, agreement, bins_for, depth_map
-from faintfield.recon.depth.best_focus import SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.focus import SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -18,7 +18,7 @@ SHAPE = (48, 96)
 OFFSETS = np.array([(row, column) for row in (-1, 0, 1) for column in (-2, -1, 0, 1, 2)], float)
 DISPARITIES = np.linspace(-3, 3, 25)
 DEPTHS_MM = 1 / np.linspace(1 / 400, 1 / 900, 25)
-NEAR, FAR = 17, 6  # what these planes' disparities are, the two halves of the scene move by
+NEAR, FAR = 17, 6  # planes of the sweep in which the two halves of the scene lie
 
 
 def _waves(x: NDArray[np.floating], y: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -32,7 +32,7 @@ def _two_halves(x: NDArray[np.floating], y: NDArray[np.floating], level: float) 
 
 
 def _problem(texture: Scene, seed: int = 3, scale: float = 1.0) -> tuple[list[Agreement], ElementalImages]:
-    """The left half is near, the right half far; each pixel's place on either is known without any operator."""
+    """The left half is near, the right half far; pixels are computed from their coordinates, without an operator."""
     rows, columns = np.indices(SHAPE, float)
     middle = SHAPE[1] / 2
     views = []
@@ -57,7 +57,7 @@ def halves() -> list[Agreement]:
     return _problem(_two_halves)[0]
 
 
-def test_each_half_is_where_it_is(halves: list[Agreement]) -> None:
+def test_the_depth_of_each_half_is_found(halves: list[Agreement]) -> None:
     found = depth_map(halves, DEPTHS_MM)
     for part, truth in ((np.s_[6:-6, 8:40], NEAR), (np.s_[6:-6, 58:86], FAR)):
         sure = found.confidence[part] >= SURE
@@ -66,15 +66,15 @@ def test_each_half_is_where_it_is(halves: list[Agreement]) -> None:
         assert np.quantile(np.abs(found.index[part][sure] - truth), 0.95) < 1
 
 
-def test_the_squares_of_views_that_agree_are_as_many_as_their_degrees_of_freedom(halves: list[Agreement]) -> None:
+def test_the_squares_of_agreeing_views_equal_their_degrees_of_freedom(halves: list[Agreement]) -> None:
     plane, inner = halves[NEAR], np.s_[8:-8, 12:36]
     per_freedom = plane.squares[inner].sum() / (plane.sensitivity[inner] - 1).sum()
-    assert 0.75 < per_freedom < 1.1  # interpolation takes some of the noise, and the model's own error is allowed for
+    assert 0.75 < per_freedom < 1.1  # interpolation removes noise, and the variance allows for model error
     assert halves[FAR].squares[inner].sum() > 1.5 * plane.squares[inner].sum()
 
 
 @pytest.mark.parametrize("level_e", [0.0, 20.0])
-def test_what_is_dark_or_alike_everywhere_is_not_sure(level_e: float) -> None:
+def test_dark_and_uniform_regions_have_no_confident_depth(level_e: float) -> None:
     def flat_right(x: NDArray[np.floating], y: NDArray[np.floating], far: float) -> NDArray[np.floating]:
         return np.where(far, level_e, _waves(x, y))
 
@@ -83,7 +83,7 @@ def test_what_is_dark_or_alike_everywhere_is_not_sure(level_e: float) -> None:
     assert (found.confidence[6:-6, 62:86] >= SURE).mean() < 0.02
 
 
-def test_the_ends_of_a_sweep_are_not_sure(halves: list[Agreement]) -> None:
+def test_depths_at_the_ends_of_a_sweep_are_not_confident(halves: list[Agreement]) -> None:
     found = depth_map(halves[: NEAR + 1], DEPTHS_MM[: NEAR + 1])
     at_end = np.rint(found.index) >= NEAR - 0.25
     assert at_end[6:-6, 8:40].mean() > 0.5
@@ -117,7 +117,7 @@ def test_less_light_takes_larger_bins() -> None:
         assert bins_for(operator, images) == bins
 
 
-def test_bins_of_images_are_sums_and_count_where_all_their_pixels_do() -> None:
+def test_binned_images_are_sums_and_valid_where_all_their_pixels_are() -> None:
     generator = np.random.default_rng(4)
     electrons = generator.poisson(5, (2, 7, 9)).astype(np.float32)
     valid = np.ones(electrons.shape, bool)

@@ -7,11 +7,10 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.cross_validation import cross_validated_weight
-from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.recon.solver.problem import SceneProblem
 
 SIZE = 48
 

@@ -1,4 +1,4 @@
-"""Back-projection, the smooth start and the universal weight, against what their definitions promise."""
+"""Back-projection, the smooth start and the universal weight, against their definitions."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +35,7 @@ def test_back_projection_without_flat_field_is_divided_by_the_number_of_views_an
     np.testing.assert_array_equal(plane[:, -4:], 0.0)
 
 
-def test_a_start_is_positive_even_where_the_data_say_darkness() -> None:
+def test_a_start_is_positive_even_where_the_data_are_negative() -> None:
     operator = shifted_views(3, unseen_columns=5)
     assert smooth_start(operator, ElementalImages(np.full(operator.images_shape, -1.0))).min() > 0
     electrons = np.where(np.arange(operator.images_shape[2]) < 3, 50.0, -1.0) * np.ones(operator.images_shape)
@@ -45,7 +45,7 @@ def test_a_start_is_positive_even_where_the_data_say_darkness() -> None:
     assert start.max() > 2 * level_e
 
 
-def test_a_start_takes_the_mean_level_far_from_what_is_seen() -> None:
+def test_far_from_seen_samples_a_start_has_the_mean_level() -> None:
     operator = shifted_views(3, unseen_columns=10)
     start = smooth_start(operator, ElementalImages(np.full(operator.images_shape, 7.0)))
     assert (operator.coverage()[:, 3:] == 0).all()

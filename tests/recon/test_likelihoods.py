@@ -1,4 +1,4 @@
-"""Which likelihood is chosen, and how much light each would report without a penalty."""
+"""The choice of the likelihood, and the light that each reports without a penalty."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm, poisson
 
-from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName
-from faintfield.recon.likelihood.pixel_models import WORK_ROWS, form_ratio
-from faintfield.recon.likelihood.selection import read_noise_share, select_likelihood
+from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName, read_noise_share, select_likelihood
+from faintfield.recon.likelihood.pixel_models import WORK_ROWS
+from tests.recon.pixels import form_ratio
 
 SIGMAS_E = [0.3, 1.0, 2.0, 3.46, 7.0]
 
@@ -29,7 +29,7 @@ def images(variance_e2: object) -> ElementalImages:
         (np.where(np.arange(25).reshape(1, 5, 5) < 2, 1.0, 12.0), "poisson-gaussian"),
     ],
 )
-def test_the_read_noise_chooses(variance_e2: object, name: str) -> None:
+def test_auto_selects_the_likelihood_by_read_noise(variance_e2: object, name: str) -> None:
     assert select_likelihood(images(variance_e2), "auto", 1.0).name == name
 
 
@@ -49,7 +49,7 @@ def light_at_snr(sigma_e: float) -> float:
 
 
 def reported_e(name: LikelihoodName, mean_e: float, sigma_e: float) -> float:
-    """The mean that any number of pixels lead to: the root of the expected score, integrated over what they read."""
+    """The mean estimated from very many pixels: the root of the expected score, integrated over their readings."""
     counts = np.arange(80)
     g = np.linspace(-9 * sigma_e, 40 + 9 * sigma_e, 60001)
     density = poisson.pmf(counts, mean_e) @ norm.pdf(g, counts[:, None], sigma_e)
@@ -71,7 +71,7 @@ def test_light_is_reported_without_bias_at_snr_016(sigma_e: float) -> None:
     assert reported_e(name, mean_e, sigma_e) == pytest.approx(mean_e, rel=0.01)
 
 
-def test_without_the_exact_model_little_read_noise_would_make_a_great_bias() -> None:
+def test_the_shifted_model_is_strongly_biased_at_low_read_noise() -> None:
     assert reported_e("shifted-poisson", light_at_snr(1.0), 1.0) > 1.3 * light_at_snr(1.0)
 
 

@@ -1,4 +1,4 @@
-"""Opacity from light, and what it leaves of farther planes, against pictures whose answer is plain."""
+"""Opacity from light, and the transmission of farther planes, on simple scenes with known answers."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from faintfield.recon.operator.occlusion import opacity, transmission
 from faintfield.recon.operator.scene_operator import SceneOperator
 
 
-def test_what_shines_is_opaque_and_faint_ghosts_are_not() -> None:
+def test_bright_objects_are_opaque_and_faint_ghosts_are_not() -> None:
     generator = np.random.default_rng(2)
     plane = np.maximum(generator.normal(0, 0.1, (60, 80)), 0)
     plane[20:40, 20:50] += 1.0
@@ -24,9 +24,9 @@ def test_a_plane_without_light_hides_nothing() -> None:
     np.testing.assert_array_equal(opacity(np.zeros((5, 6))), 0)
 
 
-def test_only_farther_planes_are_hidden_each_by_all_before_it() -> None:
+def test_each_plane_is_hidden_by_all_nearer_planes_and_no_other() -> None:
     homographies = np.stack([np.eye(3)] * 6).reshape(3, 2, 3, 3)
-    homographies[:, 1, 0, 2] = 1.0  # the second view is a sample aside
+    homographies[:, 1, 0, 2] = 1.0  # the second view is displaced by one sample
     rays = np.stack(np.meshgrid(np.arange(7.0), np.arange(5.0)), axis=-1)
     grids = [PlaneGrid((5, 9), 1.0, (0.0, 0.0))] * 3
     flat = np.full((5, 7), 0.5)

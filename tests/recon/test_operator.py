@@ -1,4 +1,4 @@
-"""H against the contract, against a matrix built another way, against analytic scenes; and what it refuses."""
+"""H against the operator contract, an independently built matrix, and analytic scenes."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -28,7 +28,7 @@ type LinearOperatorCheck = Callable[[PlaneOperator], Image]
 def ray_hits(
     rays: NDArray[Any], rt_cam_ref: NDArray[Any], rt_ref_plane: NDArray[Any]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Where rays (…, 2) from the camera's centre cut the plane: its coordinates in mm (…, 2), and whether in front."""
+    """Where rays (…, 2) from the camera's centre meet the plane (…, 2) in mm, and whether in front of the camera."""
     r_ref_cam = Rotation.from_rotvec(rt_cam_ref[:3]).as_matrix().T
     r_ref_plane = Rotation.from_rotvec(rt_ref_plane[:3]).as_matrix()
     centre, origin, normal = -r_ref_cam @ rt_cam_ref[3:], rt_ref_plane[3:], r_ref_plane[:, 2]
@@ -38,7 +38,7 @@ def ray_hits(
 
 
 def matrix_by_ray_casting(case: Case) -> Image:
-    """H (pixel of any view, sample), a pixel at a time: its ray is cut with the plane, tents weigh the samples."""
+    """H (pixel of any view, sample), pixel by pixel: intersect its ray with the plane, weight samples by tents."""
     matrix = []
     (rows, columns), (detector_rows, detector_columns) = case.grid.shape, case.rays.shape[1:3]
     for view, lattice in enumerate(case.lattice_of_view):
@@ -55,7 +55,7 @@ def matrix_by_ray_casting(case: Case) -> Image:
 
 
 def tent(at: float, samples: int) -> NDArray[np.float64]:
-    """Bilinear weights along one axis: each sample's falls linearly to zero at its neighbours."""
+    """Bilinear weights along one axis: that of each sample falls linearly to zero at its neighbours."""
     return np.maximum(0.0, 1.0 - np.abs(np.arange(samples) - at))
 
 
@@ -85,7 +85,7 @@ def test_wide_views_at_scale_one_keep_the_contract(
     check_linear_operator(PlaneOperator(homographies, rays, grid, dtype=np.float64, workers=workers))
 
 
-@given(case=cases(most_rows=7, most_columns=11))
+@given(case=cases(max_rows=7, max_columns=11))
 def test_h_is_the_matrix_found_by_casting_each_pixels_ray(
     case: Case, check_linear_operator: LinearOperatorCheck
 ) -> None:
@@ -102,7 +102,7 @@ def test_coordinates_on_the_last_sample_count_and_those_outside_do_not(mirrored:
     np.testing.assert_array_equal(operator.sensitivity(), np.ones((4, 50)))
 
 
-def test_between_samples_the_plane_is_weighed_bilinearly_up_to_both_edges() -> None:
+def test_interpolation_is_bilinear_up_to_both_edges() -> None:
     plane = np.random.default_rng(5).uniform(1, 2, (4, 50))
     operator = looking_at([0.25, 48.25, 49.0], [0.5, 2.5, 3.0])
     below, right = np.vstack([plane[1:], plane[-1:]]), np.hstack([plane[:, 1:], plane[:, -1:]])
@@ -116,7 +116,7 @@ def test_between_samples_the_plane_is_weighed_bilinearly_up_to_both_edges() -> N
 
 
 @pytest.mark.parametrize("overshoot", [-0.9, 0.9, -1.1, 1.1])
-def test_only_within_the_tolerance_does_a_pixel_beside_the_plane_see_its_edge(overshoot: float) -> None:
+def test_a_pixel_beside_the_plane_sees_its_edge_only_within_the_tolerance(overshoot: float) -> None:
     beyond = overshoot * EDGE_TOLERANCE
     operator = looking_at([10.0, beyond if beyond < 0 else 49 + beyond], [1.0])
     edge = operator.forward(np.ones((4, 50)))[0, 0, 1]
@@ -161,13 +161,13 @@ def test_opencv_images_the_point_that_a_pixel_sees_onto_that_pixel(distortion: t
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("distortion", DISTORTIONS)
-def test_h_of_an_analytic_scene_is_what_rays_cast_at_it_meet(
+def test_h_of_an_analytic_scene_agrees_with_ray_casting(
     distortion: tuple[float, ...], dtype: type[np.float32] | type[np.float64]
 ) -> None:
     def light(x_mm: Image, y_mm: Image) -> Image:
         return np.asarray(3 + np.sin(x_mm / 50 + 0.3) * np.cos(y_mm / 40) + x_mm / 800)
 
-    optics = SimulatedOptics((96, 64), 120.0, 120.0, 50.0, 30.0, distortion)  # inverts the distortion its own way
+    optics = SimulatedOptics((96, 64), 120.0, 120.0, 50.0, 30.0, distortion)  # has its own inverse of the distortion
     lens = Lens((96, 64), 120.0, 120.0, 50.0, 30.0, distortion)
     poses = np.array([[0.0, 0, 0, 0, 0, 0], [0.03, -0.05, 0.1, 50, -50, 5], [-0.04, 0.06, -0.02, -100, 50, -8]])
     rt_ref_plane = np.array([0.2, 0.3, -0.1, 10.0, -5.0, 500.0])
@@ -189,15 +189,15 @@ rigid_motions = st.integers(0, 2**32 - 1).map(
 )
 
 
-@given(case=cases(most_rows=7, most_columns=40), motion=rigid_motions)
-def test_moving_the_world_is_moving_all_cameras_back(case: Case, motion: NDArray[np.float64]) -> None:
+@given(case=cases(max_rows=7, max_columns=40), motion=rigid_motions)
+def test_moving_the_world_equals_moving_all_cameras_back(case: Case, motion: NDArray[np.float64]) -> None:
     world_moved = plane_from_ray(case.rt_cam_ref, composed(motion, case.rt_ref_plane))
     moved_back = plane_from_ray(np.array([composed(rt, motion) for rt in case.rt_cam_ref]), case.rt_ref_plane)
     for one, other in zip(world_moved, moved_back, strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * np.abs(one).max())
 
 
-@given(case=cases(most_rows=7, most_columns=40), motion=rigid_motions)
+@given(case=cases(max_rows=7, max_columns=40), motion=rigid_motions)
 def test_moving_the_world_and_all_cameras_changes_nothing(case: Case, motion: NDArray[np.float64]) -> None:
     back = np.concatenate([-motion[:3], -Rotation.from_rotvec(motion[:3]).inv().apply(motion[3:])])
     moved = replace(
@@ -215,7 +215,7 @@ def composed(rt_c_b: NDArray[np.float64], rt_b_a: NDArray[np.float64]) -> NDArra
     return np.concatenate([(r_c_b * r_b_a).as_rotvec(), r_c_b.apply(rt_b_a[3:]) + rt_c_b[3:]])
 
 
-def test_the_scale_of_a_homography_is_nothing_and_its_sign_is_behind_the_camera() -> None:
+def test_the_scale_of_a_homography_does_not_matter_but_its_sign_does() -> None:
     lens, grid = Lens((30, 20), 40.0, 40.0, 14.2, 9.1), PlaneGrid((20, 30), 12.5, (-180.0, -110.0))
     homographies = plane_from_ray(np.array([[0.0] * 6, [0.02, 0.1, 0, 30, 5, 9]]), FACING_AT_500_MM)
     plane = np.random.default_rng(3).normal(size=grid.shape)
@@ -239,7 +239,7 @@ def test_float32_differs_from_float64_by_rounding_only() -> None:
 
 @pytest.mark.parametrize("mirrored", [False, True], ids=["contiguous blocks", "scattered blocks"])
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-def test_what_a_pixel_that_does_not_count_holds_reaches_no_sample(mirrored: bool, nonsense: float) -> None:
+def test_the_values_of_invalid_pixels_reach_no_sample(mirrored: bool, nonsense: float) -> None:
     valid = np.ones((1, 4, 50), bool)
     valid[0, 2, 17] = False
     operator = looking_at(np.arange(50.0)[:: -1 if mirrored else 1], np.arange(4.0), valid=valid)
@@ -269,7 +269,7 @@ def test_each_lattice_has_a_background_and_a_variance_of_its_own() -> None:
     np.testing.assert_allclose(operator.adjoint_of_map(background), operator.adjoint(b), atol=1e-12)
 
 
-def test_where_nothing_is_expected_and_nothing_known_the_ratio_is_zero() -> None:
+def test_the_ratio_is_zero_where_no_electron_is_expected() -> None:
     operator = looking_at(np.arange(50.0), np.arange(4.0))
     ratio = operator.adjoint_of_ratio(np.zeros((4, 50)), ElementalImages(np.ones((1, 4, 50))))
     np.testing.assert_array_equal(ratio, 0.0)

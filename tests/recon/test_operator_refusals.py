@@ -1,4 +1,4 @@
-"""What an operator refuses: parts that do not fit together, views that do not exist, arrays of other shapes."""
+"""Errors of an operator: parts that do not fit together, missing views, arrays of the wrong shape."""
 
 from collections.abc import Callable
 from typing import Any
@@ -46,7 +46,7 @@ def test_parts_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> N
 
 
 @pytest.mark.parametrize("views", [[2], [-1], [0, 0], [0.0], [True, False]])
-def test_views_that_are_not_there_or_twice_are_refused(views: Any) -> None:
+def test_missing_and_repeated_views_are_refused(views: Any) -> None:
     operator = PlaneOperator(**GOOD)
     uses: list[Callable[[], Image]] = [
         lambda: operator.forward(np.ones((5, 5)), views),

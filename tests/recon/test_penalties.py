@@ -15,7 +15,7 @@ epsilons = st.sampled_from([1e-6, 1e-2, 1.0])
 
 
 def penalty_as_printed(f: Image, epsilon: float) -> Image:
-    """Eq. (3), sample by sample; what lies across an edge equals what lies on it."""
+    """Eq. (3), sample by sample; samples across an edge equal those on it."""
 
     def at(i: int, j: int) -> float:
         return float(f[min(i, f.shape[0] - 1), min(j, f.shape[1] - 1)])

@@ -8,15 +8,15 @@ import pytest
 from scipy.special import gammaln, logsumexp
 from scipy.stats import norm, poisson
 
-from faintfield.recon import elementary
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.likelihood.pixel_models import (
     LEAST_SQUARES,
     POISSON_GAUSSIAN,
     SHIFTED_POISSON,
     WORK_ROWS,
-    form_ratio,
 )
+from faintfield.recon.numba_tools import compiled, exponential, logarithm
+from tests.recon.pixels import form_ratio
 
 PIXELS = 100
 PRECISIONS = [(np.float32, 3e-6), (np.float64, 1e-10)]
@@ -40,7 +40,7 @@ def judged(
 
 
 def exact(mean: Image, observed: Image, variance: float) -> tuple[Image, Image]:
-    """E[N | g, λ]/λ and −ln p(g | λ) + ½ ln 2πσ², summed over every count that there could be."""
+    """E[N | g, λ]/λ and −ln p(g | λ) + ½ ln 2πσ², summed over all possible counts."""
     counts = np.arange(6000.0)
     mean, observed = mean.astype(float)[:, None], observed.astype(float)[:, None]
     terms = counts * np.log(mean) - mean - gammaln(counts + 1) - (observed - counts) ** 2 / (2 * variance)
@@ -59,13 +59,13 @@ def test_the_exact_model_is_the_sum_over_all_counts(sigma_e: float, dtype: Any, 
     observed = np.maximum(mean + spread, -6 * sigma_e).astype(dtype)
     ratio, value = judged(POISSON_GAUSSIAN, expected, observed, variance)
     exact_ratio, exact_values = exact(mean, observed, variance)
-    # A float32 exponent of 40 is known to within 3e-6, and so is what it is the exponent of
+    # A float32 exponent of 40 has an error of 3e-6, and so has the exponential
     np.testing.assert_allclose(ratio, exact_ratio, rtol=accuracy * (10 if sigma_e < 1 else 1), atol=accuracy)
     assert value == pytest.approx(exact_values.sum(), rel=max(accuracy, 2e-7))
 
 
 @pytest.mark.parametrize("observed_e", [-40.0, 0.0, 3.0, 900.0])
-def test_the_exact_model_stays_finite_far_from_what_is_expected(observed_e: float) -> None:
+def test_the_exact_model_stays_finite_far_from_the_expected_count(observed_e: float) -> None:
     expected = np.geomspace(1e-12, 1e5, PIXELS).astype(np.float32)
     for sigma_e in (0.0, 0.05, 1.0, 3.0):
         ratio, value = judged(POISSON_GAUSSIAN, expected, np.full(PIXELS, observed_e), sigma_e**2, background=0.0)
@@ -101,7 +101,7 @@ def test_pixels_of_response_zero_add_nothing_to_the_value(model: int) -> None:
     assert form_ratio(model, *parts[:5].copy(), 1.0, np.empty((WORK_ROWS, 2))) == alone
 
 
-def test_counts_where_nothing_is_expected_are_impossible() -> None:
+def test_counts_are_impossible_where_none_are_expected() -> None:
     zero = np.zeros(1)
     assert judged(SHIFTED_POISSON, zero, np.ones(1), 0.0, background=0.0)[1] == np.inf
     assert judged(SHIFTED_POISSON, zero, zero, 0.0, background=0.0)[1] == 0.0
@@ -128,8 +128,8 @@ def test_logarithm_and_exponential_are_good_to_the_last_digits(dtype: Any, accur
     np.testing.assert_allclose(logarithms, np.log(powers.astype(float)), rtol=accuracy / 5, atol=accuracy / 10)
 
 
-@elementary.compiled
+@compiled
 def _both(x: Image, powers: Image, logarithms: Image) -> None:
     for k in range(x.size):
-        powers[k] = elementary.exponential(x[k])
-        logarithms[k] = elementary.logarithm(powers[k])
+        powers[k] = exponential(x[k])
+        logarithms[k] = logarithm(powers[k])

@@ -1,4 +1,4 @@
-"""What describes a plane and the images of a scene, and what it refuses."""
+"""Plane grids and elemental images: their values and their errors."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ def test_grids_without_area_are_refused(shape: tuple[int, int], pitch_mm: float,
 
 
 @pytest.mark.parametrize("origin_mm", [(float("nan"), 0.0), (0.0, float("inf"))])
-def test_grids_that_lie_nowhere_are_refused(origin_mm: tuple[float, float]) -> None:
+def test_origins_that_are_not_finite_are_refused(origin_mm: tuple[float, float]) -> None:
     with pytest.raises(ValueError, match="origin_mm"):
         PlaneGrid((5, 5), 1.0, origin_mm)
 
@@ -57,7 +57,7 @@ def test_images_that_do_not_fit_or_are_not_numbers_are_refused(parts: dict[str, 
         ElementalImages(**{"electrons": np.zeros((2, 3, 4)), **parts})
 
 
-def test_pixels_that_do_not_count_may_hold_anything() -> None:
+def test_invalid_pixels_may_hold_anything() -> None:
     electrons, valid = np.zeros((2, 3, 4)), np.ones((2, 3, 4), bool)
     electrons[1, 2, 0], valid[1, 2, 0] = np.nan, False
     assert np.isnan(ElementalImages(electrons, valid=valid).electrons[1, 2, 0])

@@ -19,7 +19,7 @@ def solution(
     return DualField.zero([(v.shape[0], v.shape[1])], v.dtype).prox(v, w, weight, penalty, lambda _: gap, most).plane
 
 
-def test_two_halves_lose_contrast_as_theory_says() -> None:
+def test_two_halves_lose_contrast_as_predicted() -> None:
     """Two halves of a plane: each level moves by β · (length of the edge) / (weight of the half)."""
     v, w = np.full((16, 20), 2.0), np.full((16, 20), 3.0)
     v[:, 5:] = 6.0
@@ -68,7 +68,7 @@ def test_no_plane_is_better_than_the_gap_allows(penalty: Penalty) -> None:
     columns=st.integers(2, 9),
     smoothing=st.sampled_from([0, 0.4]),
 )
-def test_the_slack_is_zero_only_where_the_field_belongs_to_the_plane(
+def test_the_slack_is_zero_only_for_the_field_of_the_plane(
     seed: int, rows: int, columns: int, smoothing: float
 ) -> None:
     generator = np.random.default_rng(seed)
@@ -102,7 +102,7 @@ def test_strips_and_threads_change_nothing(dtype: type[np.float32] | type[np.flo
         np.testing.assert_allclose(plane, planes[0], rtol=50 * np.finfo(dtype).eps)
 
 
-def test_a_step_is_the_textbooks() -> None:
+def test_steps_follow_the_textbook_iteration() -> None:
     generator = np.random.default_rng(6)
     v, w = generator.normal(2, 1, (7, 6)), generator.uniform(0.5, 2, (7, 6))
     reach = 1.3 / w

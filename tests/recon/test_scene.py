@@ -15,8 +15,8 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.block_layout import BLOCK_PX
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.placement import BLOCK_PX
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 
@@ -76,7 +76,7 @@ def test_a_scene_and_its_adjoint_are_adjoint(generator: np.random.Generator) -> 
     assert abs(float(np.vdot(seen, images)) - back) <= 1e-12 * np.linalg.norm(seen) * np.linalg.norm(images)
 
 
-def test_the_ratio_of_a_scene_is_formed_with_what_all_planes_give(generator: np.random.Generator) -> None:
+def test_the_ratio_of_a_scene_uses_the_light_of_all_planes(generator: np.random.Generator) -> None:
     options = known(generator)
     scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options)
     samples = scene.samples_of([generator.uniform(0.5, 2.0, grid.shape) for grid in GRIDS])
@@ -93,7 +93,7 @@ def test_the_ratio_of_a_scene_is_formed_with_what_all_planes_give(generator: np.
 
 
 @pytest.mark.parametrize("plane", range(len(GRIDS)))
-def test_blocks_in_step_and_not_interpolate_as_scipy_does(plane: int, generator: np.random.Generator) -> None:
+def test_blocks_in_step_and_scattered_interpolate_as_scipy_does(plane: int, generator: np.random.Generator) -> None:
     grid, samples = GRIDS[plane], generator.normal(size=GRIDS[plane].shape)
     seen = PlaneOperator(HOMOGRAPHIES[plane], LENS.rays(), grid, dtype=np.float64).forward(samples)
     at = index_of_pixels(HOMOGRAPHIES[plane], grid)

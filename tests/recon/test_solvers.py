@@ -17,7 +17,6 @@ from faintfield.recon.solver.initialization import smooth_start
 from faintfield.recon.solver.one_step_late import (
     Iterate,
     IterationStep,
-    mlem,
     oscillates,
     pmlem_one_step_late,
     settled,
@@ -53,6 +52,10 @@ def drawn(
     return ElementalImages(counts + read_noise, background_e, variance_e2)
 
 
+def mlem(operator: PlaneOperator, images: ElementalImages, start: Image) -> Iterator[Iterate]:
+    return pmlem_one_step_late(operator, images, start, penalty_weight=0.0, epsilon=1.0)
+
+
 def after(iterates: Iterator[Iterate], passes: int) -> Iterate:
     return list(islice(iterates, passes))[-1]
 
@@ -73,7 +76,7 @@ def negative_log_likelihood(matrix: Image, f: Image, images: ElementalImages) ->
 
 @pytest.mark.parametrize("penalty_weight", [0.0, 0.4])
 @pytest.mark.parametrize("variance_e2", [0.0, 12.0])
-def test_each_pass_is_eqs_2_and_3_in_dense_algebra(penalty_weight: float, variance_e2: float) -> None:
+def test_each_pass_agrees_with_eqs_2_and_3_in_dense_algebra(penalty_weight: float, variance_e2: float) -> None:
     operator = shifted_views(4)
     images, f = drawn(operator, box(2, 6), variance_e2=variance_e2), np.random.default_rng(4).uniform(1, 5, SHAPE)
     matrix, s = dense_matrix(operator), operator.sensitivity()
@@ -123,7 +126,7 @@ def test_mlem_recovers_a_plane_seen_without_noise(dtype: type[np.float32] | type
     np.testing.assert_allclose(plane, truth, rtol=2e-3)
 
 
-def test_a_settled_run_is_the_optimum_that_an_independent_optimiser_finds() -> None:
+def test_a_settled_run_agrees_with_an_independent_optimiser() -> None:
     operator = shifted_views(5)
     images, weight, epsilon = drawn(operator, box(4, 12), variance_e2=1.0), 0.05, 4.0
     matrix = dense_matrix(operator)
@@ -147,7 +150,7 @@ def test_a_settled_run_is_the_optimum_that_an_independent_optimiser_finds() -> N
     assert cost(found.plane.ravel()) <= best.fun + 1e-6
 
 
-def test_shifting_by_the_variance_keeps_the_mean_that_clipping_doubles() -> None:
+def test_the_variance_shift_keeps_the_mean_while_clipping_doubles_it() -> None:
     mean_e, variance_e2, views = 0.97, 12.0, 4000  # SNR 0.16 on the paper's camera, by moments
     columns_rows = np.stack(np.meshgrid([0.0, 1.0], [0.0, 1.0]), axis=-1)
     operator = PlaneOperator(np.stack([np.eye(3)] * views), columns_rows, PlaneGrid((2, 2), 1.0, (0.0, 0.0)))
@@ -188,7 +191,7 @@ def run(penalty_weight: float, epsilon: float) -> list[IterationStep]:
     return [iterate.step for iterate in islice(solver, 200)]
 
 
-def test_a_large_weight_is_seen_to_swing_and_a_small_one_to_settle() -> None:
+def test_a_large_weight_oscillates_and_a_small_one_settles() -> None:
     swinging, settling = run(1.0, 0.01), run(0.1, 1.0)
     assert oscillates(swinging, 1e-3)
     assert not settled(swinging, 1e-3)
@@ -238,7 +241,7 @@ def test_a_weight_that_makes_most_denominators_negative_is_refused_with_its_limi
     next(pmlem_one_step_late(operator, images, np.ones(SHAPE), penalty_weight=0.99 * limit, epsilon=1.0))
 
 
-def test_an_iterate_that_leaves_the_finite_numbers_is_reported_with_its_pass() -> None:
+def test_an_iterate_that_is_not_finite_is_reported_with_its_pass() -> None:
     operator = shifted_views(2, dtype=np.float32)
     images = ElementalImages(np.full(operator.images_shape, 1e38, np.float32), 1e-9)
     with pytest.raises(NotConverged, match="pass 1 left"), np.errstate(over="ignore", invalid="ignore"):

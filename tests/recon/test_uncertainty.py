@@ -6,8 +6,8 @@ import pytest
 from faintfield.pipelines.reconstruction.planes import Objective, Settings, solve, solve_pmlem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
-from faintfield.recon.solver.problem import SceneProblem
 from faintfield.recon.solver.uncertainty import standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_cross_validation import dark_views
@@ -15,7 +15,7 @@ from tests.recon.test_cross_validation import scene as pieces
 from tests.recon.test_scene_fit import scene
 
 
-def test_with_a_quadratic_penalty_it_is_that_of_the_inverse_matrix() -> None:
+def test_with_a_quadratic_penalty_sigma_is_that_of_the_inverse_matrix() -> None:
     generator = np.random.default_rng(4)
     metric = generator.uniform(3.0, 4.0, SHAPE)
     gradient_of, weight, delta = difference_matrix(), 2.0, 0.5
@@ -28,13 +28,13 @@ def test_with_a_quadratic_penalty_it_is_that_of_the_inverse_matrix() -> None:
     assert found.mean() == pytest.approx(exact.mean(), rel=0.03)
 
 
-def test_without_a_penalty_it_is_that_of_the_data() -> None:
+def test_without_a_penalty_sigma_is_that_of_the_data() -> None:
     metric = np.random.default_rng(4).uniform(0.1, 4.0, SHAPE)
     found = standard_deviation(np.ones(SHAPE), metric, 0.0, Penalty("none"), np.random.default_rng(1))
     np.testing.assert_allclose(found, metric**-0.5, rtol=1e-6)
 
 
-def test_total_variation_leaves_edges_less_sure_than_flat_pieces_and_all_surer_than_the_data_alone() -> None:
+def test_with_total_variation_sigma_is_larger_at_edges_and_below_that_of_the_data() -> None:
     plane = np.where(np.arange(48) < 24, 0.0, 20.0) * np.ones((40, 1))
     penalty = Penalty("huber-tv", 0.02)  # of a given weight
     found = standard_deviation(plane, np.full(plane.shape, 4.0), 3.0, penalty, np.random.default_rng(3))
@@ -43,7 +43,7 @@ def test_total_variation_leaves_edges_less_sure_than_flat_pieces_and_all_surer_t
 
 
 @pytest.mark.parametrize("name", ["quadratic", "huber-tv"])
-def test_more_weight_makes_surer(name: PenaltyName) -> None:
+def test_a_larger_weight_reduces_sigma(name: PenaltyName) -> None:
     sigmas = [
         standard_deviation(np.ones((40, 40)), np.full((40, 40), 2.0), weight, Penalty(name, 0.1), generator)
         for weight in (0.5, 1.0, 2.0)
@@ -54,7 +54,7 @@ def test_more_weight_makes_surer(name: PenaltyName) -> None:
     assert means[0] < 2**-0.5
 
 
-def test_total_variation_is_weighted_as_the_plane_is_rough_whatever_the_weight_of_the_optimum() -> None:
+def test_total_variation_takes_its_weight_from_the_roughness_of_the_plane() -> None:
     rough = blurred(np.random.default_rng(1).normal(0, 4, (40, 40)), (1, 2))
 
     def mean_of(height: float, weight: float) -> float:
@@ -65,7 +65,7 @@ def test_total_variation_is_weighted_as_the_plane_is_rough_whatever_the_weight_o
     assert 1.1 * mean_of(1.0, 1.0) < mean_of(2.0, 1.0) < 2**-0.5
 
 
-def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
+def test_intervals_cover_the_truth_on_objects() -> None:
     truth: Image = pieces(64)
     held = []
     for seed in range(3):
@@ -75,7 +75,7 @@ def test_intervals_hold_the_truth_where_there_is_something_to_see() -> None:
     assert 0.85 <= np.mean(held) <= 0.995
 
 
-def test_each_plane_of_a_scene_has_its_own_as_if_the_others_were_known() -> None:
+def test_each_plane_of_a_scene_has_sigma_as_if_the_others_were_known() -> None:
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
     settings = Settings(penalty_weight=0.8, uncertainty=True)

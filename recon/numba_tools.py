@@ -1,16 +1,21 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""Logarithm and exponential that can be vectorised in compiled loops.
+"""What compiled functions share: their options, pointers into arrays, and fast elementary functions.
 
-The library's functions take one number at a time, which would more than double the cost of a pass over the data. In
-float32 the functions here replace them, with errors of one or two units in the last place; in float64 they are the
-library's.
+An array is a counted reference: passing one to a function that works on 64 numbers costs more than the work itself. A
+pointer is indexed like an array, `pointer[k]`, and costs nothing; whoever makes one must keep the array alive.
+
+The library's logarithm and exponential take one number at a time, which would more than double the cost of a pass over
+the data. In float32 the functions here replace them, with errors of one or two units in the last place; in float64
+they are the library's.
 """
 
 import math
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
 # Options of all compiled code: sums may be reordered, but infinities and NaN keep their meaning, because callers test
@@ -21,6 +26,9 @@ compiled = numba.njit(nogil=True, cache=True, **_OPTIONS)
 # For small functions called per pixel or block, where passing arrays would cost more than the work.
 inlined = numba.njit(inline="always", **_OPTIONS)
 
+# Unsigned, because numba tests whether signed indices are negative, and loops with tests are not vectorised.
+index = np.uintp
+
 _HALF_ROOT_BITS = np.int32(0x3F3504F3)  # √½ as float32
 _LN2, _LN2_HIGH, _LN2_LOW = np.float32(0.6931472), np.float32(0.693359375), np.float32(-2.12194440e-4)
 _LOG2_E = np.float32(1.442695)
@@ -29,27 +37,38 @@ _MIN_EXPONENT, _MAX_EXPONENT = np.float32(-87.0), np.float32(88.0)
 
 
 @intrinsic
-def _bits(_context, number):
-    """Return the 32 bits of a float32 as an int32."""
+def pointer(_context, array):
+    """Return the pointer to the first number of a contiguous array."""
 
-    def build(_, builder, __, arguments):
-        from llvmlite import ir
+    def build(context, builder, signature, arguments):
+        return context.make_array(signature.args[0])(context, builder, arguments[0]).data
 
-        return builder.bitcast(arguments[0], ir.IntType(32))
-
-    return types.int32(number), build
+    return types.CPointer(array.dtype)(array), build
 
 
 @intrinsic
-def _float_from_bits(_context, bits):
-    """Return the float32 with the 32 bits of an int32."""
+def advanced(_context, begin, count):
+    """Return the pointer to the number `count` places after another."""
 
     def build(_, builder, __, arguments):
-        from llvmlite import ir
+        return builder.gep(arguments[0], [arguments[1]])
 
-        return builder.bitcast(arguments[0], ir.FloatType())
+    return begin(begin, count), build
 
-    return types.float32(bits), build
+
+@intrinsic
+def prefetch(_context, begin, count):
+    """Tell the processor to load the cache line that holds the number `count` places after a pointer."""
+
+    def build(context, builder, _, arguments):
+        place = builder.bitcast(builder.gep(arguments[0], [arguments[1]]), cgutils.voidptr_t)
+        read, keep, data = (ir.Constant(ir.IntType(32), value) for value in (0, 3, 1))
+        kind = ir.FunctionType(ir.VoidType(), [cgutils.voidptr_t, read.type, keep.type, data.type])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [place, read, keep, data])
+        return context.get_dummy_value()
+
+    return types.void(begin, count), build
 
 
 def logarithm(x):
@@ -71,16 +90,14 @@ def _logarithm(x):
 
 @overload(exponential, inline="always")
 def _exponential(x):
-    if x == types.float32:
-        return _exponential_single
-    return lambda x: math.exp(min(max(x, -87.0), 88.0))
+    return _exponential_single if x == types.float32 else exponential
 
 
 def _logarithm_single(x):
     """Return ln x from x = 2ᵉ m with m near one, and six terms of the series of ln m = 2 artanh((m − 1)/(m + 1))."""
-    bits = _bits(x)
+    bits = np.float32(x).view(np.int32)
     exponent = np.int32(bits - _HALF_ROOT_BITS) >> np.int32(23)
-    mantissa = _float_from_bits(np.int32(bits - np.int32(exponent << np.int32(23))))
+    mantissa = np.int32(bits - np.int32(exponent << np.int32(23))).view(np.float32)
     s = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
     t = s * s
     series = np.float32(2 / 9) + t * np.float32(2 / 11)
@@ -96,4 +113,4 @@ def _exponential_single(x):
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = np.float32(1 / 24) + r * (np.float32(1 / 120) + r * (np.float32(1 / 720) + r * np.float32(1 / 5040)))
     series = np.float32(1) + r * (np.float32(1) + r * (np.float32(1 / 2) + r * (np.float32(1 / 6) + r * series)))
-    return series * _float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))
+    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
