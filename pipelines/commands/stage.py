@@ -18,8 +18,7 @@ from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.server import serving
 from faintfield.rig.stages.conformance import Check, conformance
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.protocol import Identity, Point, Position
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
 
 app = App(
     name="stage",

@@ -6,8 +6,7 @@ from faintfield.rig.clock import Clock
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.grbl.controller import GrblController
 from faintfield.rig.stages.marlin.controller import MarlinController
-from faintfield.rig.stages.protocol import Controller
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Controller, StageSettings
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
 

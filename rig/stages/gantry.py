@@ -12,10 +12,8 @@ from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s
-from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position
-from faintfield.rig.stages.settings import StageSettings
-from faintfield.rig.stages.workspace import StageWorkspace
+from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided, path_duration_s
+from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import serial
@@ -24,7 +25,6 @@ class TrafficLog(Protocol):
 
     def record(self, at_s: float, direction: Direction, data: bytes) -> None:
         """Record `data`, which passed at `at_s` on the rig's clock."""
-        ...
 
 
 class Port(Protocol):
@@ -32,15 +32,12 @@ class Port(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send `data`; raises `StageLost` if the connection is lost."""
-        ...
 
     def read(self, timeout_s: float) -> bytes:
         """Return what has arrived, waiting up to `timeout_s` for the first byte; raises `StageLost`."""
-        ...
 
     def close(self) -> None:
         """Close the connection."""
-        ...
 
 
 class SerialPort:
@@ -192,3 +189,20 @@ class LineTransport:
         except StageLost:
             self.close()
             raise
+
+
+@dataclass(frozen=True, slots=True)
+class Ok:
+    """The controller has accepted a command; its motion may still be under way."""
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A line of no known form, such as a damaged one."""
+
+    text: str
+
+
+def restart_failure() -> StageLost:
+    """Return the exception for a controller that has reported a restart."""
+    return StageLost("the controller has restarted, and its position is lost; check its power, then home it")

@@ -10,12 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from faintfield.rig.errors import RigError, StageError
-from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.link import PtyLink
-from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.simulation.controller.bench import Bench, PtyLink
+from faintfield.rig.stages.drift import DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.recovery import recover
 from tests.faults.stage_faults import FAULTS, Fault, faults_of
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink

@@ -1,14 +1,21 @@
 """What the simulated GRBL and Marlin have in common: restarts, lines in and out, homing that takes time."""
 
+import re
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import ClassVar
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 from faintfield.rig.simulation.controller.kinematics import Mechanics
-from faintfield.rig.simulation.controller.wire import Wire
-from faintfield.rig.stages.settings import ProtocolName
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
+from faintfield.rig.stages.protocol import ProtocolName
+
+WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
+
+
+def words(text: str) -> dict[str, float]:
+    """Return the numbers of a line by letter; the last word of a letter counts."""
+    return {letter: float(value) for letter, value in WORD.findall(text)}
 
 
 class SimulatedFirmware(ABC):

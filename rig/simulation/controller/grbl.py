@@ -8,13 +8,10 @@ before GRBL has asked for it; a failed homing still answers `ok`; and only some 
 import re
 from collections.abc import Callable
 
-from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.gcode import words
-from faintfield.rig.simulation.controller.grbl_lines import parse_jog, status_report
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, parse_jog, status_report
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
 # Sizes of GRBL's line (bytes), receive buffer (bytes) and planner (motions).
 _LINE_BYTES, _BUFFER_BYTES, _PLANNER_BLOCKS = 80, 128, 15

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock
 
 type Vector = tuple[float, ...]
 

@@ -11,11 +11,9 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.gcode import words
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
 
 # Motions that the planner holds.
 _PLANNER_BLOCKS = 16

@@ -8,9 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from faintfield.rig.simulation.controller.clock import SimulatedClock
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
 # Longest wait in s between two looks at the port.
 _MAX_WAIT_S = 0.05

@@ -9,11 +9,10 @@ from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import MarlinSettings
-from faintfield.rig.stages.messages import Ok, restart_failure
+from faintfield.rig.stages.marlin.messages import MarlinSettings
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
-from faintfield.rig.stages.transport import LineTransport
+from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
 # the echo of a marker.

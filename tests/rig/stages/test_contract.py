@@ -5,11 +5,9 @@ from collections.abc import Iterator
 import pytest
 
 from faintfield.rig.devices import open_stage
-from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink
+from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
 from faintfield.rig.stages.conformance import conformance
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Point, StageSettings
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.contract import check_stage
 from tests.rig.stages.socket_link import SocketLink

@@ -10,9 +10,8 @@ from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageA
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.drift import DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.recovery import recover
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
