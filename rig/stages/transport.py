@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import serial
+from msgspec import Struct
 from serial.tools.list_ports import comports
 
 from faintfield.rig.clock import Clock
@@ -191,13 +191,11 @@ class LineTransport:
             raise
 
 
-@dataclass(frozen=True, slots=True)
-class Ok:
+class Ok(Struct, frozen=True):
     """The controller has accepted a command; its motion may still be under way."""
 
 
-@dataclass(frozen=True, slots=True)
-class Unknown:
+class Unknown(Struct, frozen=True):
     """A line of no known form, such as a damaged one."""
 
     text: str

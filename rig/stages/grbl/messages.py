@@ -5,7 +5,9 @@ exactly is `Unknown`, so that a damaged line is never taken for a response.
 """
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+
+from msgspec import Struct
 
 from faintfield.rig.errors import WrongFirmware
 from faintfield.rig.stages.motion import timeout_s
@@ -14,58 +16,44 @@ from faintfield.rig.stages.transport import Ok, Unknown
 
 _NUMBER = r"-?\d{1,7}(?:\.\d{1,6})?"
 _VECTOR = rf"{_NUMBER}(?:,{_NUMBER}){{1,5}}"
-_ERROR = re.compile(r"error:(\d{1,3})")
-_ALARM = re.compile(r"ALARM:(\d{1,3})")
-_SETTING = re.compile(rf"\$(\d{{1,3}})=({_NUMBER})")
-_BANNER = re.compile(r"(Grbl|GrblHAL) (\d{1,2}\.\d{1,2}[a-z]?)(?: .*)?")
-_FEEDBACK = re.compile(r"\[([A-Za-z0-9]+):(.*)\]")
-_REPORT = re.compile(
-    rf"<(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep|Tool)(?::(\d{{1,2}}))?\|([MW])Pos:({_VECTOR})((?:\|[^|<>]*)*)>"
-)
 _OFFSET = re.compile(rf"\|WCO:({_VECTOR})(?=\||$)")
 _PINS = re.compile(r"\|Pn:([A-Z]+)(?=\||$)")
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorCode:
+class ErrorCode(Struct, frozen=True):
     """The controller has refused a command."""
 
     code: int
 
 
-@dataclass(frozen=True, slots=True)
-class Alarm:
+class Alarm(Struct, frozen=True):
     """The controller has stopped."""
 
     code: int
 
 
-@dataclass(frozen=True, slots=True)
-class Banner:
+class Banner(Struct, frozen=True):
     """The controller has just started."""
 
     name: str
     version: str
 
 
-@dataclass(frozen=True, slots=True)
-class GrblSetting:
+class GrblSetting(Struct, frozen=True):
     """One `$` setting."""
 
     number: int
     value: str
 
 
-@dataclass(frozen=True, slots=True)
-class Feedback:
+class Feedback(Struct, frozen=True):
     """A message in brackets: its kind (`MSG`, `VER`, `OPT`, ...) and text."""
 
     kind: str
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True):
     """A real-time status report.
 
     Parameters
@@ -97,25 +85,11 @@ type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report
 
 def parse(line: str) -> Message:
     """Return `line` as a message."""
-    if line == "ok":
-        return Ok()
-    if found := _REPORT.fullmatch(line):
-        return _report(found)
-    if found := _ERROR.fullmatch(line):
-        return ErrorCode(int(found[1]))
-    if found := _ALARM.fullmatch(line):
-        return Alarm(int(found[1]))
-    if found := _SETTING.fullmatch(line):
-        return GrblSetting(int(found[1]), found[2])
-    if found := _FEEDBACK.fullmatch(line):
-        return Feedback(found[1], found[2])
-    if found := _BANNER.fullmatch(line):
-        return Banner(found[1], found[2])
-    return Unknown(line)
+    return next((make(found) for form, make in _FORMS if (found := form.fullmatch(line))), Unknown(line))
 
 
 def _report(found: re.Match[str]) -> Report:
-    """Return the status report of a match of `_REPORT`."""
+    """Return the status report of a match."""
     state, substate, frame, position, fields = found.groups()
     offset, pins = _OFFSET.search(fields), _PINS.search(fields)
     return Report(
@@ -133,6 +107,24 @@ def _vector(text: str) -> tuple[float, ...]:
     return tuple(float(number) for number in text.split(","))
 
 
+# The forms of lines, each with the function that makes its message of a match.
+_FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] = (
+    (re.compile("ok"), lambda _: Ok()),
+    (
+        re.compile(
+            r"<(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep|Tool)(?::(\d{1,2}))?"
+            rf"\|([MW])Pos:({_VECTOR})((?:\|[^|<>]*)*)>"
+        ),
+        _report,
+    ),
+    (re.compile(r"error:(\d{1,3})"), lambda found: ErrorCode(int(found[1]))),
+    (re.compile(r"ALARM:(\d{1,3})"), lambda found: Alarm(int(found[1]))),
+    (re.compile(rf"\$(\d{{1,3}})=({_NUMBER})"), lambda found: GrblSetting(int(found[1]), found[2])),
+    (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda found: Feedback(found[1], found[2])),
+    (re.compile(r"(Grbl|GrblHAL) (\d{1,2}\.\d{1,2}[a-z]?)(?: .*)?"), lambda found: Banner(found[1], found[2])),
+)
+
+
 # Reports and commands have three decimals, and each rounds by up to half a micrometre.
 _ROUNDING_MM = 0.001
 
@@ -143,8 +135,7 @@ _MIN_HOMING_BOUND_S = 240.0
 _KEEP_MOTORS_ON = 255
 
 
-@dataclass(frozen=True)
-class GrblSettings:
+class GrblSettings(Struct, frozen=True):
     """The `$$` settings and the `$I` build information of one controller.
 
     Parameters

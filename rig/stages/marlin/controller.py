@@ -64,7 +64,7 @@ class MarlinController:
         first, second = self._read_settings(), self._read_settings()
         if first != second:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return MarlinSettings.from_messages((*about, *first)).identity(self._axes, self._travel_mm)
+        return MarlinSettings((*about, *first)).identity(self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> float:
         """Home the named axis or both, and no others, such as a focus drive."""
