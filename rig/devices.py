@@ -20,8 +20,7 @@ from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.gantry import Gantry, make_stage
 from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
 

@@ -15,7 +15,7 @@ from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
-from faintfield.rig.simulation.controller.server import serving
+from faintfield.rig.simulation.controller.firmware import serving
 from faintfield.rig.stages.conformance import Check, conformance
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings

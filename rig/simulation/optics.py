@@ -43,15 +43,6 @@ class SimulatedOptics:
         """
         return _rays(self, samples_per_px)
 
-    def cast_rays(self, samples_per_px: int) -> NDArray[np.float32]:
-        """Compute the result of `rays`, which is cached."""
-        width, height = self.size_px
-        inside = (np.arange(samples_per_px) + 0.5) / samples_per_px - 0.5
-        columns = (np.arange(width)[:, np.newaxis] + inside).ravel()
-        rows = (np.arange(height)[:, np.newaxis] + inside).ravel()
-        x, y = np.meshgrid((columns - self.cx_px) / self.fx_px, (rows - self.cy_px) / self.fy_px)
-        return np.stack(_undistort(x, y, self.distortion), axis=-1).astype(np.float32)
-
     def relative_illumination(self) -> NDArray[np.float32]:
         """Return the light (row, column) of a scene of uniform radiance, relative to the optical axis."""
         if not self.vignetting:
@@ -67,7 +58,12 @@ class SimulatedOptics:
 @lru_cache(maxsize=8)
 def _rays(optics: SimulatedOptics, samples_per_px: int) -> NDArray[np.float32]:
     """Return the rays of a lens, cached because a capture uses the same lens for every frame."""
-    rays = optics.cast_rays(samples_per_px)
+    width, height = optics.size_px
+    inside = (np.arange(samples_per_px) + 0.5) / samples_per_px - 0.5
+    columns = (np.arange(width)[:, np.newaxis] + inside).ravel()
+    rows = (np.arange(height)[:, np.newaxis] + inside).ravel()
+    x, y = np.meshgrid((columns - optics.cx_px) / optics.fx_px, (rows - optics.cy_px) / optics.fy_px)
+    rays = np.stack(_undistort(x, y, optics.distortion), axis=-1).astype(np.float32)
     rays.flags.writeable = False
     return rays
 

@@ -63,7 +63,7 @@ class SerialPort:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except (serial.SerialException, OSError, ValueError) as failure:
+        except (OSError, ValueError) as failure:
             present = ", ".join(port.device for port in comports()) or "none"
             raise StageLost(
                 f"{url}: cannot be opened ({in_one_line(failure)}); serial ports here: {present}; "
@@ -93,11 +93,7 @@ class SerialPort:
         """Raise `StageLost` for what pyserial raises on a lost connection."""
         try:
             yield
-        except (
-            serial.SerialException,
-            OSError,
-            TypeError,
-        ) as failure:  # TypeError: raised by pyserial on a closed port
+        except (OSError, TypeError) as failure:  # pyserial's own is an OSError; a closed port raises a TypeError
             raise StageLost(
                 f"{self._url}: the connection is lost ({in_one_line(failure)}); "
                 "check cable and power; the stage must be homed again"

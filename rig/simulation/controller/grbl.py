@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, parse_jog, status_report
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error, status_report
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
@@ -207,21 +207,20 @@ class SimulatedGrbl(SimulatedFirmware):
         answer = self.settings.answer(line)
         if answer is None:
             return 3
-        for text in answer:
-            self.say(text)
+        self.say(*answer)
         return 0
 
     def _jog(self, text: str) -> int:
         """Run a jog."""
         if self.state not in ("Idle", "Jog"):
             return 9
-        jog = parse_jog(text)
-        if isinstance(jog, int):
-            return jog
-        target = self._target(jog.words, relative=jog.relative, machine=jog.machine)
+        if error := jog_error(text):
+            return error
+        parsed = words(text)
+        target = self._target(parsed, relative="G91" in text, machine="G53" in text)
         if not self.settings.allows(target):
             return 15
-        self._queue(target, jog.words["F"], "Jog")
+        self._queue(target, parsed["F"], "Jog")
         return 0
 
     def _gcode(self, line: str) -> int:

@@ -1,8 +1,7 @@
-"""The `$` settings of the simulated GRBL, what they mean for its motions, and the reports that it sends."""
+"""The `$` settings of the simulated GRBL, what they mean for its motions, its jogs and its reports."""
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from faintfield.rig.simulation.controller.firmware import WORD, words
 from faintfield.rig.simulation.controller.kinematics import along
@@ -64,31 +63,14 @@ class StoredSettings(dict[int, str]):
         return None
 
 
-_JOG_LETTERS = set("GXYZF")
-_JOG_MODES = {"G20", "G21", "G90", "G91", "G53"}
-_BAD_JOG, _NO_FEED = 16, 22
-
-
-@dataclass(frozen=True)
-class JogCommand:
-    """A jog: its words, and how they give the target."""
-
-    words: dict[str, float]
-    relative: bool
-    machine: bool
-
-
-def parse_jog(text: str) -> JogCommand | int:
-    """Return what follows `$J=` as a jog, or the number of GRBL's error."""
-    parsed = words(text)
-    modes = set(re.findall(r"G\d+", text))
-    if not parsed.keys() <= _JOG_LETTERS or not modes <= _JOG_MODES or WORD.sub("", text):
-        return _BAD_JOG
+def jog_error(text: str) -> int:
+    """Return the number of GRBL's error for what follows `$J=`, 0 if it is a jog."""
+    parsed, modes = words(text), set(re.findall(r"G\d+", text))
+    if not parsed.keys() <= set("GXYZF") or not modes <= {"G20", "G21", "G90", "G91", "G53"} or WORD.sub("", text):
+        return 16
     if "F" not in parsed:
-        return _NO_FEED
-    return (
-        JogCommand(parsed, relative="G91" in modes, machine="G53" in modes) if parsed.keys() & {"X", "Y"} else _BAD_JOG
-    )
+        return 22
+    return 0 if parsed.keys() & {"X", "Y"} else 16
 
 
 def status_report(
