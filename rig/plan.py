@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import product
 from typing import Literal
 
 import msgspec
@@ -238,15 +239,7 @@ def planned_frames(plan: CapturePlan) -> tuple[PlannedFrame, ...]:
     frames: list[PlannedFrame] = []
     seen: Counter[StepKind] = Counter()
     for index, step in enumerate(plan.steps):
-        first = len(frames)
-        frames.extend(
-            PlannedFrame(first + offset, index, step.kind, seen[step.kind], stop, exposure_s, repeat)
-            for offset, (stop, exposure_s, repeat) in enumerate(
-                (stop, exposure_s, repeat)
-                for stop in plan.stops_of(step)
-                for exposure_s in step.exposure_s
-                for repeat in range(step.frames_per_node)
-            )
-        )
+        for stop, exposure_s, repeat in product(plan.stops_of(step), step.exposure_s, range(step.frames_per_node)):
+            frames.append(PlannedFrame(len(frames), index, step.kind, seen[step.kind], stop, exposure_s, repeat))
         seen[step.kind] += 1
     return tuple(frames)

@@ -226,9 +226,7 @@ class Dialogue:
         """Show the state of the capture, which is `doing` something for `frame`."""
         session = self._session
         missing, steps = session.missing(), session.plan.steps
-        drift_checks = len({it.step for it in missing if steps[it.step].at == "grid"})
-        if not session.frozen.rig.drift.check:
-            drift_checks = 0
+        to_check = {it.step for it in missing if steps[it.step].at == "grid"}
         self.operator.show_status(
             Status(
                 doing=doing,
@@ -237,7 +235,7 @@ class Dialogue:
                 title=step_title(frame, frame.step + 1, len(steps)),
                 done=len(session.valid()),
                 total=len(session.frames),
-                to_go_s=self._pace.remaining_s(missing, drift_checks),
+                to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
                 node=frame.stop.node,
                 grid=self._shares_done(frame.step),
                 warnings=self.warnings,

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +24,6 @@ from faintfield.rig.stages.protocol import Point
 _WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)
 
 
-@dataclass(frozen=True)
 class Carriage:
     """Maps motor positions to camera poses, repeatably and without error at the centre.
 
@@ -32,30 +31,22 @@ class Carriage:
     ----------
     centre : Point
         Motor position of the reference pose.
-    position_sd_mm, rotation_sd_rad : float
-        Standard deviation over the travel of the error of each axis, relative to the centre.
-    scale_error : float
-        Relative excess of distances along the columns' axis.
-    squareness_rad : float
-        Difference of a right angle and the angle between the axes.
-    seed : int
-        Seed of the shape of the rails.
+    settings : SimulatedSettings
+        Standard deviation of the pose over the travel, scale and squareness of the axes, and the seed of the rails.
     """
 
-    centre: Point
-    position_sd_mm: float = 0.0
-    rotation_sd_rad: float = 0.0
-    scale_error: float = 0.0
-    squareness_rad: float = 0.0
-    seed: int = 0
+    def __init__(self, centre: Point, settings: SimulatedSettings) -> None:
+        self._centre = centre
+        self._settings = settings
 
     def rt_cam_ref(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
         """Return the camera pose (6,), Rodrigues rad and mm, at a motor position."""
-        right_mm, down_mm = x_mm - self.centre.x_mm, y_mm - self.centre.y_mm
-        sd = np.repeat([self.rotation_sd_rad, self.position_sd_mm], 3)
+        right_mm, down_mm = x_mm - self._centre.x_mm, y_mm - self._centre.y_mm
+        settings = self._settings
+        sd = np.repeat([settings.rotation_error_mrad * 1e-3, settings.position_error_mm], 3)
         pose: NDArray[np.float64] = sd * (self._waves(right_mm, down_mm) - self._waves(0.0, 0.0))
-        right_mm = right_mm * (1.0 + self.scale_error) + down_mm * np.sin(self.squareness_rad)
-        down_mm *= np.cos(self.squareness_rad)
+        right_mm = right_mm * (1.0 + settings.scale_error) + down_mm * np.sin(settings.squareness_mrad * 1e-3)
+        down_mm *= np.cos(settings.squareness_mrad * 1e-3)
         # A camera moved right and down by c maps reference points by −c
         pose[3:5] -= right_mm, down_mm
         return pose
@@ -68,7 +59,7 @@ class Carriage:
     @cached_property
     def _shape(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Return the wave vectors' x and y and the phases, each (6, wave)."""
-        generator = np.random.default_rng([self.seed, 1])
+        generator = np.random.default_rng([self._settings.seed, 1])
         direction, phase = generator.uniform(0.0, 2.0 * np.pi, (2, 6, _WAVES))
         per_mm = 2.0 * np.pi / generator.uniform(*_WAVE_LENGTHS_MM, (6, _WAVES))
         return per_mm * np.cos(direction), per_mm * np.sin(direction), phase
@@ -115,14 +106,7 @@ class SimulatedLab:
         self._still_s = still_s
         self._boards = boards
         self._settings = settings
-        self._carriage = Carriage(
-            centre,
-            settings.position_error_mm,
-            settings.rotation_error_mrad * 1e-3,
-            settings.scale_error,
-            settings.squareness_mrad * 1e-3,
-            settings.seed,
-        )
+        self._carriage = Carriage(centre, settings)
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
