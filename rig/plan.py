@@ -1,4 +1,4 @@
-"""Plan a capture: all positions and frames, computed once, before anything moves."""
+"""Plan a capture: its grid, all positions and all frames, computed once, before anything moves."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from faintfield.rig.stages.motion import StageWorkspace, one_sided, path_duration_s
+from faintfield.rig.stages.motion import StageWorkspace, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point
 
 
@@ -174,7 +174,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         points = [targets.pop(0) if start is None else start] if targets else []
         for target in targets:
             if target != points[-1]:
-                points.extend(one_sided(points[-1], target, self.approach_mm))
+                points.extend(one_sided_path(points[-1], target, self.approach_mm))
         return tuple(points)
 
     def check(self, workspace: StageWorkspace, start: Point | None = None) -> None:

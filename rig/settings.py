@@ -1,4 +1,4 @@
-"""Define the content of rig.toml, which describes the rig of a capture."""
+"""The content of rig.toml, which describes the rig of a capture."""
 
 import math
 

@@ -1,5 +1,6 @@
-"""Guide a person through the experiment: what to do before each step, and which answers there are."""
+"""Guide the operator through a capture: what to do before each step, questions, answers, warnings and status."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from typing import Literal, NoReturn, Protocol
 
@@ -171,7 +172,7 @@ def format_duration(duration_s: float) -> str:
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
 
 
-# Without a person, a frame is given up after this many failures in a row, and a stage after losing steps as often.
+# Without an operator, a capture stops after this many failures in a row at one frame, or failed drift checks in all.
 MAX_UNATTENDED_TRIES = 3
 
 
@@ -245,12 +246,11 @@ class Dialogue:
     def _shares_done(self, step: int) -> tuple[tuple[float, ...], ...]:
         """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
         grid, valid = self._session.frozen.rig.grid, self._session.valid()
-        counts = {(row, column): [0, 0] for row in range(grid.rows) for column in range(grid.columns)}
+        taken: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
         for frame in self._session.frames:
             if frame.step == step:
-                counts[frame.stop.node][0] += frame.number in valid
-                counts[frame.stop.node][1] += 1
+                taken[frame.stop.node].append(frame.number in valid)
+        shares = {node: sum(frames) / len(frames) for node, frames in taken.items()}
         return tuple(
-            tuple(done / of if of else -1.0 for done, of in (counts[row, column] for column in range(grid.columns)))
-            for row in range(grid.rows)
+            tuple(shares.get((row, column), -1.0) for column in range(grid.columns)) for row in range(grid.rows)
         )

@@ -1,4 +1,4 @@
-"""Take one frame: move, rest, verify the position, expose, write, check and commit."""
+"""Take one frame, and check for drift: move, rest, verify the position, expose, write, check and commit."""
 
 import itertools
 from collections.abc import Callable
@@ -66,7 +66,7 @@ class DriftChecks:
     def add(self, frame: CommittedFrame) -> None:
         """Note that a frame relies on the position of the stage."""
         if self.watch is not None:
-            self.watch.visited(frame)
+            self.watch.note(frame)
 
     def check_after(self, nodes: int) -> None:
         """Check for drift if at least `nodes` nodes were visited since the last check; 0 means no check."""
@@ -176,7 +176,7 @@ class FrameTaker:
         self._pace.arrive(target, timed=not measures)
 
     def _expose(self, frame: PlannedFrame) -> None:
-        """Take a frame at the present node; the order of the steps is what makes a kill at any moment harmless."""
+        """Take a frame at the present node; the order of these steps makes a kill at any moment harmless."""
         rig, session = self._rig, self._session
         begun_s = rig.clock.now_s()
         intent = session.intend(frame)

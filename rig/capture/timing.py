@@ -13,7 +13,7 @@ from faintfield.rig.clock import Clock
 from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.settings import SettleSettings
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.motion import one_sided, path_duration_s
+from faintfield.rig.stages.motion import one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import Point
 
 # Time in s of a stop besides motion and rest, and of a frame besides exposure and readout, until one has been measured:
@@ -99,7 +99,7 @@ class Pace:
 
     def _motion_s(self, start: Point, target: Point) -> float:
         """Return how long the motion from `start` to `target` takes."""
-        path = (start, *one_sided(start, target, self._stage.settings.approach_mm))
+        path = (start, *one_sided_path(start, target, self._stage.settings.approach_mm))
         return path_duration_s(path, self._stage.identify().motion, self._stage.feed_mm_per_s())
 
 

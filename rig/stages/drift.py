@@ -1,4 +1,4 @@
-"""Detects lost steps, which no report shows, by timing homing again.
+"""Detects lost steps, which no report shows, by timing homing again, and recovers the stage after an error.
 
 When a motor loses steps, the carriage is not where the controller counts it. Homing from a known position then takes
 longer or shorter than before, since the distance to the switch has changed. The speed of homing is measured at the
@@ -75,7 +75,7 @@ class DriftWatch:
         """What was recorded before a failed check, or not checked before the stage was homed again."""
         return tuple(self._doubtful)
 
-    def visited(self, what: object) -> None:
+    def note(self, what: object) -> None:
         """Record that `what` (a node, a frame) was taken at a position not yet checked."""
         self._unchecked.append(what)
 
@@ -180,7 +180,7 @@ class DriftWatch:
         return speed
 
     def _mark_doubtful(self) -> tuple[object, ...]:
-        """Count what is unchecked as doubtful, and return it."""
+        """Mark what is unchecked as doubtful, and return it."""
         doubtful, self._unchecked = self.unchecked, []
         self._doubtful.extend(doubtful)
         return doubtful

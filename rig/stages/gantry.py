@@ -14,7 +14,7 @@ from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
 from faintfield.rig.stages.grbl.controller import GrblController
 from faintfield.rig.stages.marlin.controller import MarlinController
-from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided, path_duration_s
+from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 
@@ -119,7 +119,7 @@ class Gantry:
     def move_to(self, x_mm: float, y_mm: float) -> Position:
         """Go to a position, wait until the stage stands still there, and return the verified report.
 
-        Every axis arrives upwards (`one_sided`), so play in the drive does not affect where the carriage stops.
+        Every axis arrives upwards (`one_sided_path`), so play in the drive does not affect where the carriage stops.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Gantry:
         target = Point(x_mm, y_mm)
         self._require_trust(target)
         start = self._here or self.position().point
-        path = (start, *one_sided(start, target, self.settings.approach_mm))
+        path = (start, *one_sided_path(start, target, self.settings.approach_mm))
         self.workspace().check_path(path)
         feed = self.feed_mm_per_s()
         predicted_s = path_duration_s(path, self.identify().motion, feed)

@@ -41,7 +41,7 @@ def path_duration_s(path: Sequence[Point], motion: MotionLimits, feed_mm_per_s: 
     return sum(duration_s(start, end, motion, feed_mm_per_s) for start, end in pairwise(path))
 
 
-def one_sided(start: Point, target: Point, approach_mm: float) -> tuple[Point, ...]:
+def one_sided_path(start: Point, target: Point, approach_mm: float) -> tuple[Point, ...]:
     """Return a path to `target` on which every axis arrives upwards.
 
     Screws and belts have play: the carriage stops at a different place when it arrives from the other side. An axis

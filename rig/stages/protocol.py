@@ -1,4 +1,4 @@
-"""The types of a stage, and `Controller`: what the driver of one firmware must be able to do.
+"""The types and settings of a stage, and `Controller`: what the driver of one firmware must be able to do.
 
 Coordinates are the controller's machine coordinates in millimetres, along the two axes that carry the camera. They are
 not shifted or flipped, so a position in a log can be compared with the controller's display.

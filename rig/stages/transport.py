@@ -1,4 +1,4 @@
-"""Sends and receives lines over a serial port, and logs every byte with its time."""
+"""Sends and receives lines over a serial port, logging every byte, and defines what both firmwares answer."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -96,7 +96,7 @@ class RehearsedCapture:
         self.stage.verify_at(*target)
         frame = KeptFrame(len(self.kept), target, began, self.bench.true_position())
         self.kept.append(frame)
-        self.watch.visited(frame.number)
+        self.watch.note(frame.number)
 
     def accepted(self) -> list[KeptFrame]:
         """Return the frames that are neither doubtful nor unchecked."""

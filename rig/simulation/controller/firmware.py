@@ -1,4 +1,4 @@
-"""What the simulated GRBL and Marlin have in common: restarts, lines in and out, homing that takes time, a port."""
+"""What the simulated GRBL and Marlin share: restarts, lines and homing, and a server that gives them a real port."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Exchanges commands, responses and status reports with GRBL, and raises its errors, alarms and restarts, explained."""
+"""Exchanges commands, responses and status reports with GRBL, and explains its alarms, errors and states."""
 
 import re
 

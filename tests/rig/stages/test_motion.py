@@ -12,7 +12,7 @@ from faintfield.rig.simulation.controller.kinematics import Profile
 from faintfield.rig.stages.motion import (
     StageWorkspace,
     duration_s,
-    one_sided,
+    one_sided_path,
     path_duration_s,
     segment_meets,
     timeout_s,
@@ -51,7 +51,7 @@ def test_the_simulated_carriage_takes_as_long_as_predicted(length: float, speed:
 @settings(deadline=None)
 @given(points, points, st.floats(0.1, 5.0))
 def test_no_axis_arrives_downwards(start: Point, target: Point, approach_mm: float) -> None:
-    path = (start, *one_sided(start, target, approach_mm))
+    path = (start, *one_sided_path(start, target, approach_mm))
     assert path[-1] == target
     assert len(path) <= 3
     before = path[-2]
