@@ -122,7 +122,7 @@ def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
     boards whose pose was solved.
     """
     rig = measured.rig
-    solved = {board.target for board in rig.settings}
+    solved = {board.target for board in rig.boards}
     files: dict[str, bytes | str] = {
         COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.intrinsics),
         CORNERS_FILE: _corners_npz([seen for seen in measured.observations if seen.target in solved]),
