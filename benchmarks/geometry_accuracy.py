@@ -26,7 +26,7 @@ from faintfield.calib.geometry import (
 )
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
 from faintfield.calib.lens import Lens
-from faintfield.rig.grid import grid_nodes
+from faintfield.rig.plan import grid_nodes
 from faintfield.rig.simulation.boards import six_boards
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 

@@ -16,8 +16,7 @@ from faintfield.rig.session.journal import FrameRecord
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.settings import RigSettings, StepSettings
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Point, StageSettings
 
 FRAMES = 40
 SHAPE = (3000, 4000)

@@ -10,7 +10,7 @@ from faintfield.calib.lens import Lens
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
-from faintfield.rig.grid import nominal_poses_rt_cam_ref
+from faintfield.rig.plan import nominal_poses_rt_cam_ref
 
 DEPTH_MM = 500.0
 

@@ -27,7 +27,7 @@ _MODULES = {
     "ReconstructionError": "recon.errors",
     "RigError": "rig.errors",
     "RigSettings": "rig.settings",
-    "StageSettings": "rig.stages.settings",
+    "StageSettings": "rig.stages.protocol",
     "CaptureStep": "rig.plan",
     "Target": "calib.geometry",
     "back_projection": "recon.solver.initialization",
@@ -46,7 +46,7 @@ _MODULES = {
     "read_frame": "pipelines.formats.frames",
     "simulate": "pipelines.commands.simulate",
     "smooth_start": "recon.solver.initialization",
-    "taken_frames": "rig.session.access",
+    "taken_frames": "rig.session.session",
     "universal_penalty_weight": "recon.solver.initialization",
 }
 __all__ = list(_MODULES)
@@ -86,11 +86,11 @@ if TYPE_CHECKING:  # type checkers and editors read these lines; a test compares
     from faintfield.rig.plan import CapturePlan as CapturePlan
     from faintfield.rig.plan import CaptureStep as CaptureStep
     from faintfield.rig.plan import Grid as Grid
-    from faintfield.rig.session.access import taken_frames as taken_frames
+    from faintfield.rig.session.session import taken_frames as taken_frames
     from faintfield.rig.settings import RigSettings as RigSettings
     from faintfield.rig.stages.protocol import MotionLimits as MotionLimits
     from faintfield.rig.stages.protocol import Point as Point
-    from faintfield.rig.stages.settings import StageSettings as StageSettings
+    from faintfield.rig.stages.protocol import StageSettings as StageSettings
 
     __version__: str
     calibrate_noise = calibrate

@@ -9,11 +9,9 @@ class Clock(Protocol):
 
     def now_s(self) -> float:
         """Return the time in seconds since a fixed moment."""
-        ...
 
     def sleep_s(self, duration_s: float) -> None:
         """Wait for `duration_s` seconds."""
-        ...
 
 
 class WallClock:

@@ -16,15 +16,12 @@ from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import RigSettings
-from faintfield.rig.simulation.camera import SimulatedCamera
-from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import PtyLink
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.stages.drivers import make_stage
-from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
+from faintfield.rig.stages.gantry import Gantry, make_stage
+from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
 # Prefix of the port of a simulated stage; the name of its controller follows.

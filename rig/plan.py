@@ -1,15 +1,37 @@
-"""Plan a capture: all positions and frames, computed once, before anything moves."""
+"""Plan a capture: its grid, all positions and all frames, computed once, before anything moves."""
 
+from collections import Counter
 from collections.abc import Sequence
+from itertools import product
 from typing import Literal
 
 import msgspec
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from faintfield.rig.grid import centre_node
-from faintfield.rig.stages.motion import one_sided, path_duration_s
+from faintfield.rig.stages.motion import StageWorkspace, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace
+
+
+def grid_nodes(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Return the nodes (row, column) in raster order; row 0 is the top, column 0 the left."""
+    return [(row, column) for row in range(rows) for column in range(columns)]
+
+
+def centre_node(rows: int, columns: int) -> tuple[int, int]:
+    """Return the node of the reference camera; of two in the middle, the lower or right one."""
+    return rows // 2, columns // 2
+
+
+def nominal_poses_rt_cam_ref(rows: int, columns: int, pitch_mm: float) -> NDArray[np.float64]:
+    """Return the poses (view, 6) of a perfect grid; a camera moved by c right and down shifts points by −c."""
+    row_0, column_0 = centre_node(rows, columns)
+    poses = np.zeros((rows * columns, 6))
+    for view, (row, column) in enumerate(grid_nodes(rows, columns)):
+        poses[view, 3:5] = (column_0 - column) * pitch_mm, (row_0 - row) * pitch_mm
+    return poses
+
 
 type Order = Literal["serpentine", "raster"]
 type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"]
@@ -152,7 +174,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         points = [targets.pop(0) if start is None else start] if targets else []
         for target in targets:
             if target != points[-1]:
-                points.extend(one_sided(points[-1], target, self.approach_mm))
+                points.extend(one_sided_path(points[-1], target, self.approach_mm))
         return tuple(points)
 
     def check(self, workspace: StageWorkspace, start: Point | None = None) -> None:
@@ -174,3 +196,50 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         )
         moving_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
         return moving_s + stops * (_ARRIVAL_S + self.settle_s) + exposing_s
+
+
+class PlannedFrame(Struct, frozen=True):
+    """One frame that the plan asks for.
+
+    Parameters
+    ----------
+    number : int
+        Index in the plan.
+    step : int
+        Index of its step in the plan.
+    kind : str
+        Kind of that step.
+    sweep : int
+        Number of earlier steps of the same kind: the sweep of a board, the light level of a flat.
+    stop : Stop
+        Node and position of the stage.
+    exposure_s : float
+        Exposure time in s.
+    repeat : int
+        Index among the frames of the same exposure time at the same stop.
+    """
+
+    number: int
+    step: int
+    kind: StepKind
+    sweep: int
+    stop: Stop
+    exposure_s: float
+    repeat: int
+
+    @property
+    def name(self) -> str:
+        """Name of the frame in messages, and the beginning of its file name."""
+        row, column = self.stop.node
+        return f"{self.number:05d}_{self.kind}_{self.sweep}_r{row}_c{column}"
+
+
+def planned_frames(plan: CapturePlan) -> tuple[PlannedFrame, ...]:
+    """Return all frames of `plan`, in order."""
+    frames: list[PlannedFrame] = []
+    seen: Counter[StepKind] = Counter()
+    for index, step in enumerate(plan.steps):
+        for stop, exposure_s, repeat in product(plan.stops_of(step), step.exposure_s, range(step.frames_per_node)):
+            frames.append(PlannedFrame(len(frames), index, step.kind, seen[step.kind], stop, exposure_s, repeat))
+        seen[step.kind] += 1
+    return tuple(frames)

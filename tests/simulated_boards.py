@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintfield.calib.board import Board, black_rectangles_mm
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.board_set import BoardEntry, BoardSetFile, ImageEntry, write_board_set
-from faintfield.rig.grid import grid_nodes
+from faintfield.rig.plan import grid_nodes
 from faintfield.rig.simulation.boards import SimulatedBoard, printed_board, six_boards
 from faintfield.rig.simulation.experiment import SimulatedExperiment
 from faintfield.rig.simulation.scene import TexturedPlane, render

@@ -29,7 +29,7 @@ from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.recon.likelihood.images import LikelihoodName
 from faintfield.recon.solver.penalties import PenaltyName
-from faintfield.rig.session.access import has_session
+from faintfield.rig.session.session import has_session
 
 
 def reconstruct(

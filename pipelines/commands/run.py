@@ -21,8 +21,7 @@ from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_de
 from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
-from faintfield.rig.session.access import has_session, read_plan, taken_frames
-from faintfield.rig.session.session import PLAN
+from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 
 def run(

@@ -15,11 +15,10 @@ from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
-from faintfield.rig.simulation.controller.server import serving
-from faintfield.rig.stages.conformance import Check, conformance
+from faintfield.rig.simulation.controller.firmware import serving
+from faintfield.rig.stages.conformance import Check, check_conformance
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.protocol import Identity, Point, Position
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
 
 app = App(
     name="stage",
@@ -172,7 +171,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     """
     with _connected(connection) as stage:
         checks = []
-        for check in conformance(stage):
+        for check in check_conformance(stage):
             inform(f"tried: {check.name}")
             checks.append(check)
     console.print(_table(checks))

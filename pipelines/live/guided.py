@@ -17,9 +17,8 @@ from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.session.access import has_session, read_plan
 from faintfield.rig.session.resume import check_same_rig, open_session
-from faintfield.rig.session.session import FrozenPlan, is_sealed
+from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 
 

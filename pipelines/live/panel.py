@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
-from faintfield.rig.session.frames import PlannedFrame
+from faintfield.rig.plan import PlannedFrame
 
 REQUESTS: tuple[OperatorRequest, ...] = get_args(OperatorRequest.__value__)
 

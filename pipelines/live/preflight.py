@@ -8,7 +8,7 @@ from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.survey import Survey
 from faintfield.rig.devices import is_simulated
 from faintfield.rig.plan import CapturePlan
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import StageSettings
 
 # Frames that are taken again keep their earlier file: ask for half as much room again.
 _ROOM_FACTOR = 1.5

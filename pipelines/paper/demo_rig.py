@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 
 from faintfield.recon.metrics import signal_scale_for_snr
-from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import (
+    BoardSettings,
     CheckSettings,
     DriftSettings,
     RigSettings,
@@ -20,8 +20,7 @@ from faintfield.rig.settings import (
 )
 from faintfield.rig.simulation.lab import flat_photons_per_s, lab_experiment
 from faintfield.rig.simulation.scene import render
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Point, StageSettings
 
 EXPOSURE_S = 0.1
 

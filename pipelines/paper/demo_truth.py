@@ -21,10 +21,9 @@ from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.request import folder_of_method
 from faintfield.pipelines.simulation.scene_truth import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.session.access import read_plan, taken_frames
-from faintfield.rig.simulation.camera import TRUE_POSE
+from faintfield.rig.session.session import read_plan, taken_frames
 from faintfield.rig.simulation.experiment import SimulatedExperiment
-from faintfield.rig.simulation.lab import lab_experiment
+from faintfield.rig.simulation.lab import TRUE_POSE, lab_experiment
 
 type Node = tuple[int, int]
 

@@ -13,7 +13,7 @@ from faintfield.pipelines.formats.hashes import Hashes
 from faintfield.pipelines.formats.provenance import Provenance, first_difference, provenance
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
-from faintfield.rig.session.access import taken_frames
+from faintfield.rig.session.session import taken_frames
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
 from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
-from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.optics import SimulatedSensor
 
 _PAPER = SimulatedSensor()
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_file import Noise
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
-from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.optics import SimulatedSensor
 
 
 def stated_noise(sensor: SimulatedSensor) -> Noise:

@@ -18,10 +18,10 @@ from faintfield.recon.metrics import (
     photons_from_linear_snr,
     photons_from_moments,
 )
-from faintfield.rig.grid import grid_nodes
+from faintfield.rig.plan import grid_nodes
 from faintfield.rig.simulation.experiment import SimulatedExperiment
+from faintfield.rig.simulation.optics import through_mosaic
 from faintfield.rig.simulation.scene import TexturedPlane, render
-from faintfield.rig.simulation.sensor import through_mosaic
 
 NOISE_FREE = "noise_free"
 

@@ -1,6 +1,7 @@
 """Tethered cameras, through libgphoto2; files are kept byte for byte."""
 
 import re
+from functools import partial
 from pathlib import PurePath
 from typing import Any
 
@@ -42,7 +43,7 @@ class GPhoto2Camera:
         self.close()
         self._camera = self._bounded(self._connect, "connecting")
         for name, value in self._settings.settings.items():
-            self._set(name, value)
+            self._bounded(partial(self._set, name, value), f"setting {name} = {value}")
 
     def report(self) -> CameraReport:
         """Return model, serial number, exposure times and settings."""
@@ -135,19 +136,13 @@ class GPhoto2Camera:
         if nearest is None or abs(nearest - exposure_s) > 0.01 * nearest:
             offered = ", ".join(f"{seconds:g}" for seconds in sorted(choices))
             raise CameraError(f"exposure_s = {exposure_s:g} is not among the camera's: {offered}; choose one of them")
-        widget = self._shutter()
-        widget.set_value(choices[nearest])
-        self._camera.set_single_config(widget.get_name(), widget)
+        self._set(self._shutter().get_name(), choices[nearest])
 
     def _set(self, name: str, value: str) -> None:
         """Change one of the camera's settings."""
-
-        def change() -> None:
-            widget = self._camera.get_single_config(name)
-            widget.set_value(value)
-            self._camera.set_single_config(name, widget)
-
-        self._bounded(change, f"setting {name} = {value}")
+        widget = self._camera.get_single_config(name)
+        widget.set_value(value)
+        self._camera.set_single_config(name, widget)
 
     def _release(self) -> tuple[bytes, str]:
         """Expose, and return the file and its name."""

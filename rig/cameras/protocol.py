@@ -72,11 +72,9 @@ class Camera(Protocol):
 
     def open(self) -> None:
         """Connect to the camera, without exposing."""
-        ...
 
     def report(self) -> CameraReport:
         """Return the camera's name, limits and settings."""
-        ...
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame.
@@ -88,8 +86,6 @@ class Camera(Protocol):
         number : int
             Number of the exposure in the session, counting those that were not kept.
         """
-        ...
 
     def close(self) -> None:
         """Disconnect; closing twice does no harm."""
-        ...

@@ -1,13 +1,16 @@
-"""Guide a person through the experiment: what to do before each step, and which answers there are."""
+"""Guide the operator through a capture: what to do before each step, questions, answers, warnings and status."""
 
+from collections import defaultdict
 from collections.abc import Mapping
-from typing import Literal, Protocol
+from typing import Literal, NoReturn, Protocol
 
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.plan import StepKind
-from faintfield.rig.session.frames import PlannedFrame
+from faintfield.rig.capture.timing import Pace
+from faintfield.rig.errors import CaptureStopped
+from faintfield.rig.plan import PlannedFrame, StepKind
+from faintfield.rig.session.session import Session
 
 type Answer = Literal["go", "again", "keep", "retake", "skip", "stop"]
 type OperatorRequest = Literal["pause", "skip", "retake", "stop"]
@@ -121,19 +124,15 @@ class OperatorInterface(Protocol):
 
     def ask(self, prompt: Prompt) -> Answer:
         """Return the answer to a prompt, waiting for it."""
-        ...
 
     def take_request(self) -> OperatorRequest | None:
         """Return the latest request since the last call, without waiting."""
-        ...
 
     def show_status(self, status: Status) -> None:
         """Show the state of the capture."""
-        ...
 
     def show_frame(self, frame: PlannedFrame, pixels: Pixels, values: Mapping[str, float]) -> None:
         """Show the frame just taken."""
-        ...
 
 
 def step_prompt(frame: PlannedFrame, step: int, steps: int, frames: int, duration_s: float) -> Prompt:
@@ -171,3 +170,87 @@ def format_duration(duration_s: float) -> str:
         return f"about {max(1, round(duration_s))} s"
     minutes = round(duration_s / 60)
     return f"about {minutes} min" if minutes < 90 else f"about {minutes // 60} h {minutes % 60:02d} min"
+
+
+# Without an operator, a capture stops after this many failures in a row at one frame, or failed drift checks in all.
+MAX_UNATTENDED_TRIES = 3
+
+
+class Dialogue:
+    """The capture's side of the conversation with the operator.
+
+    Parameters
+    ----------
+    session : Session
+        Open session whose state is shown, and whose journal keeps what is said.
+    operator : OperatorInterface
+        Answers prompts and shows the state of the capture.
+    pace : Pace
+        Estimates the remaining time.
+
+    Attributes
+    ----------
+    warnings : tuple of str
+        The latest warnings, shown with the status.
+    """
+
+    def __init__(self, session: Session, operator: OperatorInterface, pace: Pace) -> None:
+        self._session = session
+        self._pace = pace
+        self.operator = operator
+        self.warnings: tuple[str, ...] = ()
+
+    def ask(self, prompt: Prompt) -> Answer:
+        """Ask the operator, and record question and answer."""
+        answer = self.operator.ask(prompt)
+        self._session.journal.event("prompt", key=prompt.key, title=prompt.title, lines=prompt.lines, answer=answer)
+        return answer
+
+    def warn(self, text: str) -> None:
+        """Record a warning, and show it from now on."""
+        self._session.journal.event("warning", message=text)
+        self.warnings = (text,)
+
+    def stop(self) -> NoReturn:
+        """End the capture on behalf of the operator.
+
+        Raises
+        ------
+        CaptureStopped
+            Always.
+        """
+        self._session.journal.event("stopped")
+        done, total = len(self._session.valid()), len(self._session.frames)
+        raise CaptureStopped(f"stopped with {done} of {total} frames taken; run the same command to go on")
+
+    def show_status(self, frame: PlannedFrame, doing: str) -> None:
+        """Show the state of the capture, which is `doing` something for `frame`."""
+        session = self._session
+        missing, steps = session.missing(), session.plan.steps
+        to_check = {it.step for it in missing if steps[it.step].at == "grid"}
+        self.operator.show_status(
+            Status(
+                doing=doing,
+                step=frame.step + 1,
+                steps=len(steps),
+                title=step_title(frame, frame.step + 1, len(steps)),
+                done=len(session.valid()),
+                total=len(session.frames),
+                to_go_s=self._pace.remaining_s(missing, len(to_check) if session.frozen.rig.drift.check else 0),
+                node=frame.stop.node,
+                grid=self._shares_done(frame.step),
+                warnings=self.warnings,
+            )
+        )
+
+    def _shares_done(self, step: int) -> tuple[tuple[float, ...], ...]:
+        """Return the share of a step's frames that is done, per row and column; −1 where the step has none."""
+        grid, valid = self._session.frozen.rig.grid, self._session.valid()
+        taken: defaultdict[tuple[int, int], list[bool]] = defaultdict(list)
+        for frame in self._session.frames:
+            if frame.step == step:
+                taken[frame.stop.node].append(frame.number in valid)
+        shares = {node: sum(frames) / len(frames) for node, frames in taken.items()}
+        return tuple(
+            tuple(shares.get((row, column), -1.0) for column in range(grid.columns)) for row in range(grid.rows)
+        )

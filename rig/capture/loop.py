@@ -4,17 +4,15 @@ from contextlib import suppress
 
 import msgspec
 
-from faintfield.rig.capture.dialogue import MAX_UNATTENDED_TRIES, Dialogue
-from faintfield.rig.capture.drift_checks import DriftChecks
-from faintfield.rig.capture.guide import Answer, OperatorInterface, Prompt, step_prompt
-from faintfield.rig.capture.pace import Pace
+from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
 from faintfield.rig.capture.survey import check_plan
-from faintfield.rig.capture.take import Decode, FrameTaker
+from faintfield.rig.capture.take import Decode, DriftChecks, FrameTaker
+from faintfield.rig.capture.timing import Pace
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, NotHomed, StageError
-from faintfield.rig.session.frames import PlannedFrame
+from faintfield.rig.plan import PlannedFrame
 from faintfield.rig.session.session import Session
-from faintfield.rig.stages.recovery import recover
+from faintfield.rig.stages.drift import recover
 
 
 class Capture:

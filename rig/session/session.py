@@ -1,16 +1,17 @@
-"""The session that a capture writes: which frames are taken, which are missing, and how a frame is recorded."""
+"""The session of a capture: its frames that are taken or missing, how one is recorded, and how all are read."""
 
 import hashlib
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import msgspec
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Exposure
-from faintfield.rig.plan import CapturePlan
+from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.disk import encode_exposure, sha256, write_new
-from faintfield.rig.session.frames import PlannedFrame, planned_frames
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
 from faintfield.rig.settings import RigSettings
 
@@ -143,3 +144,39 @@ class Session:
 def is_sealed(folder: Path) -> bool:
     """Return whether the session in `folder` is complete."""
     return (folder / SUMS).is_file()
+
+
+def read_plan(folder: Path) -> FrozenPlan:
+    """Read the plan of the session in `folder`.
+
+    Raises
+    ------
+    SessionCorrupt
+        The plan is missing or cannot be read.
+    """
+    path = folder / PLAN
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FrozenPlan)
+    except OSError as failure:
+        raise SessionCorrupt(f"{path}: {failure.strerror}; name the folder of a session, or restore the file") from None
+    except (msgspec.DecodeError, ValueError) as failure:
+        raise SessionCorrupt(f"{path}: is not a plan ({failure}); restore it from a copy") from failure
+
+
+def has_session(folder: Path) -> bool:
+    """Return whether `folder` holds a session."""
+    return (folder / PLAN).exists()
+
+
+def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]]:
+    """Return the valid frames of a session in the order of the plan, each with its journal entry and its file.
+
+    Raises
+    ------
+    SessionCorrupt
+        Plan or journal cannot be read.
+    """
+    frames = planned_frames(read_plan(folder).plan)
+    with Journal(folder / JOURNAL, read_only=True) as journal:
+        valid = {it.frame: it for it in journal.committed() if it.void is None}
+    return [(it, valid[it.number], folder / FRAMES / valid[it.number].file) for it in frames if it.number in valid]

@@ -1,4 +1,4 @@
-"""The simulated lab: renders what the camera sees in each step, from the true position of the stage."""
+"""The simulated lab and its camera: renders what the camera sees in each step, from the true position of the stage."""
 
 import math
 from collections.abc import Callable
@@ -8,15 +8,62 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.rig.boards import BoardSettings
+from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import CameraError
 from faintfield.rig.plan import StepKind
-from faintfield.rig.simulation.carriage import Carriage
+from faintfield.rig.settings import BoardSettings
+from faintfield.rig.simulation.boards import standing_board
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from faintfield.rig.simulation.lab_boards import standing_board
+from faintfield.rig.simulation.optics import through_mosaic
 from faintfield.rig.simulation.scene import TexturedPlane, render
-from faintfield.rig.simulation.sensor import through_mosaic
 from faintfield.rig.stages.protocol import Point
+
+# Bent rails and eccentric pulleys: number of waves over the travel, and the range of their lengths in mm.
+_WAVES, _WAVE_LENGTHS_MM = 8, (80.0, 400.0)
+
+
+class Carriage:
+    """Maps motor positions to camera poses, repeatably and without error at the centre.
+
+    Parameters
+    ----------
+    centre : Point
+        Motor position of the reference pose.
+    settings : SimulatedSettings
+        Standard deviation of the pose over the travel, scale and squareness of the axes, and the seed of the rails.
+    """
+
+    def __init__(self, centre: Point, settings: SimulatedSettings) -> None:
+        self._centre = centre
+        self._settings = settings
+
+    def rt_cam_ref(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
+        """Return the camera pose (6,), Rodrigues rad and mm, at a motor position."""
+        right_mm, down_mm = x_mm - self._centre.x_mm, y_mm - self._centre.y_mm
+        settings = self._settings
+        sd = np.repeat([settings.rotation_error_mrad * 1e-3, settings.position_error_mm], 3)
+        pose: NDArray[np.float64] = sd * (self._waves(right_mm, down_mm) - self._waves(0.0, 0.0))
+        right_mm = right_mm * (1.0 + settings.scale_error) + down_mm * np.sin(settings.squareness_mrad * 1e-3)
+        down_mm *= np.cos(settings.squareness_mrad * 1e-3)
+        # A camera moved right and down by c maps reference points by −c
+        pose[3:5] -= right_mm, down_mm
+        return pose
+
+    def _waves(self, x_mm: float, y_mm: float) -> NDArray[np.float64]:
+        """Return the errors (6,) of the rails; the difference of two distant positions has variance 1."""
+        x_per_mm, y_per_mm, phase = self._shape
+        return np.asarray(np.sin(x_per_mm * x_mm + y_per_mm * y_mm + phase).sum(axis=1) / np.sqrt(_WAVES))
+
+    @cached_property
+    def _shape(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the wave vectors' x and y and the phases, each (6, wave)."""
+        generator = np.random.default_rng([self._settings.seed, 1])
+        direction, phase = generator.uniform(0.0, 2.0 * np.pi, (2, 6, _WAVES))
+        per_mm = 2.0 * np.pi / generator.uniform(*_WAVE_LENGTHS_MM, (6, _WAVES))
+        return per_mm * np.cos(direction), per_mm * np.sin(direction), phase
+
 
 # Light of a flat relative to that of a white object.
 _FLAT = 0.5
@@ -59,14 +106,7 @@ class SimulatedLab:
         self._still_s = still_s
         self._boards = boards
         self._settings = settings
-        self._carriage = Carriage(
-            centre,
-            settings.position_error_mm,
-            settings.rotation_error_mrad * 1e-3,
-            settings.scale_error,
-            settings.squareness_mrad * 1e-3,
-            settings.seed,
-        )
+        self._carriage = Carriage(centre, settings)
         self._planes: tuple[TexturedPlane, ...] = ()
         self._photons_per_s = 0.0
         self._flat = False
@@ -131,3 +171,67 @@ def lab_experiment(settings: SimulatedSettings) -> SimulatedExperiment:
     )
     coloured = replace(paper, sensor=sensor)
     return coloured if settings.mosaic else coloured.grey()
+
+
+# Key of the true pose in a frame's metadata.
+TRUE_POSE = "true_rt_cam_ref"
+
+# Time to read a frame.
+_READOUT_S = 0.05
+
+# Temperature of the cooled sensor, recorded with each frame.
+_TEMPERATURE_C = -20.0
+
+# Upper estimate of what a TIFF file holds besides its pixels.
+_TIFF_HEADER_BYTES = 512
+
+
+class SimulatedCamera:
+    """A `Camera` that renders its frames; exposures take simulated time.
+
+    Parameters
+    ----------
+    settings : SimulatedSettings
+        The `[camera]` table.
+    clock : Clock
+        The simulated clock.
+    lab : SimulatedLab
+        Renders the frames.
+    """
+
+    def __init__(self, settings: SimulatedSettings, clock: Clock, lab: SimulatedLab) -> None:
+        self._settings = settings
+        self._clock = clock
+        self._lab = lab
+        self._open = False
+
+    def open(self) -> None:
+        """Connect."""
+        self._open = True
+
+    def report(self) -> CameraReport:
+        """Return the size of a frame."""
+        self._require_open()
+        width, height = self._settings.size_px
+        return CameraReport("simulated camera", 2 * width * height + _TIFF_HEADER_BYTES, readout_s=_READOUT_S)
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        """Render the scene from the camera's pose at the beginning of the exposure."""
+        self._require_open()
+        truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
+        pixels = self._lab.expose(exposure_s, number)
+        self._clock.sleep_s(exposure_s + _READOUT_S)
+        return Exposure(
+            ".tiff",
+            pixels=pixels,
+            metadata={"camera": "simulated camera", "temperature_c": _TEMPERATURE_C, TRUE_POSE: truth},
+        )
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._open = False
+
+    def _require_open(self) -> None:
+        """Raise `CameraError` before `open` and after `close`."""
+        if not self._open:
+            raise CameraError("the camera is not connected; open it first")

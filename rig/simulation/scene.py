@@ -101,7 +101,7 @@ def _render_view(
     light = np.zeros((*rays.shape[:2], *colours), np.float32)
     unhidden = np.ones(rays.shape[:2], np.float32)
     visible = {}
-    for plane in sorted(planes, key=lambda plane: _depth_mm(plane, rt_cam_ref)):
+    for plane in sorted(planes, key=lambda plane: _plane_in_camera(plane, rt_cam_ref)[0][2]):
         reflected, opacity = _sample(plane, rays, rt_cam_ref)
         light += reflected * (unhidden if not colours else unhidden[:, :, np.newaxis])
         visible[plane.name] = _pixel_means(opacity * unhidden, samples_per_px)
@@ -154,11 +154,6 @@ def _plane_in_camera(
     r_cam_plane = r_cam_ref @ r_ref_plane
     origin_mm = r_cam_ref @ np.asarray(plane.rt_ref_plane[3:]) + rt_cam_ref[3:]
     return origin_mm, r_cam_plane[:, 0], r_cam_plane[:, 1]
-
-
-def _depth_mm(plane: TexturedPlane, rt_cam_ref: NDArray[np.float64]) -> float:
-    """Return the depth of the plane's centre in the camera."""
-    return float(_plane_in_camera(plane, rt_cam_ref)[0][2])
 
 
 def _pixel_means(samples: NDArray[np.float32], samples_per_px: int) -> NDArray[np.float32]:

@@ -37,7 +37,7 @@ class Check(Struct, frozen=True):
     limit: str
 
 
-def conformance(stage: Gantry) -> Iterator[Check]:
+def check_conformance(stage: Gantry) -> Iterator[Check]:
     """Check a connected stage, and yield each result.
 
     The stage homes and moves within the middle 40 % of its travel.
@@ -122,7 +122,7 @@ def _repeatability(stage: Gantry) -> Check:
     try:
         watch.begin()
         for corner in _corners(stage):
-            watch.visited(stage.move_to(*corner))
+            watch.note(stage.move_to(*corner))
         drift = watch.check()
     except (PositionDrifted, PlanRefused) as failure:
         return Check("repeatability", False, str(failure), "no drift")

@@ -1,4 +1,4 @@
-"""Detects lost steps, which no report shows, by timing homing again.
+"""Detects lost steps, which no report shows, by timing homing again, and recovers the stage after an error.
 
 When a motor loses steps, the carriage is not where the controller counts it. Homing from a known position then takes
 longer or shorter than before, since the distance to the switch has changed. The speed of homing is measured at the
@@ -10,10 +10,11 @@ drifted towards it.
 """
 
 import math
+from collections.abc import Callable
 
 from msgspec import Struct
 
-from faintfield.rig.errors import PlanRefused, PositionDrifted, StageError
+from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageError
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import AxisIndex, Point
 
@@ -74,7 +75,7 @@ class DriftWatch:
         """What was recorded before a failed check, or not checked before the stage was homed again."""
         return tuple(self._doubtful)
 
-    def visited(self, what: object) -> None:
+    def note(self, what: object) -> None:
         """Record that `what` (a node, a frame) was taken at a position not yet checked."""
         self._unchecked.append(what)
 
@@ -179,7 +180,7 @@ class DriftWatch:
         return speed
 
     def _mark_doubtful(self) -> tuple[object, ...]:
-        """Count what is unchecked as doubtful, and return it."""
+        """Mark what is unchecked as doubtful, and return it."""
         doubtful, self._unchecked = self.unchecked, []
         self._doubtful.extend(doubtful)
         return doubtful
@@ -192,3 +193,33 @@ class DriftWatch:
             "look for an obstacle or too high an acceleration, home, and take them again",
             suspect=suspect,
         )
+
+
+def recover(stage: Gantry, may_home: Callable[[str], bool], watch: DriftWatch | None = None) -> None:
+    """Make the stage usable again after a `StageError`.
+
+    Parameters
+    ----------
+    stage : Gantry
+        The stage that failed.
+    may_home : callable
+        Called with a question before the stage moves to its switches; homing needs the answer True.
+    watch : DriftWatch, optional
+        Begins again if the stage is homed; positions not yet checked for drift become doubtful.
+
+    Raises
+    ------
+    StageError
+        The stage cannot be recovered; the message says what to do.
+    NotHomed
+        Homing was declined and the position is not known.
+    """
+    stage.recover()
+    if stage.trusted:
+        return
+    if not may_home("The stage's position is lost. Home it now? It will move to its switches."):
+        raise NotHomed("homing was declined and the stage's position is not known; home it before going on")
+    if watch is None:
+        stage.home()
+    else:
+        watch.begin()

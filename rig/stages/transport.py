@@ -1,10 +1,11 @@
-"""Sends and receives lines over a serial port, and logs every byte with its time."""
+"""Sends and receives lines over a serial port, logging every byte, and defines what both firmwares answer."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Literal, Protocol
 
 import serial
+from msgspec import Struct
 from serial.tools.list_ports import comports
 
 from faintfield.rig.clock import Clock
@@ -24,7 +25,6 @@ class TrafficLog(Protocol):
 
     def record(self, at_s: float, direction: Direction, data: bytes) -> None:
         """Record `data`, which passed at `at_s` on the rig's clock."""
-        ...
 
 
 class Port(Protocol):
@@ -32,15 +32,12 @@ class Port(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send `data`; raises `StageLost` if the connection is lost."""
-        ...
 
     def read(self, timeout_s: float) -> bytes:
         """Return what has arrived, waiting up to `timeout_s` for the first byte; raises `StageLost`."""
-        ...
 
     def close(self) -> None:
         """Close the connection."""
-        ...
 
 
 class SerialPort:
@@ -66,7 +63,7 @@ class SerialPort:
             self._serial = serial.serial_for_url(
                 url, baudrate=baud, timeout=0, write_timeout=_WRITE_TIMEOUT_S, exclusive=True
             )
-        except (serial.SerialException, OSError, ValueError) as failure:
+        except (OSError, ValueError) as failure:
             present = ", ".join(port.device for port in comports()) or "none"
             raise StageLost(
                 f"{url}: cannot be opened ({in_one_line(failure)}); serial ports here: {present}; "
@@ -96,11 +93,7 @@ class SerialPort:
         """Raise `StageLost` for what pyserial raises on a lost connection."""
         try:
             yield
-        except (
-            serial.SerialException,
-            OSError,
-            TypeError,
-        ) as failure:  # TypeError: raised by pyserial on a closed port
+        except (OSError, TypeError) as failure:  # pyserial's own is an OSError; a closed port raises a TypeError
             raise StageLost(
                 f"{self._url}: the connection is lost ({in_one_line(failure)}); "
                 "check cable and power; the stage must be homed again"
@@ -192,3 +185,18 @@ class LineTransport:
         except StageLost:
             self.close()
             raise
+
+
+class Ok(Struct, frozen=True):
+    """The controller has accepted a command; its motion may still be under way."""
+
+
+class Unknown(Struct, frozen=True):
+    """A line of no known form, such as a damaged one."""
+
+    text: str
+
+
+def restart_failure() -> StageLost:
+    """Return the exception for a controller that has reported a restart."""
+    return StageLost("the controller has restarted, and its position is lost; check its power, then home it")

@@ -11,11 +11,11 @@ import pytest
 from faintfield.pipelines import cli
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.pipelines.live.preflight import duration_words
-from faintfield.rig.session.access import taken_frames
 from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import StageSettings
 
 STEPS = [
     *[("charuco", 49)] * 6,

@@ -11,23 +11,20 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.plan import Grid
+from faintfield.rig.plan import Grid, PlannedFrame
 from faintfield.rig.session import disk, session
-from faintfield.rig.session.frames import PlannedFrame
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
-from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
+from faintfield.rig.settings import BoardSettings, DriftSettings, RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Point, StageSettings
 
 SMALL_RIG = RigSettings(
     stage=StageSettings("simulated"),

@@ -11,7 +11,7 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.wire import ByteFilter
-from faintfield.rig.stages.settings import ProtocolName
+from faintfield.rig.stages.protocol import ProtocolName
 
 type Nature = Literal["wire", "controller", "mechanics"]
 

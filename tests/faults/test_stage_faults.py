@@ -10,12 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from faintfield.rig.errors import RigError, StageError
-from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.link import PtyLink
-from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.simulation.controller.bench import Bench, PtyLink
+from faintfield.rig.stages.drift import DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.recovery import recover
 from tests.faults.stage_faults import FAULTS, Fault, faults_of
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink
@@ -98,7 +96,7 @@ class RehearsedCapture:
         self.stage.verify_at(*target)
         frame = KeptFrame(len(self.kept), target, began, self.bench.true_position())
         self.kept.append(frame)
-        self.watch.visited(frame.number)
+        self.watch.note(frame.number)
 
     def accepted(self) -> list[KeptFrame]:
         """Return the frames that are neither doubtful nor unchecked."""

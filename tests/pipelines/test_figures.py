@@ -21,7 +21,7 @@ from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, Figur
 from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.solver.initialization import back_projection
-from faintfield.rig.simulation.objects import shaded_ball, star_chart
+from faintfield.rig.simulation.experiment import shaded_ball, star_chart
 
 type Command = Callable[..., CompletedProcess[str]]
 

@@ -14,7 +14,7 @@ from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
-from faintfield.rig.grid import nominal_poses_rt_cam_ref
+from faintfield.rig.plan import nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import take_set, write_frames

@@ -130,7 +130,7 @@ def test_the_conformance_list(shell: Shell, stage: str) -> None:
 
 def test_a_stage_that_fails_a_check_ends_with_a_named_failure(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Check("homing", True, "2 s", "60 s"), Check("speed", False, "3 mm/s", "at least 50 mm/s")]
-    monkeypatch.setattr("faintfield.pipelines.commands.stage.conformance", lambda stage: iter(found))
+    monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: iter(found))
     assert shell.run("test", "--port", "simulated:grbl") == 1
     assert "StageUnfit: speed: 3 mm/s, and at least 50 mm/s is asked for" in shell.words
 

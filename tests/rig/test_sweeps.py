@@ -2,9 +2,8 @@
 
 import pytest
 
-from faintfield.rig.capture.sweeps import board_warnings
-from faintfield.rig.plan import CapturePlan, CaptureStep, Grid
-from faintfield.rig.session.frames import planned_frames
+from faintfield.rig.capture.checks import board_warnings
+from faintfield.rig.plan import CapturePlan, CaptureStep, Grid, planned_frames
 from faintfield.rig.stages.protocol import Point
 
 _GRID = Grid(3, 3, 50.0, Point(0.0, 0.0))

@@ -8,7 +8,7 @@ from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
-from faintfield.rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
+from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 
 # Missing pictures per picture there is: where more are missing, the numbers in the names are not rows and columns.
 _MAX_MISSING_RATIO = 10

@@ -17,9 +17,8 @@ from faintfield.pipelines.formats.files import sha256, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
 from faintfield.pipelines.formats.toml_files import inside, read_toml
-from faintfield.rig.grid import centre_node
-from faintfield.rig.session.access import has_session, read_plan, taken_frames
-from faintfield.rig.session.session import PLAN
+from faintfield.rig.plan import centre_node
+from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 FILE_NAME = "charuco.toml"
 

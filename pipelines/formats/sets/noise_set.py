@@ -11,7 +11,7 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
-from faintfield.rig.session.access import has_session, read_plan, taken_frames
+from faintfield.rig.session.session import has_session, read_plan, taken_frames
 
 FILE_NAME = "noise.toml"
 

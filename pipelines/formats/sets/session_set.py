@@ -15,10 +15,8 @@ from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
-from faintfield.rig.plan import CapturePlan, StepKind, Stop
-from faintfield.rig.session.access import has_session, read_plan, taken_frames
-from faintfield.rig.session.frames import planned_frames
-from faintfield.rig.session.session import PLAN
+from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
+from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 RECONSTRUCTIONS = "reconstructions"
 

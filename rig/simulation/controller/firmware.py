@@ -1,14 +1,27 @@
-"""What the simulated GRBL and Marlin have in common: restarts, lines in and out, homing that takes time."""
+"""What the simulated GRBL and Marlin share: restarts, lines and homing, and a server that gives them a real port."""
 
+import os
+import re
+import select
+import time
+import tty
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import ClassVar
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
 from faintfield.rig.simulation.controller.kinematics import Mechanics
-from faintfield.rig.simulation.controller.wire import Wire
-from faintfield.rig.stages.settings import ProtocolName
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
+from faintfield.rig.stages.protocol import ProtocolName
+
+WORD = re.compile(r"([A-Z])(-?\d+(?:\.\d+)?)")
+
+
+def words(text: str) -> dict[str, float]:
+    """Return the numbers of a line by letter; the last word of a letter counts."""
+    return {letter: float(value) for letter, value in WORD.findall(text)}
 
 
 class SimulatedFirmware(ABC):
@@ -62,9 +75,10 @@ class SimulatedFirmware(ABC):
     def receive(self, data: bytes) -> None:
         """Take bytes from the host."""
 
-    def say(self, text: str) -> None:
-        """Send one line to the host."""
-        self.wire.to_host(text.encode("ascii", errors="replace") + self._line_end)
+    def say(self, *lines: str) -> None:
+        """Send lines to the host."""
+        for text in lines:
+            self.wire.to_host(text.encode("ascii", errors="replace") + self._line_end)
 
     @abstractmethod
     def _reset_state(self) -> None:
@@ -87,3 +101,68 @@ class SimulatedFirmware(ABC):
         if self._homing is not None:
             self._homing.cancel()
             self._homing = None
+
+
+# Longest wait in s between two looks at the port.
+_MAX_WAIT_S = 0.05
+
+
+@dataclass
+class Server:
+    """A simulated controller and its port.
+
+    Parameters
+    ----------
+    port : str
+        Device that other programs open.
+    """
+
+    port: str
+    _clock: SimulatedClock
+    _wire: Wire
+    _firmware: SimulatedFirmware
+    _far: int
+
+    def run(self, speed: float = 1.0) -> None:
+        """Serve until interrupted.
+
+        Parameters
+        ----------
+        speed : float
+            Simulated seconds per real second.
+        """
+        begun_s = time.monotonic()
+        while True:
+            self.turn(speed * (time.monotonic() - begun_s))
+            next_s = self._clock.next_event_s()
+            wait_s = _MAX_WAIT_S if next_s is None else (next_s - self._clock.now_s()) / speed
+            select.select([self._far], [], [], min(_MAX_WAIT_S, max(0.0, wait_s)))
+
+    def turn(self, now_s: float) -> None:
+        """Advance simulated time to `now_s`, and pass on the bytes in both directions."""
+        self._clock.sleep_s(max(0.0, now_s - self._clock.now_s()))
+        if self._wire.arrived():
+            os.write(self._far, self._wire.take())
+        if select.select([self._far], [], [], 0.0)[0]:
+            self._firmware.receive(self._wire.to_controller(os.read(self._far, 4096)))
+
+
+@contextmanager
+def serving(firmware: Callable[[SimulatedClock, Wire], SimulatedFirmware]) -> Iterator[Server]:
+    """Open a pseudo-terminal with a simulated controller behind it, and close it at the end.
+
+    Parameters
+    ----------
+    firmware : callable
+        Makes the controller from a clock and a wire.
+    """
+    clock = SimulatedClock()
+    wire = Wire(clock)
+    far, near = os.openpty()
+    tty.setraw(near)
+    try:
+        # The near end stays open, so that programs can connect again.
+        yield Server(os.ttyname(near), clock, wire, firmware(clock, wire), far)
+    finally:
+        os.close(far)
+        os.close(near)

@@ -8,13 +8,10 @@ before GRBL has asked for it; a failed homing still answers `ok`; and only some 
 import re
 from collections.abc import Callable
 
-from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.gcode import words
-from faintfield.rig.simulation.controller.grbl_lines import parse_jog, status_report
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error, status_report
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
 # Sizes of GRBL's line (bytes), receive buffer (bytes) and planner (motions).
 _LINE_BYTES, _BUFFER_BYTES, _PLANNER_BLOCKS = 80, 128, 15
@@ -210,21 +207,20 @@ class SimulatedGrbl(SimulatedFirmware):
         answer = self.settings.answer(line)
         if answer is None:
             return 3
-        for text in answer:
-            self.say(text)
+        self.say(*answer)
         return 0
 
     def _jog(self, text: str) -> int:
         """Run a jog."""
         if self.state not in ("Idle", "Jog"):
             return 9
-        jog = parse_jog(text)
-        if isinstance(jog, int):
-            return jog
-        target = self._target(jog.words, relative=jog.relative, machine=jog.machine)
+        if error := jog_error(text):
+            return error
+        parsed = words(text)
+        target = self._target(parsed, relative="G91" in text, machine="G53" in text)
         if not self.settings.allows(target):
             return 15
-        self._queue(target, jog.words["F"], "Jog")
+        self._queue(target, parsed["F"], "Jog")
         return 0
 
     def _gcode(self, line: str) -> int:

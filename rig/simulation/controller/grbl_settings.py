@@ -1,8 +1,9 @@
-"""The `$` settings of the simulated GRBL, and what they mean for its motions."""
+"""The `$` settings of the simulated GRBL, what they mean for its motions, its jogs and its reports."""
 
 import re
 from collections.abc import Sequence
 
+from faintfield.rig.simulation.controller.firmware import WORD, words
 from faintfield.rig.simulation.controller.kinematics import along
 
 _DEFAULTS = {
@@ -60,3 +61,36 @@ class StoredSettings(dict[int, str]):
             self[int(found[1])] = found[2]
             return []
         return None
+
+
+def jog_error(text: str) -> int:
+    """Return the number of GRBL's error for what follows `$J=`, 0 if it is a jog."""
+    parsed, modes = words(text), set(re.findall(r"G\d+", text))
+    if not parsed.keys() <= set("GXYZF") or not modes <= {"G20", "G21", "G90", "G91", "G53"} or WORD.sub("", text):
+        return 16
+    if "F" not in parsed:
+        return 22
+    return 0 if parsed.keys() & {"X", "Y"} else 16
+
+
+def status_report(
+    state: str,
+    machine_mm: Sequence[float],
+    offset_mm: Sequence[float],
+    switches: Sequence[bool],
+    is_machine: bool,
+    with_offset: bool,
+) -> str:
+    """Return a status report with machine or work position, and the work offset if asked for."""
+    values = machine_mm if is_machine else [m - o for m, o in zip(machine_mm, offset_mm, strict=True)]
+    fields = [state, f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
+    if pins := "".join(letter for letter, closed in zip("XY", switches, strict=True) if closed):
+        fields.append(f"Pn:{pins}")
+    if with_offset:
+        fields.append(f"WCO:{_vector(offset_mm)}")
+    return f"<{'|'.join(fields)}>"
+
+
+def _vector(values: Sequence[float]) -> str:
+    """Return numbers as GRBL prints them."""
+    return ",".join(f"{value:.3f}" for value in values)

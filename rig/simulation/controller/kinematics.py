@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock
 
 type Vector = tuple[float, ...]
 
@@ -239,19 +239,15 @@ class Mechanics:
         """Start `motion`, and schedule its end and its first contact with a switch."""
         self._end_motion()
         self._motion = motion
-        duration_s = motion.profile.duration_s
-        self._events = [] if self.endless else [self.clock.after(duration_s, self._finish)]
-        open_now = not any(self.switches())
-        hit_s = self._first_contact_s(motion) if open_now else None
-        if hit_s is not None:
+        self._events = [] if self.endless else [self.clock.after(motion.profile.duration_s, self._finish)]
+        if not any(self.switches()) and (hit_s := self._first_contact_s(motion)) is not None:
             self._events.append(self.clock.after(hit_s, self.on_switch))
 
     def _first_contact_s(self, motion: Motion) -> float | None:
         """Return the time from the start of `motion` until it closes a switch, or None."""
-        duration_s = motion.profile.duration_s
         if not self._contact_at(motion.end):
             return None
-        low, high = 0.0, duration_s
+        low, high = 0.0, motion.profile.duration_s
         for _ in range(40):
             middle = 0.5 * (low + high)
             here = motion.at(motion.begun_s + middle)[0]

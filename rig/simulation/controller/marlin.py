@@ -11,11 +11,9 @@ from collections.abc import Callable
 from functools import reduce
 from operator import xor
 
-from faintfield.rig.simulation.controller.clock import ScheduledEvent, SimulatedClock
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
-from faintfield.rig.simulation.controller.gcode import words
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, along
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import ScheduledEvent, SimulatedClock, Wire
 
 # Motions that the planner holds.
 _PLANNER_BLOCKS = 16
@@ -97,15 +95,13 @@ class SimulatedMarlin(SimulatedFirmware):
     def kill(self, reason: str) -> None:
         """Halt until a restart, as after a failure of the hardware."""
         self.mechanics.stop_dead()
-        self.say(f"Error:{reason}")
-        self.say("Error:Printer halted. kill() called!")
+        self.say(f"Error:{reason}", "Error:Printer halted. kill() called!")
         self.alive = False
 
     def _booted(self) -> None:
         """Send the greeting."""
         self.alive = True
-        for text in ("start", "echo:Marlin 2.1.2.4", "echo: Last Updated: 2024-06-01", "echo:EEPROM OK"):
-            self.say(text)
+        self.say("start", "echo:Marlin 2.1.2.4", "echo: Last Updated: 2024-06-01", "echo:EEPROM OK")
         self._watch_idle()
 
     def _run_lines(self) -> None:
@@ -142,22 +138,15 @@ class SimulatedMarlin(SimulatedFirmware):
     def _ask_again(self, why: str) -> None:
         """Report a damaged line and ask for the next number."""
         self._waiting.clear()
-        self.say(f"Error:{why}, Last Line: {self._last_line}")
-        self.say(f"Resend: {self._last_line + 1}")
-        self.say("ok")
+        self.say(f"Error:{why}, Last Line: {self._last_line}", f"Resend: {self._last_line + 1}", "ok")
 
     def _run(self, command: str) -> None:
-        """Run one command and answer it."""
+        """Run one command and answer it; homing and waiting answer when they have ended."""
         name = command.split(" ", 1)[0]
         parameters = words(command[len(name) :])
-        blocking: dict[str, Callable[[], None]] = {
+        actions: dict[str, Callable[[], None]] = {
             "G28": lambda: self._home([i for i in (0, 1) if "XY"[i] in command[3:]] or [0, 1]),
             "M400": lambda: self._await(lambda: not self.mechanics.moving),
-        }
-        if name in blocking:
-            blocking[name]()
-            return
-        immediate: dict[str, Callable[[], None]] = {
             "G0": lambda: self._move(parameters),
             "G1": lambda: self._move(parameters),
             "G90": lambda: setattr(self, "_relative", False),
@@ -170,11 +159,12 @@ class SimulatedMarlin(SimulatedFirmware):
             "M211": self._tell_limits,
             "M503": self._tell_settings,
         }
-        if name in immediate:
-            immediate[name]()
+        if name in actions:
+            actions[name]()
         elif name not in ("G21", "M110", "M410"):
             self.say(f'echo:Unknown command: "{command}"')
-        self.say("ok")
+        if name not in ("G28", "M400"):
+            self.say("ok")
 
     def _move(self, parameters: dict[str, float]) -> None:
         """Plan a straight motion, clipped to the travel of homed axes."""
@@ -269,15 +259,14 @@ class SimulatedMarlin(SimulatedFirmware):
 
     def _tell_capabilities(self) -> None:
         """Answer M115."""
-        self.say(
-            "FIRMWARE_NAME:Marlin 2.1.2.4 (Jun  1 2024 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin "
-            "PROTOCOL_VERSION:1.0 MACHINE_TYPE:Gantry EXTRUDER_COUNT:0"
-        )
-        for capability in ("EEPROM:1", "EMERGENCY_PARSER:1", "AUTOREPORT_POS:0"):
-            self.say(f"Cap:{capability}")
         x, y = self.travel_mm
         bounds = f"{{min:{{x:0,y:0,z:0}},max:{{x:{x:g},y:{y:g},z:100}}}}"
-        self.say(f"area:{{full:{bounds},work:{bounds}}}")
+        self.say(
+            "FIRMWARE_NAME:Marlin 2.1.2.4 (Jun  1 2024 12:00:00) SOURCE_CODE_URL:github.com/MarlinFirmware/Marlin "
+            "PROTOCOL_VERSION:1.0 MACHINE_TYPE:Gantry EXTRUDER_COUNT:0",
+            *("Cap:EEPROM:1", "Cap:EMERGENCY_PARSER:1", "Cap:AUTOREPORT_POS:0"),
+            f"area:{{full:{bounds},work:{bounds}}}",
+        )
 
     def _tell_switches(self) -> None:
         """Answer M119."""

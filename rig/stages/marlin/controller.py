@@ -9,11 +9,10 @@ from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.settings import MarlinSettings
-from faintfield.rig.stages.messages import Ok, restart_failure
+from faintfield.rig.stages.marlin.messages import MarlinSettings
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
-from faintfield.rig.stages.transport import LineTransport
+from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
 # the echo of a marker.
@@ -65,7 +64,7 @@ class MarlinController:
         first, second = self._read_settings(), self._read_settings()
         if first != second:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
-        return MarlinSettings.from_messages((*about, *first)).identity(self._axes, self._travel_mm)
+        return MarlinSettings((*about, *first)).identity(self._axes, self._travel_mm)
 
     def home(self, axis: AxisIndex | None, bound_s: float) -> float:
         """Home the named axis or both, and no others, such as a focus drive."""

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import BoardObservation, Target
-from faintfield.rig.grid import centre_node, grid_nodes, nominal_poses_rt_cam_ref
+from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from faintfield.rig.simulation.experiment import paper_experiment
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from faintfield.calib.geometry import GeometrySettings, RigGeometry, calibrate_geometry
 from faintfield.calib.geometry.stage import approach_directions, stage_report
-from faintfield.rig.grid import grid_nodes
+from faintfield.rig.plan import grid_nodes
 from tests.calib.geometry.simulated import BOARDS, OPTICS, simulated
 
 NODES = grid_nodes(5, 5)

@@ -17,9 +17,8 @@ from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
-from faintfield.rig.simulation.camera import TRUE_POSE, SimulatedCamera
-from faintfield.rig.simulation.controller.clock import SimulatedClock
-from faintfield.rig.simulation.lab import SimulatedLab
+from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.simulation.lab import TRUE_POSE, SimulatedCamera, SimulatedLab
 from faintfield.rig.stages.protocol import Point
 from tests.rig.cameras.contract import check_camera
 

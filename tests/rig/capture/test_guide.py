@@ -6,7 +6,7 @@ import pytest
 from faintfield.rig.capture.guide import TITLES, format_duration, step_prompt
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.session.frames import planned_frames
+from faintfield.rig.plan import planned_frames
 from faintfield.rig.settings import StepSettings
 from tests.faults.capturing import BOARD, SMALL_RIG
 

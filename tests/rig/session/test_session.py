@@ -15,15 +15,12 @@ import pytest
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import PlanRefused, SessionBusy, SessionCorrupt, SessionUnwritable
-from faintfield.rig.plan import CapturePlan
+from faintfield.rig.plan import CapturePlan, planned_frames
 from faintfield.rig.session import journal as journal_module
-from faintfield.rig.session.access import read_plan
 from faintfield.rig.session.disk import set_aside, write_new
-from faintfield.rig.session.frames import planned_frames
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import check_same_rig, open_session
-from faintfield.rig.session.session import FrozenPlan
-from faintfield.rig.session.verify import verify
+from faintfield.rig.session.resume import check_same_rig, open_session, verify
+from faintfield.rig.session.session import FrozenPlan, read_plan
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 
 

@@ -4,7 +4,7 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import StageSettings
 
 type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
 

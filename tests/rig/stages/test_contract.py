@@ -5,11 +5,9 @@ from collections.abc import Iterator
 import pytest
 
 from faintfield.rig.devices import open_stage
-from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.link import DirectLink, Link, PtyLink
-from faintfield.rig.stages.conformance import conformance
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
+from faintfield.rig.stages.conformance import check_conformance
+from faintfield.rig.stages.protocol import Point, StageSettings
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.contract import check_stage
 from tests.rig.stages.socket_link import SocketLink
@@ -64,6 +62,6 @@ def test_a_grid_of_7_by_7_within_a_minute_of_simulated_time(controller: Controll
 def test_conformance(controller: Controller) -> None:
     stage = Bench(controller).stage()
     stage.connect()
-    checks = list(conformance(stage))
+    checks = list(check_conformance(stage))
     assert len(checks) == 7
     assert all(check.passed for check in checks), checks

@@ -10,9 +10,8 @@ from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageA
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.stages.drift import DriftWatch
+from faintfield.rig.stages.drift import DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.recovery import recover
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
 
@@ -29,7 +28,7 @@ def test_a_good_stage_passes_again_and_again(controller: Controller) -> None:
     stage, watch = watched(Bench(controller))
     for number in range(3):
         stage.move_to(*_middle(stage))
-        watch.visited(number)
+        watch.note(number)
         assert watch.check().passed
         assert watch.unchecked == ()
     assert watch.doubtful == ()
@@ -43,7 +42,7 @@ def test_any_drift_beyond_the_limit_is_found_and_none_within(controller: Control
     bench = Bench(controller)
     stage, watch = watched(bench)
     stage.move_to(*_middle(stage))
-    watch.visited("frame")
+    watch.note("frame")
     bench.firmware.mechanics.axes[axis].slip_mm += by_mm
     if abs(by_mm) < 0.5:
         watch.check()
@@ -59,9 +58,9 @@ def test_any_drift_beyond_the_limit_is_found_and_none_within(controller: Control
 def test_only_what_came_after_the_last_good_check_is_doubtful(controller: Controller) -> None:
     bench = Bench(controller)
     stage, watch = watched(bench)
-    watch.visited("early")
+    watch.note("early")
     watch.check()
-    watch.visited("late")
+    watch.note("late")
     bench.firmware.mechanics.axes[0].slip_mm += 2.0
     with pytest.raises(PositionDrifted):
         watch.check()
@@ -69,7 +68,7 @@ def test_only_what_came_after_the_last_good_check_is_doubtful(controller: Contro
     stage.recover()
     stage.home()
     watch.begin()
-    watch.visited("again")
+    watch.note("again")
     watch.check()
     assert watch.doubtful == ("late",)
 
@@ -79,7 +78,7 @@ def test_a_check_without_begin_is_refused() -> None:
     stage.connect()
     stage.home()
     watch = DriftWatch(stage)
-    watch.visited("frame")
+    watch.note("frame")
     with pytest.raises(PlanRefused, match="begin the watch first"):
         watch.check()
     assert watch.unchecked == ("frame",)
@@ -117,7 +116,7 @@ def test_limits_that_cannot_be_kept_are_refused() -> None:
 def test_recovery_homes_only_when_agreed_to_and_leaves_the_unchecked_doubtful() -> None:
     bench = Bench(SimulatedGrbl)
     stage, watch = watched(bench)
-    watch.visited("frame")
+    watch.note("frame")
     assert isinstance(bench.firmware, SimulatedGrbl)
     bench.firmware.alarm(3)
     with pytest.raises(StageAlarm):
@@ -135,7 +134,7 @@ def test_recovery_homes_only_when_agreed_to_and_leaves_the_unchecked_doubtful() 
 def test_recovery_that_keeps_the_position_asks_nothing() -> None:
     bench = Bench(SimulatedGrbl)
     stage, watch = watched(bench)
-    watch.visited("frame")
+    watch.note("frame")
     bench.firmware.receive(b"G53 G0 X10\n")
     with pytest.raises(StageAlarm, match="ALARM:2"):
         stage.position()

@@ -9,8 +9,7 @@ from faintfield.rig.errors import OutsideTravel, StageAlarm, StageLost, StageRej
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.protocol import Box, Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Box, Point, StageSettings
 from tests.rig.stages.benches import Traffic, grbl, homed
 
 

@@ -8,8 +8,7 @@ import pytest
 from faintfield.rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.stages.protocol import Box, Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Box, Point, StageSettings
 from tests.rig.stages.benches import homed
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from faintfield.rig.stages.grbl import messages as grbl
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.messages import Ok, Unknown
+from faintfield.rig.stages.transport import Ok, Unknown
 
 GRBL_LINES = [
     "ok",

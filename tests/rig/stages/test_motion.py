@@ -9,9 +9,15 @@ from hypothesis import strategies as st
 
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.simulation.controller.kinematics import Profile
-from faintfield.rig.stages.motion import duration_s, one_sided, path_duration_s, timeout_s
+from faintfield.rig.stages.motion import (
+    StageWorkspace,
+    duration_s,
+    one_sided_path,
+    path_duration_s,
+    segment_meets,
+    timeout_s,
+)
 from faintfield.rig.stages.protocol import Box, MotionLimits, Point
-from faintfield.rig.stages.workspace import StageWorkspace, segment_meets
 
 LIMITS = MotionLimits((100.0, 50.0), (500.0, 200.0))
 coordinates = st.floats(-300.0, 300.0).map(lambda value: round(value, 3))
@@ -45,7 +51,7 @@ def test_the_simulated_carriage_takes_as_long_as_predicted(length: float, speed:
 @settings(deadline=None)
 @given(points, points, st.floats(0.1, 5.0))
 def test_no_axis_arrives_downwards(start: Point, target: Point, approach_mm: float) -> None:
-    path = (start, *one_sided(start, target, approach_mm))
+    path = (start, *one_sided_path(start, target, approach_mm))
     assert path[-1] == target
     assert len(path) <= 3
     before = path[-2]

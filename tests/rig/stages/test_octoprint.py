@@ -10,8 +10,7 @@ import pytest
 from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageAlarm, StageLost, StageTimeout
 from faintfield.rig.stages.gantry import Gantry
-from faintfield.rig.stages.protocol import Point
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.stages.protocol import Point, StageSettings
 from tests.rig.stages.contract import check_stage
 
 PYTHON = Path(__file__).parents[3] / "build" / "octoprint" / "bin" / "python"

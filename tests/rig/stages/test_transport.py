@@ -6,11 +6,10 @@ import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageLost, StageTimeout
-from faintfield.rig.simulation.controller.bench import Bench
-from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.bench import Bench, DirectLink, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from faintfield.rig.simulation.controller.link import DirectLink, PtyLink
-from faintfield.rig.stages.settings import StageSettings
+from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import LineTransport, SerialPort
 from tests.rig.stages.benches import Traffic
 from tests.rig.stages.socket_link import SocketLink

@@ -6,11 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from faintfield.rig.simulation.controller.clock import SimulatedClock
+from faintfield.rig.simulation.controller.firmware import serving
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.simulation.controller.server import serving
-from faintfield.rig.simulation.controller.wire import Wire
+from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 from faintfield.rig.stages.transport import SerialPort
 from tests.rig.stages.benches import CONTROLLERS, Controller
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from faintfield.rig.simulation.controller.clock import SimulatedClock
 from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
+from faintfield.rig.simulation.controller.wire import SimulatedClock
 
 
 def mechanics(clock: SimulatedClock, play_mm: float = 0.0) -> Mechanics:
