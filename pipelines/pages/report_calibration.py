@@ -125,7 +125,7 @@ def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> Geo
     from faintfield.pipelines.pages.node_drawings import node_drawing, sigma_maps
     from faintfield.pipelines.pages.stage_page import stage_rows
 
-    record = read_geometry(path)
+    record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
     return GeometrySection(
         **_origin(directory, path, inputs),
