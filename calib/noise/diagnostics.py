@@ -6,9 +6,8 @@ import numpy as np
 from scipy import stats
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from faintfield.calib.noise.fitting import SeriesFit
+from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.result import TransferPoint
-from faintfield.calib.noise.selection import NoiseLikelihood
 from faintfield.calib.noise.statistics import Series
 
 # Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.

@@ -13,7 +13,7 @@ from scipy import stats
 from faintfield.calib.noise.fitting import SeriesFit
 from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
 from faintfield.calib.noise.moments import Moments
-from faintfield.calib.noise.response import Response, quantum_efficiency
+from faintfield.calib.noise.pixels import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.statistics import Series
 

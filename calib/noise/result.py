@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.histogram import Histogram
 from faintfield.calib.noise_model import Map, NoiseModel
 
 
@@ -74,6 +73,26 @@ class TransferPoint:
     variance_se_dn2: float
     model_mean_dn: float
     model_variance_dn2: float
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """Observed and predicted values of one dark series.
+
+    Attributes
+    ----------
+    exposure_s : float
+        Exposure time.
+    value_dn : array (value,)
+        All digital numbers from the lowest to the highest.
+    count, expected : array (value,)
+        Number of times each occurred among the sampled pixels and frames, and its expectation by the fit.
+    """
+
+    exposure_s: float
+    value_dn: NDArray[np.int64]
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
