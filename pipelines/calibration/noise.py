@@ -1,11 +1,13 @@
 """A sensor's noise from a noise set: each phase of its mosaic calibrated, as the record and the maps of the result."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
@@ -75,10 +77,7 @@ def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
 def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     """Return the record of a calibration, without the hash of its maps."""
     readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
-    mosaic: dict[str, Any] = {}
-    if readout.mosaic is not None:
-        records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
-        mosaic = {"mosaic": readout.mosaic, "planes": records}
+    records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
     bad_pixels: dict[str, Any] = {
         f"{kind}_pixels": np.argwhere(_assembled(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
         for kind in ("hot", "noisy", "dead")
@@ -86,12 +85,13 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     temperature_c, warnings = temperature_notes(settings)
     warnings += [warning for calibration in phases for warning in calibration.warnings]
     return NoiseRecord(
-        **_quantities({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
+        **_records({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
         covariance=_covariance(phases),
         likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
         saturation_dn=readout.saturation_dn,
         size_px=readout.size_px,
-        **mosaic,
+        mosaic=readout.mosaic or UNSET,
+        planes=records if readout.mosaic else UNSET,
         **bad_pixels,
         temperature_c=temperature_c,
         frames=settings.frame,
@@ -147,7 +147,7 @@ def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRec
         colour=phase.colour,
         likelihood=str(calibration.likelihood),
         masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
-        **_quantities(calibration.estimates),
+        **_records(calibration.estimates),
     )
 
 
@@ -174,12 +174,9 @@ def _mean(estimates: Sequence[Estimate]) -> Estimate:
     return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
 
 
-def _quantities(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return estimates as noise.json has them: with their uncertainty, or with the reason why there is no value."""
-    return {
-        name: Measured(None, why=it.why) if it.value is None else Measured(**asdict(it))
-        for name, it in estimates.items()
-    }
+def _records(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Return the entries of estimates in noise.json."""
+    return msgspec.convert(estimates, dict[str, Measured], from_attributes=True)
 
 
 def _covariance(calibrations: Sequence[NoiseCalibration]) -> CovarianceRecord:

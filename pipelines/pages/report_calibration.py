@@ -121,9 +121,8 @@ def _digits(error: float | None) -> int:
 
 def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> GeometrySection:
     """Return what the page says of where the camera was; parameters as for `noise_section`."""
-    # These load the calibration of geometries, which most reports do not show
-    from faintfield.pipelines.pages.node_drawings import node_drawing, sigma_maps
-    from faintfield.pipelines.pages.stage_page import stage_rows
+    # This loads the calibration of geometries, which most reports do not show
+    from faintfield.pipelines.pages.stage_page import node_drawing, sigma_maps, stage_rows
 
     record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)

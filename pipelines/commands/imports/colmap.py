@@ -4,7 +4,7 @@ from pathlib import Path
 
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.formats.exchange.colmap import read_posed_images
-from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
+from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
 
 
 def import_colmap(

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
 from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
-from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
 def import_mrcal(
