@@ -9,7 +9,7 @@ from scipy.signal import fftconvolve
 from faintfield.calib.noise.diagnostics import check_series, frame_warnings, level_warning, noise_warning
 from faintfield.calib.noise.estimates import estimate_all
 from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
-from faintfield.calib.noise.mass import mass_function
+from faintfield.calib.noise.marginal import mass_function
 from faintfield.calib.noise.pixels import (
     PixelLevels,
     Response,
@@ -110,23 +110,16 @@ def _maps(
 ) -> NoiseMaps:
     """Return the maps; those in electrons only where the gain is known."""
     gain = estimates["gain_dn_per_e"].value
-    read_noise = dark_current = dark_variance = None
+    maps = {"offset_dn": levels.offset_dn, "offset_variance_dn2": levels.offset_variance_dn2}
     if gain is not None:
         ratio = shrunk_variance_ratio(*variance_ratio(fitted.darks, fitted.dark_noise_dn2), ~unusable)
-        read_noise = (np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain).astype(np.float32)
-    if gain is not None and estimates["dark_current_e_per_s"].value is not None:
-        dark_current = np.maximum(levels.dark_signal_dn_per_s / gain, 0).astype(np.float32)
-        dark_variance = (levels.dark_signal_variance_dn2_per_s2 / gain**2).astype(np.float32)
-    return NoiseMaps(
-        offset_dn=levels.offset_dn.astype(np.float32),
-        offset_variance_dn2=levels.offset_variance_dn2.astype(np.float32),
-        unusable=unusable,
-        dark_current_e_per_s=dark_current,
-        dark_current_variance_e2_per_s2=dark_variance,
-        read_noise_e=read_noise,
-        relative_response=response.relative.astype(np.float32) if response else None,
-        vignetting=response.vignetting.astype(np.float32) if response else None,
-    )
+        maps["read_noise_e"] = np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain
+        if estimates["dark_current_e_per_s"].value is not None:
+            maps["dark_current_e_per_s"] = np.maximum(levels.dark_signal_dn_per_s / gain, 0)
+            maps["dark_current_variance_e2_per_s2"] = levels.dark_signal_variance_dn2_per_s2 / gain**2
+    if response is not None:
+        maps |= {"relative_response": response.relative, "vignetting": response.vignetting}
+    return NoiseMaps(unusable=unusable, **{name: values.astype(np.float32) for name, values in maps.items()})
 
 
 def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_]) -> Response | None:

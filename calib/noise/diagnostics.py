@@ -55,7 +55,7 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     pixels = darks[0].pattern_dn.size
     if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < _MIN_SIDE_PX:
         raise TooFewFrames(
-            f"frames of {pixels} pixels: {_MIN_PIXELS} and {_MIN_SIDE_PX} rows and columns are the least; "
+            f"frames of {pixels} pixels, limits {_MIN_PIXELS} pixels and {_MIN_SIDE_PX} rows and columns; "
             "record larger frames, or widen the region"
         )
 

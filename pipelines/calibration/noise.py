@@ -79,7 +79,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
     records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
     bad_pixels: dict[str, Any] = {
-        f"{kind}_pixels": np.argwhere(_assembled(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
+        f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
         for kind in ("hot", "noisy", "dead")
     }
     temperature_c, warnings = temperature_notes(settings)
@@ -103,15 +103,15 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
 def noise_maps(sensor: SensorCalibration) -> dict[str, NDArray[Any]]:
     """Return the arrays of `noise_maps.npz` (row, column): float32 by the names in `NoiseMaps`, and the bool `mask`."""
     readout, phases = sensor.readout, sensor.phases
-    maps = {"mask": _assembled(readout, [c.maps.unusable for c in phases], fill=True)}
+    maps = {"mask": _interleave(readout, [c.maps.unusable for c in phases], fill=True)}
     for name, fill in _MAPS.items():
         parts = [getattr(c.maps, name) for c in phases]
         if all(part is not None for part in parts):
-            maps[name] = _assembled(readout, parts, fill)
+            maps[name] = _interleave(readout, parts, fill)
     gains = [c.estimates["gain_dn_per_e"].value for c in phases]
     if len(gains) > 1 and None not in gains:
         shape = phases[0].maps.offset_dn.shape
-        maps["gain_dn_per_e"] = _assembled(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
+        maps["gain_dn_per_e"] = _interleave(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
     return maps
 
 
@@ -135,7 +135,7 @@ def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> 
     if abs(offset.value - black_dn) <= _BLACK_TOLERANCE_DN + 3 * (offset.se or 0.0):
         return []
     return [
-        f"the darks' offset is {offset.value:.1f} DN, the black level that the files bring {black_dn:.1f} DN (at most "
+        f"the darks' offset is {offset.value:.1f} DN, the black level stated in the files {black_dn:.1f} DN (at most "
         f"{_BLACK_TOLERANCE_DN:g} DN apart is usual); the lens was not quite covered, or the amplifier glows"
     ]
 
@@ -151,7 +151,7 @@ def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRec
     )
 
 
-def _assembled(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
+def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
     """Return the phases' arrays interleaved to the size of a frame."""
     width, height = readout.size_px
     whole = np.full((height, width), fill, parts[0].dtype)

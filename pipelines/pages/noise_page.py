@@ -82,7 +82,7 @@ def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
         Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _reason_to_omit(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
@@ -134,7 +134,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw a table of the numbers with their intervals."""
     axes.axis("off")
-    cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
+    cells = [[label, *_value_and_interval(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
     table = axes.table(
         cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
     )
@@ -146,7 +146,7 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.text(0.5, 0.0, f"{words} pixels", ha="center", fontsize=9, transform=axes.transAxes)
 
 
-def _words(estimate: Estimate) -> tuple[str, str]:
+def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
     """Return value and interval as text, rounded to the standard error."""
     if estimate.value is None or estimate.ci95 is None:
         return "—", "not identifiable"
@@ -166,10 +166,10 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         axes.set_ylabel("row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Plot(title, draw, _sameness(values, unusable))
+    return Plot(title, draw, _reason_to_omit(values, unusable))
 
 
-def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+def _reason_to_omit(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
     """Return why a map has nothing to show, None if it has."""
     if values is None:
         return "not identifiable from these frames"

@@ -333,7 +333,7 @@ def test_masked_pixels_that_disagree_with_the_darks_raise_a_warning(
     assert isinstance(result.planes, list)
     assert [plane.masked_black_dn for plane in result.planes] == [100, 100, 100, 140]
     assert result.saturation_dn == 4095
-    warnings = [warning for warning in result.warnings if "black level that the files bring" in warning]
+    warnings = [warning for warning in result.warnings if "black level stated in the files" in warning]
     assert len(warnings) == 1
     assert warnings[0].startswith("plane B_r1c1: the darks' offset is ")
 

@@ -33,7 +33,7 @@ def import_mrcal(
     reference
         Name of the image whose camera is the reference; the one nearest to the middle by default.
     exposure_s
-        Of each image; from EXIF by default, 1 s where there is none.
+        Exposure of each image; by default that of EXIF, or 1 s where there is none.
     overwrite
         Replace an earlier set in OUT.
     """

@@ -155,7 +155,7 @@ def write_imported_set(
     first = read_picture(images[0].path)
     _check_lenses([image.lens for image in images], images[0].path, first)
     exposure_s = exposure_s or _stated_exposure_s(first)
-    noise = _completed(noise, first)
+    noise = _complete_noise(noise, first)
     inputs = [*models, *(image.path for image in images)]
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
         views = [
@@ -176,7 +176,7 @@ def _stated_exposure_s(first: Frame) -> float:
     return 1.0
 
 
-def _completed(noise: Noise, first: Frame) -> Noise:
+def _complete_noise(noise: Noise, first: Frame) -> Noise:
     """Return the noise with black level and saturation of a picture filled in."""
     return msgspec.structs.replace(
         noise,
@@ -190,7 +190,7 @@ def read_picture(path: Path) -> Frame:
     frame = read_frame(path)
     if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
         raise BadValue(
-            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted; convert it"
+            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are needed; convert it"
         )
     return frame
 
@@ -207,7 +207,7 @@ def _check_lenses(lenses: Sequence[Lens], path: Path, first: Frame) -> None:
     count = len({replace(lens, cx_px=0.0, cy_px=0.0) for lens in lenses})
     if count > 1:
         raise BadValue(
-            f"{path}: it and the others have {count} lenses; one camera on a gantry is one lens, of which only the "
+            f"{path}: it and the others have {count} lenses; a camera on a gantry has one lens, of which only the "
             "principal point may differ; calibrate all images as one camera (COLMAP: ImageReader.single_camera)"
         )
     height, width = first.pixels_dn.shape[:2]
@@ -237,7 +237,7 @@ def _copy(path: Path, folder: Path, first: Frame) -> str:
     if pixels.dtype != first.pixels_dn.dtype:
         raise WrongBitDepth(
             f"{path}: has {8 * pixels.itemsize} bits per pixel, the first picture {8 * first.pixels_dn.itemsize}; "
-            "they are full at one value in a set; export all of them alike"
+            "all pictures of a set saturate at one value; export all of them alike"
         )
     as_it_is = path.suffix.lower() in RAW_SUFFIXES or pixels.dtype == np.uint16
     name = path.name if as_it_is else f"{path.stem}.tiff"

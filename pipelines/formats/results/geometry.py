@@ -22,7 +22,7 @@ CORNERS_FILE = "geometry_corners.npz"
 GEOMETRY_PAGE = "geometry.html"
 CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
 
-# Depths of the planes by which a geometry is judged where none are stated: the paper's.
+# Depths at which a geometry is judged unless others are stated; the paper's.
 DEFAULT_DEPTHS_MM = (500.0, 700.0)
 
 type Pose = tuple[float, float, float, float, float, float]
