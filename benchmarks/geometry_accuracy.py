@@ -70,7 +70,7 @@ def errors_of(geometry: RigGeometry, truth: NDArray[np.float64], experiment: Sim
     turned = geometry.rt_cam_ref[:, :3] - truth[:, :3]
     pose_errors = geometry.rt_cam_ref - truth
     per_pose = [pose_errors[i] @ np.linalg.solve(geometry.pose_covariance(i), pose_errors[i]) / 6 for i in others]
-    rows = np.concatenate([len(geometry.intrinsics) + 6 * i + np.arange(6) for i in others])
+    rows = np.concatenate([len(geometry.lens.parameters) + 6 * i + np.arange(6) for i in others])
     covariance = geometry.covariance[np.ix_(rows, rows)]
     joint = pose_errors[others].ravel()
     optics = experiment.optics

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
+from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
+from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -1,11 +1,12 @@
-"""Acceptance of a geometry by the transfer uncertainty that its own covariance predicts."""
+"""Acceptance of a geometry: by the transfer uncertainty that it predicts, by its outliers, and by hold-out."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.errors import LensNotInvertible, NotIdentifiable
+from faintfield.calib.errors import LensNotInvertible, NotIdentifiable, PoorFit
+from faintfield.calib.geometry.bundle import Bundle, fit_boards, solve_again
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.geometry.rig_geometry import RigGeometry
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, rotation_matrix, transfer_sigma_px
@@ -17,6 +18,15 @@ _MIN_TILT_RAD = np.radians(15)
 _MIN_COVERAGE = 0.5  # share of the image's cells that hold corners
 _COVERAGE_CELLS = 6  # along each side of the image
 _MAX_DISTANCE_OVER_DEPTH = 2.0  # of the nearest board, over the depth of the plane
+
+# A view is inconsistent if at least this share of its corners, and this many, are outliers: fewer are lone corners.
+_MIN_OUTLIER_SHARE_OF_VIEW, _MIN_OUTLIERS_OF_VIEW = 0.2, 3
+
+# Largest share of outliers among all corners; the model does not explain a set with more.
+_MAX_OUTLIER_SHARE = 0.1
+
+# Views that a message names, so that it stays readable.
+_MAX_NAMED = 5
 
 _MORE = "show more boards, nearer and tilted about both axes, or raise --limit-px"
 
@@ -110,3 +120,69 @@ def _coverage(observations: Observations, size_px: tuple[int, int]) -> float:
     pixels = observations.pixels[observations.weights > 0]
     cells = np.clip((pixels / np.array(size_px) * _COVERAGE_CELLS).astype(int), 0, _COVERAGE_CELLS - 1)
     return len(np.unique(cells, axis=0)) / _COVERAGE_CELLS**2
+
+
+def inconsistent_views(bundle: Bundle, observations: Observations) -> list[str]:
+    """Return a warning that names the views whose corners disagree with all others; empty if there is none.
+
+    Raises
+    ------
+    PoorFit
+        Too many corners disagree for any view to be trusted.
+    """
+    seen = (observations.weights > 0).sum(axis=(1, 2))
+    lost = seen - bundle.inlier.sum(axis=(1, 2))
+    worst = [
+        view
+        for view in np.argsort(-lost / seen, kind="stable")
+        if lost[view] >= max(_MIN_OUTLIERS_OF_VIEW, _MIN_OUTLIER_SHARE_OF_VIEW * seen[view])
+    ]
+    named = [f"{observations.view_name(view)} ({lost[view]} of {seen[view]} corners)" for view in worst[:_MAX_NAMED]]
+    more = f" and {len(worst) - _MAX_NAMED} more" if len(worst) > _MAX_NAMED else ""
+    share = lost.sum() / seen.sum()
+    if share > _MAX_OUTLIER_SHARE:
+        raise PoorFit(
+            f"{share:.0%} of the corners disagree with the fit, limit {_MAX_OUTLIER_SHARE:.0%}"
+            f"{', most at ' + ', '.join(named) + more if named else ''}; check that every image has its right node and "
+            "sweep, that columns and rows are those of the print, and that no board moved within a sweep"
+        )
+    if not named:
+        return []
+    return [
+        f"corners disagree with all other images at {', '.join(named)}{more}: they were left out; check the node and "
+        "sweep of these images, and whether they are shaken or the board moved; take them again"
+    ]
+
+
+def holdout_ratio(bundle: Bundle, observations: Observations) -> float | None:
+    """Return the ratio of the residual of boards left out to that of the fit, √(Σ held out² / Σ fitted²).
+
+    Each target (a board in a sweep) is left out in turn. Lens and cameras are found from the others, then only the
+    pose of that board is fitted to its corners. A ratio near 1 says that the model is right and determined; a wrong
+    lens model, boards of different sizes, or a board that moved increase it. A target that some node sees alone is
+    not left out; None if that holds for all.
+
+    Raises
+    ------
+    NotIdentifiable
+        There is no solution without one of the boards.
+    """
+    if len(observations.targets) < 2:
+        return None
+    held_out, fitted = 0.0, 0.0
+    residuals = bundle.residuals()
+    for target in range(len(observations.targets)):
+        others = observations.target_of != target
+        if len(set(observations.node_of[others].tolist())) < len(observations.nodes):
+            continue  # some node saw this board alone
+        try:
+            without = solve_again(bundle, observations, others)
+        except RuntimeError as failure:
+            name = observations.targets[target].board
+            raise NotIdentifiable(
+                f"without board '{name}' the geometry cannot be solved ({failure}); show more boards"
+            ) from failure
+        refitted = fit_boards(bundle, without, observations, ~others)
+        held_out += float(np.sum(refitted.residuals() ** 2))
+        fitted += float(np.sum(residuals[~others] ** 2))
+    return float(np.sqrt(held_out / fitted)) if fitted else None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.geometry.initialization import Initialization, initialize
+from faintfield.calib.geometry.initialization import initialize
 from faintfield.calib.geometry.observations import Observations
 from faintfield.calib.mrcal_loader import load_mrcal
 
@@ -104,7 +104,7 @@ class Bundle:
 
 def solve(problem: BundleProblem) -> Bundle:
     """Return the solution, found in stages: poses, then the lens, then everything with outliers marked."""
-    inputs = _inputs(problem, initialize(problem.observations, problem.size_px, problem.square_mm))
+    inputs = _inputs(problem)
     stages: list[dict[str, bool]] = [
         {"do_optimize_intrinsics_core": False, "do_optimize_intrinsics_distortions": False},
         {"do_optimize_intrinsics_distortions": False},
@@ -142,19 +142,20 @@ def fit_boards(bundle: Bundle, other: Bundle, observations: Observations, chosen
     return Bundle(inputs)
 
 
-def _inputs(problem: BundleProblem, initial: Initialization) -> dict[str, Any]:
+def _inputs(problem: BundleProblem) -> dict[str, Any]:
     """Return mrcal's optimization inputs at the initial values."""
     observations = problem.observations
+    focal_px, rt_cam_ref, rt_ref_board = initialize(observations, problem.size_px, problem.square_mm)
     model = LENS_MODELS[problem.lens_model]
     width, height = problem.size_px
     intrinsics = np.zeros((1, load_mrcal().lensmodel_num_params(model)))
-    intrinsics[0, :4] = initial.focal_px, initial.focal_px, (width - 1) / 2, (height - 1) / 2
+    intrinsics[0, :4] = focal_px, focal_px, (width - 1) / 2, (height - 1) / 2
     return {
         "lensmodel": model,
         "intrinsics": intrinsics,
         "imagersizes": np.array([problem.size_px], np.int32),
-        "rt_cam_ref": initial.rt_cam_ref[1:].copy(),
-        "rt_ref_frame": initial.rt_ref_board.copy(),
+        "rt_cam_ref": rt_cam_ref[1:].copy(),
+        "rt_ref_frame": rt_ref_board,
         "points": None,
         "observations_point": None,
         "indices_point_camintrinsics_camextrinsics": None,

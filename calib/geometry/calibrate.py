@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
 from faintfield.calib.errors import PoorFit, TooFewViews
-from faintfield.calib.geometry.acceptance import find_shortcomings, require_determined
+from faintfield.calib.geometry.acceptance import (
+    find_shortcomings,
+    holdout_ratio,
+    inconsistent_views,
+    require_determined,
+)
 from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, BundleProblem, solve
 from faintfield.calib.geometry.covariance import Uncertainty, uncertainty
-from faintfield.calib.geometry.diagnostics import inconsistent_views
-from faintfield.calib.geometry.holdout import holdout_ratio
 from faintfield.calib.geometry.observations import BoardObservation, Node, Observations, gather
 from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
 from faintfield.calib.lens import Lens

@@ -1,7 +1,6 @@
 """Initial values of the bundle adjustment: the focal length by trial, the poses along a tree of views."""
 
 import heapq
-from dataclasses import dataclass
 from itertools import zip_longest
 
 import cv2
@@ -21,36 +20,27 @@ type Transform = NDArray[np.float64]
 """Homogeneous matrix (4, 4) from the source to the destination frame."""
 
 
-@dataclass(frozen=True)
-class Initialization:
-    """Initial values of the bundle adjustment.
+def initialize(
+    observations: Observations, size_px: tuple[int, int], square_mm: float
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Return the focal length that fits single views best, and poses along the tree of the best-fitting views.
 
-    Attributes
-    ----------
+    Returns
+    -------
     focal_px : float
         Focal length of a pinhole whose principal point is the middle of the detector.
     rt_cam_ref : array (node, 6)
-        Poses of the nodes; zero for the reference, which is the first.
+        Poses of the nodes, Rodrigues rad and mm; zero for the reference, which is the first.
     rt_ref_board : array (target, 6)
-        Poses of the boards, Rodrigues rad and mm.
+        Poses of the boards.
     """
-
-    focal_px: float
-    rt_cam_ref: NDArray[np.float64]
-    rt_ref_board: NDArray[np.float64]
-
-
-def initialize(observations: Observations, size_px: tuple[int, int], square_mm: float) -> Initialization:
-    """Return the focal length that fits single views best, and poses along the tree of the best-fitting views."""
     focal_px = _focal_by_trial(observations, size_px, square_mm)
     matrix = _matrix(focal_px, size_px)
     poses = [_pose(observations, view, matrix, square_mm) for view in range(len(observations.node_of))]
     camera_from_ref, ref_from_board = _tree(observations, [pose for pose, _ in poses], [error for _, error in poses])
-    return Initialization(
-        focal_px,
-        np.array([_rt(camera_from_ref[node]) for node in range(len(observations.nodes))]),
-        np.array([_rt(ref_from_board[target]) for target in range(len(observations.targets))]),
-    )
+    rt_cam_ref = [_rt(camera_from_ref[node]) for node in range(len(observations.nodes))]
+    rt_ref_board = [_rt(ref_from_board[target]) for target in range(len(observations.targets))]
+    return focal_px, np.array(rt_cam_ref), np.array(rt_ref_board)
 
 
 def _focal_by_trial(observations: Observations, size_px: tuple[int, int], square_mm: float) -> float:

@@ -52,8 +52,7 @@ class RigGeometry:
     rt_cam_ref : array (node, 6)
         Poses, Rodrigues rad and mm.
     covariance : array (state, state)
-        Covariance of `intrinsics` (fx, fy, cx, cy, distortion) and of the nodes' poses in order; the reference's is
-        zero.
+        Covariance of `lens.parameters` and of the nodes' poses in order; the reference's is zero.
     boards : list of BoardPose
         Poses of the boards in each sweep.
     warp_mm : array (2,)
@@ -91,11 +90,6 @@ class RigGeometry:
     repeatability: Repeatability | None
     warnings: list[str] = field(default_factory=list)
 
-    @property
-    def intrinsics(self) -> NDArray[np.float64]:
-        """Parameters of the lens, as the covariance has them: fx, fy, cx, cy, and the distortion."""
-        return self.lens.parameters
-
     def pose_covariance(self, node: int) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of one node's pose, rad² and mm²."""
         here = self._pose_slice(node)
@@ -103,7 +97,7 @@ class RigGeometry:
 
     def lens_and_pose_covariance(self, node: int) -> NDArray[np.float64]:
         """Return the covariance (intrinsics + 6, square) of the lens together with one node's pose."""
-        chosen = np.r_[: len(self.intrinsics), self._pose_slice(node)]
+        chosen = np.r_[: len(self.lens.parameters), self._pose_slice(node)]
         return np.asarray(self.covariance[np.ix_(chosen, chosen)])
 
     def centres_mm(self) -> NDArray[np.float64]:
@@ -128,7 +122,7 @@ class RigGeometry:
         return np.array([np.sqrt(np.trace(self.pose_covariance(node)[:3, :3])) for node in range(len(self.nodes))])
 
     def _pose_slice(self, node: int) -> slice:
-        first = len(self.intrinsics) + 6 * node
+        first = len(self.lens.parameters) + 6 * node
         return slice(first, first + 6)
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.geometry.diagnostics import misplaced_nodes, scale_warnings
 from faintfield.calib.geometry.observations import Node
 from faintfield.calib.geometry.rig_geometry import RigGeometry
 
@@ -14,6 +13,14 @@ type Array = NDArray[np.float64]
 
 _AXES = ("x", "y")
 _LINES = ("rows", "columns")  # what lies along each axis
+
+# A node farther than this from its place, in pitches, has the label of another one, or the stage lost steps.
+_MAX_NODE_ERROR = 0.3
+_REWEIGHTINGS = 50  # of the least absolute distances
+
+# Largest relative error of a stage's scale, and the standard errors that it must exceed as well; beyond, it is the
+# boards that differ from what is stated.
+_MAX_SCALE_ERROR, _SCALE_SIGMAS = 0.005, 4.0
 
 _DIFFERENCE = 1e-6  # step of the central differences, in mm or in units of the solution
 
@@ -135,18 +142,48 @@ def stage_report(
         tilt_rad=grid.estimate(_tilt_rad),
         node_residual_rms_mm=grid.residual_rms_mm(),
         residuals_mm=[(x, y, z) for x, y, z in (grid.residuals @ _grid_axes(grid.solution).T).tolist()],
-        warnings=misplaced_nodes(geometry.nodes, geometry.centres_mm()) or _scale_warnings(scales),
+        warnings=_misplaced_nodes(geometry) or _scale_warnings(scales),
     )
 
 
 def _scale_warnings(scales: Sequence[StageEstimate]) -> list[str]:
-    """Return a warning for each axis whose scale error is too large for a stage."""
-    known = [
-        (axis, scale.value, scale.sigma)
-        for axis, scale in zip(_AXES, scales, strict=True)
-        if scale.value is not None and scale.sigma is not None
-    ]
-    return [warning for scale in known for warning in scale_warnings(*scale)]
+    """Return a warning for each axis along which the scale error is too large for a stage."""
+    warnings = []
+    for axis, scale in zip(_AXES, scales, strict=True):
+        error = (scale.value or 1.0) - 1
+        if abs(error) > max(_MAX_SCALE_ERROR, _SCALE_SIGMAS * (scale.sigma or 0.0)):
+            warnings.append(
+                f"along {axis} the nodes lie {abs(error):.1%} {'farther apart' if error > 0 else 'closer together'} "
+                "than pitch_mm says: measure square_mm on the print (all depths and distances follow it), then check "
+                "the stage's steps per mm"
+            )
+    return warnings
+
+
+def _misplaced_nodes(geometry: RigGeometry) -> list[str]:
+    """Return a warning for each node far from its place in the regular grid of least absolute distances."""
+    nodes, centres_mm = geometry.nodes, geometry.centres_mm()
+    grid = np.column_stack([np.ones(len(nodes)), np.array(nodes, float)])
+    if len(nodes) < grid.shape[1] + 2 or np.linalg.matrix_rank(grid) < grid.shape[1]:
+        return []
+    distances = np.ones(len(nodes))
+    for _ in range(_REWEIGHTINGS):
+        roots = 1 / np.sqrt(np.maximum(distances, 1e-6))[:, np.newaxis]
+        solution = np.linalg.lstsq(roots * grid, roots * centres_mm, rcond=None)[0]
+        distances = np.linalg.norm(centres_mm - grid @ solution, axis=1)
+    places = grid @ solution
+    pitch_mm = float(np.linalg.norm(solution[1:], axis=1).min())
+    found = []
+    for index in np.flatnonzero(distances > _MAX_NODE_ERROR * pitch_mm).tolist():
+        away = np.linalg.norm(places - centres_mm[index], axis=1)
+        there = int(np.argmin(away))
+        known = there != index and away[there] < _MAX_NODE_ERROR * pitch_mm
+        where = f", where node {nodes[there]} belongs" if known else ""
+        found.append(
+            f"node {nodes[index]} lies {distances[index]:.1f} mm from its place{where}: check the node of its images, "
+            "and whether the stage lost steps"
+        )
+    return found
 
 
 class _Grid:

@@ -4,17 +4,27 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import fftconvolve
 
 from faintfield.calib.noise.diagnostics import check_series, frame_warnings, level_warning, noise_warning
 from faintfield.calib.noise.estimates import estimate_all
-from faintfield.calib.noise.fitting import SeriesFit, fit_series
-from faintfield.calib.noise.histogram import Histogram, compare_histogram
-from faintfield.calib.noise.maps import PixelLevels, pixel_levels, shrunk_variance_ratio
-from faintfield.calib.noise.pixels import hot_pixels, noisy_pixels, variance_ratio
-from faintfield.calib.noise.response import Response, measure_response
-from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
-from faintfield.calib.noise.selection import MAX_TABLE_WIDTH_DN, NoiseLikelihood, collect_counts
+from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
+from faintfield.calib.noise.marginal import mass_function
+from faintfield.calib.noise.pixels import (
+    PixelLevels,
+    Response,
+    hot_pixels,
+    measure_response,
+    noisy_pixels,
+    pixel_levels,
+    shrunk_variance_ratio,
+    variance_ratio,
+)
+from faintfield.calib.noise.result import Estimate, Histogram, NoiseCalibration, NoiseMaps, TransferPoint
 from faintfield.calib.noise.statistics import Series
+
+# Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
+_MAX_POISSON_CHARGE_E = 200.0
 
 
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:
@@ -100,23 +110,16 @@ def _maps(
 ) -> NoiseMaps:
     """Return the maps; those in electrons only where the gain is known."""
     gain = estimates["gain_dn_per_e"].value
-    read_noise = dark_current = dark_variance = None
+    maps = {"offset_dn": levels.offset_dn, "offset_variance_dn2": levels.offset_variance_dn2}
     if gain is not None:
         ratio = shrunk_variance_ratio(*variance_ratio(fitted.darks, fitted.dark_noise_dn2), ~unusable)
-        read_noise = (np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain).astype(np.float32)
-    if gain is not None and estimates["dark_current_e_per_s"].value is not None:
-        dark_current = np.maximum(levels.dark_signal_dn_per_s / gain, 0).astype(np.float32)
-        dark_variance = (levels.dark_signal_variance_dn2_per_s2 / gain**2).astype(np.float32)
-    return NoiseMaps(
-        offset_dn=levels.offset_dn.astype(np.float32),
-        offset_variance_dn2=levels.offset_variance_dn2.astype(np.float32),
-        unusable=unusable,
-        dark_current_e_per_s=dark_current,
-        dark_current_variance_e2_per_s2=dark_variance,
-        read_noise_e=read_noise,
-        relative_response=response.relative.astype(np.float32) if response else None,
-        vignetting=response.vignetting.astype(np.float32) if response else None,
-    )
+        maps["read_noise_e"] = np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain
+        if estimates["dark_current_e_per_s"].value is not None:
+            maps["dark_current_e_per_s"] = np.maximum(levels.dark_signal_dn_per_s / gain, 0)
+            maps["dark_current_variance_e2_per_s2"] = levels.dark_signal_variance_dn2_per_s2 / gain**2
+    if response is not None:
+        maps |= {"relative_response": response.relative, "vignetting": response.vignetting}
+    return NoiseMaps(unusable=unusable, **{name: values.astype(np.float32) for name, values in maps.items()})
 
 
 def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_]) -> Response | None:
@@ -132,23 +135,45 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_])
 
 def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:
     """Return the values of the shortest and the longest darks with their prediction; none while the gain is unknown."""
-    values = fitted.fit.values
-    if "log_gain" not in values:
+    if "log_gain" not in fitted.fit.values:
         return ()
     counts = collect_counts(fitted.darks, usable)
     ends = sorted({int(np.argmin(counts.exposure_s)), int(np.argmax(counts.exposure_s))})
-    shared = values["dsnu_dn2"] + values.get("jitter_dn2", 0.0) + fitted.profiles_dn2
     return tuple(
-        compare_histogram(
-            counts.values_dn[j],
-            counts.exposure_s[j],
-            values,
-            shared + values.get("dcnu_dn2_per_s2", 0.0) * counts.exposure_s[j] ** 2,
-            counts.floor_dn,
-        )
+        _histogram(counts.values_dn[j], counts.exposure_s[j], fitted, counts.floor_dn)
         for j in ends
         if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN
     )
+
+
+def _histogram(values_dn: NDArray[np.int32], exposure_s: float, fitted: SeriesFit, floor_dn: int | None) -> Histogram:
+    """Return the counts of the values (frame, pixel) of one dark series, and those that the fit predicts."""
+    fit = fitted.fit.values
+    log_gain, signal = fit["log_gain"], fit.get("dark_signal_dn_per_s", 0.0)
+    # The level about which values scatter differs between pixels, rows, columns and frames.
+    pattern_dn2 = fit["dsnu_dn2"] + fit.get("jitter_dn2", 0.0) + fitted.profiles_dn2
+    pattern_dn2 += fit.get("dcnu_dn2_per_s2", 0.0) * exposure_s**2
+    spread_dn = float(np.sqrt(max(pattern_dn2, 1e-4)))
+    per_dn = max(2, int(np.ceil(2 / spread_dn)))
+    reach = int(np.ceil(5 * spread_dn))
+    offset = np.arange(-reach * per_dn, reach * per_dn + 1) / per_dn
+    prior = np.exp(-0.5 * (offset / spread_dn) ** 2)
+    prior /= prior.sum()
+    lowest, highest = int(values_dn.min()), int(values_dn.max())
+    # A black level that drifts down moves the values but makes no charge; see `dark_variances_dn2`.
+    level_dn = fit["offset_dn"] + min(signal, 0.0) * exposure_s
+    u = lowest - reach + np.arange((highest - lowest + 2 * reach) * per_dn + 1) / per_dn - level_dn
+    slope = max(signal, 1e-9)
+    charge = float(slope / np.exp(log_gain)) * exposure_s
+    masses = mass_function(u, exposure_s, charge, exact=charge < _MAX_POISSON_CHARGE_E, spread=False)
+    table = masses(np.array([log_gain, 0.5 * fit["log_read_dn2"] - log_gain, np.log(slope) - log_gain, 0.0]))
+    logs = (table.log_mass[:, 0], table.log_tail[:, 0])
+    mass, tail = (fftconvolve(np.exp(log), prior, "valid")[::per_dn] for log in logs)
+    if floor_dn == lowest:
+        mass[0] = tail[0]
+    value = np.arange(lowest, highest + 1)
+    count = np.bincount((values_dn - lowest).ravel(), minlength=value.size)
+    return Histogram(exposure_s, value, count, np.maximum(mass, 0) * values_dn.size)
 
 
 def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
@@ -164,19 +189,9 @@ def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
         strict=True,
     )
     points = []
-    for one, mean, within, model_mean, model_variance in rows:
+    for one, mean, within, *model in rows:
         degrees = max((one.frames - 1) * fitted.moments.freedom, 1.0)
-        measured = float(within) / degrees if one.frames > 1 else float("nan")
-        points.append(
-            TransferPoint(
-                kind=one.conditions.kind,
-                exposure_s=one.conditions.exposure_s,
-                frames=one.frames,
-                mean_dn=float(mean),
-                variance_dn2=measured,
-                variance_se_dn2=measured * float(np.sqrt(2 / degrees)),
-                model_mean_dn=float(model_mean),
-                model_variance_dn2=float(model_variance),
-            )
-        )
+        measured = within / degrees if one.frames > 1 else np.nan
+        numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
+        points.append(TransferPoint(one.conditions.kind, one.conditions.exposure_s, one.frames, *numbers))
     return tuple(points)

@@ -6,9 +6,8 @@ import numpy as np
 from scipy import stats
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
-from faintfield.calib.noise.fitting import SeriesFit
+from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
 from faintfield.calib.noise.result import TransferPoint
-from faintfield.calib.noise.selection import NoiseLikelihood
 from faintfield.calib.noise.statistics import Series
 
 # Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.
@@ -56,7 +55,7 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     pixels = darks[0].pattern_dn.size
     if pixels < _MIN_PIXELS or min(darks[0].pattern_dn.shape) < _MIN_SIDE_PX:
         raise TooFewFrames(
-            f"frames of {pixels} pixels: {_MIN_PIXELS} and {_MIN_SIDE_PX} rows and columns are the least; "
+            f"frames of {pixels} pixels, limits {_MIN_PIXELS} pixels and {_MIN_SIDE_PX} rows and columns; "
             "record larger frames, or widen the region"
         )
 

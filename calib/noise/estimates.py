@@ -13,7 +13,7 @@ from scipy import stats
 from faintfield.calib.noise.fitting import SeriesFit
 from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
 from faintfield.calib.noise.moments import Moments
-from faintfield.calib.noise.response import Response, quantum_efficiency
+from faintfield.calib.noise.pixels import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.statistics import Series
 
@@ -154,18 +154,14 @@ def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Es
     if not se:
         return Estimate(None, why=_NO_SPREAD)
     if variance + quantile * se <= 0:
-        return Estimate(None, why=_negative(-variance / se))
+        return Estimate(
+            None,
+            why=f"there is less scatter than the pixels' noise alone makes (by {-variance / se:.2g} standard errors), "
+            "so that a spread would be hidden: pickup whose phase turns from frame to frame does that; record more "
+            "frames, away from what may disturb them",
+        )
     low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
     return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
-
-
-def _negative(errors: float) -> str:
-    """Return why a variance that many standard errors below zero does not mean a spread of zero."""
-    return (
-        f"there is less scatter than the pixels' noise alone makes (by {errors:.2g} standard errors), so that a spread "
-        "would be hidden: pickup whose phase turns from frame to frame does that; record more frames, away from what "
-        "may disturb them"
-    )
 
 
 def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
@@ -188,9 +184,8 @@ def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Es
         return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
     spreads["dsnu_e"] = _root(dsnu2, se, quantile, 1 / gain.value)
     spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
-    if "dcnu_dn2_per_s2" in fit.values:
-        dcnu2, se = fit.values["dcnu_dn2_per_s2"], fit.standard_error("dcnu_dn2_per_s2")
-        spreads["dcnu_e_per_s"] = _root(dcnu2, se, quantile, 1 / gain.value)
+    if (dcnu2 := fit.values.get("dcnu_dn2_per_s2")) is not None:
+        spreads["dcnu_e_per_s"] = _root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), quantile, 1 / gain.value)
     return spreads
 
 

@@ -6,6 +6,7 @@ Its maximum is found by scoring with the sum over pixels of s_i s_iáµ€, s_i = âˆ
 Annals of Economic and Social Measurement 3/4, 653 (1974).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import casadi as ca
@@ -18,6 +19,9 @@ from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikeliho
 from faintfield.calib.noise.moments import FlatMoments
 
 type Array = NDArray[np.float64]
+
+# The log-likelihood of darks and flats together at given parameters, with gradient and information.
+type _Objective = Callable[[Array], tuple[float, Array, Array]]
 
 _IS_DCNU = np.array([name == "dcnu" for name in PARAMETERS])
 
@@ -63,27 +67,25 @@ def fit_exact(
     PoorFit
         The steps do not converge.
     """
-    begin = np.array([start[name] for name in PARAMETERS])
-    even = _maximize(_Objective(MarginalLikelihood(counts, start, exact=exact, spread=False), flats, freedom), begin)
+
+    def objective(*, spread: bool) -> _Objective:
+        darks = MarginalLikelihood(counts, start, exact=exact, spread=spread)
+
+        def evaluate(x: Array) -> tuple[float, Array, Array]:
+            dark, flat = darks.evaluate(x), _flat_part(x, flats, freedom)
+            return dark[0] + flat[0], dark[1] + flat[1], dark[2] + flat[2]
+
+        return evaluate
+
+    even = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
     if not try_spread:
         return even.fit()
-    spread = _Objective(MarginalLikelihood(counts, start, exact=exact, spread=True), flats, freedom)
+    spread = objective(spread=True)
     tried = [np.where(_IS_DCNU, dcnu, even.x) for dcnu in _TRIED_DCNU]
     rises = [spread(x)[0] - even.log_likelihood for x in tried]
-    return _maximize(spread, tried[int(np.argmax(rises))]).fit() if max(rises) >= _MIN_RISE else even.fit()
-
-
-@dataclass(frozen=True)
-class _Objective:
-    """The log-likelihood of darks and flats together, with gradient and information."""
-
-    darks: MarginalLikelihood
-    flats: FlatMoments
-    freedom: float
-
-    def __call__(self, x: Array) -> tuple[float, Array, Array]:
-        dark, flat = self.darks.evaluate(x), _flat_part(x, self.flats, self.freedom)
-        return dark[0] + flat[0], dark[1] + flat[1], dark[2] + flat[2]
+    if max(rises) < _MIN_RISE:
+        return even.fit()
+    return _maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit()
 
 
 @dataclass(frozen=True)
@@ -120,9 +122,8 @@ class _Maximum:
         return NoiseFit(values, jacobian @ self.covariance @ jacobian.T, self.log_likelihood)
 
 
-def _maximize(objective: _Objective, begin: Array) -> _Maximum:
-    """Climb by scoring steps, halved where they overshoot."""
-    free = objective.darks.spread | ~_IS_DCNU
+def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _Maximum:
+    """Climb over the free parameters by scoring steps, halved where they overshoot; the others are zero."""
     x = np.where(free, begin, 0.0)
     best = objective(x)
     for _ in range(_MAX_STEPS):

@@ -1,23 +1,44 @@
-"""Fit the series of a sensor: choose pixels and likelihood, then find the parameters."""
+"""Fit the series of a sensor with the simplest likelihood that the frames allow.
+
+It is Gaussian unless that fails: with values cut off at the black level it is biased (gain nearly doubled, read noise
+a third), and with read noise below an electron it ignores the information in single electrons.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtri
 
+from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.noise.exact import fit_exact
 from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
+from faintfield.calib.noise.marginal import Counts
 from faintfield.calib.noise.moments import Moments, gather_moments
-from faintfield.calib.noise.selection import (
-    NoiseLikelihood,
-    censored_start,
-    choose_likelihood,
-    collect_counts,
-    gaussian_start,
-    shared_noise_dn2,
-)
-from faintfield.calib.noise.statistics import Series
+from faintfield.calib.noise.statistics import Series, sample_index
+
+# Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
+_MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
+
+# Largest noise that pixels share, as a fraction of the read noise variance, for the exact likelihood; more blurs single
+# electrons.
+_MAX_SHARED_FRACTION = 0.03
+
+# Largest fraction of values on the lowest one, unless more are on the next; beyond, values are cut off there.
+_MAX_FRACTION_AT_FLOOR = 2e-3
+
+# Largest range of the values of a series, in DN; for wider tables of masses the Gaussian is good enough.
+MAX_TABLE_WIDTH_DN = 2000
+
+
+class NoiseLikelihood(StrEnum):
+    """Names of the likelihoods in results."""
+
+    GAUSSIAN = "marginal Gaussian"
+    CENSORED = "censored Gaussian (Tobit), marginal over offsets"
+    EXACT = "rounded Poisson-Gauss, marginal over offsets"
 
 
 @dataclass(frozen=True)
@@ -81,12 +102,12 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
     fit, bend = _fit_gaussian(moments)
     # Among values cut off at the floor the highest look suspect; leaving them out would bias the fit.
     counts = collect_counts(darks, usable)
-    likelihood = choose_likelihood(counts, fit, shared_noise_dn2(darks, fit))
+    likelihood = choose_likelihood(counts, fit, _shared_noise_dn2(darks, fit))
     if likelihood is not NoiseLikelihood.GAUSSIAN:
         exact = likelihood is NoiseLikelihood.EXACT
         if exact:
             counts = collect_counts(darks, usable & ~suspect)
-        start = gaussian_start(fit) if exact else censored_start(counts)
+        start = _gaussian_start(fit) if exact else _censored_start(counts)
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
@@ -105,3 +126,116 @@ def _fit_gaussian(moments: Moments) -> tuple[NoiseFit, NoiseFit | None]:
     bent = fit_gaussian(moments, nonlinear=True)
     significant = abs(bent.values["nonlinearity_per_dn"]) > 3 * bent.standard_error("nonlinearity_per_dn")
     return (bent if significant else straight), bent
+
+
+def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
+    """Return the sampled values of the pixels in use, with their floor if they are cut off."""
+    keep = used.ravel()[sample_index(used.shape)]
+    values = tuple(series.sample_dn[:, keep] for series in darks)
+    floor = min(series.floor_dn for series in darks)
+    pooled = np.concatenate([v.ravel() for v in values])
+    at_floor, above = (pooled == floor).mean(), (pooled == floor + 1).mean()
+    cut_off = at_floor > max(_MAX_FRACTION_AT_FLOOR, above)
+    return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
+
+
+def _shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
+    """Return the variance of the noise that pixels of a frame, row or column share, in the quietest series."""
+    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
+    variance, quietest = min(
+        (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
+    )
+    dark = darks[quietest]
+    rows, columns = dark.pattern_dn.shape
+    banding = dark.row_noise_dn2 + dark.column_noise_dn2 - variance * (1 / columns + 1 / rows)
+    return gaussian.values["jitter_dn2"] + max(float(banding), 0.0)
+
+
+def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> NoiseLikelihood:
+    """Return the simplest likelihood that the frames allow.
+
+    Parameters
+    ----------
+    counts : Counts
+        Values, with their floor if they are cut off.
+    gaussian : NoiseFit
+        Fit of the Gaussian likelihood.
+    shared_dn2 : float
+        Variance of the noise that pixels share. It blurs single electrons, and the exact likelihood does not model it,
+        so that the Gaussian is better with more than a little of it.
+    """
+    widest = max(int(np.ptp(values)) for values in counts.values_dn)
+    if widest > MAX_TABLE_WIDTH_DN or not {"log_gain", "dark_signal_dn_per_s"} <= gaussian.values.keys():
+        return NoiseLikelihood.GAUSSIAN
+    read_dn = np.exp(0.5 * gaussian.values["log_read_dn2"])
+    read_e = read_dn / np.exp(gaussian.values["log_gain"])
+    telling = gaussian.standard_error("log_gain") < 0.5 and gaussian.values["dark_signal_dn_per_s"] > 0
+    if counts.floor_dn is not None:
+        return NoiseLikelihood.CENSORED
+    if shared_dn2 > _MAX_SHARED_FRACTION * read_dn**2:
+        return NoiseLikelihood.GAUSSIAN
+    if read_dn < _MIN_GAUSSIAN_READ_DN or (telling and read_e < _MIN_GAUSSIAN_READ_E):
+        return NoiseLikelihood.EXACT
+    return NoiseLikelihood.GAUSSIAN
+
+
+def _gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
+    """Return initial values for the exact likelihood from the Gaussian fit."""
+    values = gaussian.values
+    signal = max(values["dark_signal_dn_per_s"], 1e-6)
+    return {
+        "log_gain": values["log_gain"],
+        "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
+        "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
+        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
+        "offset_dn": values["offset_dn"],
+        "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
+    }
+
+
+def _censored_start(counts: Counts) -> dict[str, float]:
+    """Return initial values for the censored likelihood from quantiles above the floor.
+
+    Raises
+    ------
+    NotIdentifiable
+        There are no two exposures at which a twentieth of the values is above the black level.
+    """
+    exposure, centre, spread2 = [], [], []
+    for t, values in zip(counts.exposure_s, counts.values_dn, strict=True):
+        normal = _normal_above(values, counts.floor_dn or 0)
+        if normal is not None:
+            exposure.append(t)
+            centre.append(normal[0])
+            spread2.append(normal[1])
+    if len(set(exposure)) < 2:
+        raise NotIdentifiable(
+            f"the darks are cut off at the black level: of {len(counts.exposure_s)} exposures {len(exposure)} have a "
+            "twentieth of their values above it, 2 are needed; raise the camera's black offset and record them again"
+        )
+    slope, offset = np.polyfit(exposure, centre, 1)
+    slope = max(float(slope), 1e-6)
+    excess, both = np.polyfit(exposure, spread2, 1)
+    gain = float(np.clip(excess / slope, 0.05, 50.0))
+    read2 = max(0.7 * float(both), 0.1)
+    return {
+        "log_gain": float(np.log(gain)),
+        "log_read_e": 0.5 * float(np.log(read2)) - float(np.log(gain)),
+        "log_dark_e_per_s": float(np.log(slope / gain)),
+        "dcnu": 0.05,
+        "offset_dn": float(offset),
+        "log_dsnu_dn": 0.5 * float(np.log(max(0.3 * float(both), 0.1))),
+    }
+
+
+def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
+    """Return mean and variance of the normal law through two quantiles above the floor, None with too few values."""
+    hidden = float((values == floor_dn).mean())
+    if hidden > 0.95:
+        return None
+    low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
+    # Half a DN of dither smooths the steps of the rounding.
+    dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
+    below, above = np.quantile(dithered, [low, high])
+    sigma = float((above - below) / (ndtri(high) - ndtri(low)))
+    return float(below - sigma * ndtri(low)), sigma**2

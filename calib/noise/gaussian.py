@@ -80,9 +80,10 @@ def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
     objective = negative_log_likelihood(parameters, moments)
     at, minimum = _minimize(objective, x, start, units)
     free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(start)])
+    hessian = np.array(ca.Function("hessian", [x], [ca.hessian(objective, x)[0]])(at))
     return NoiseFit(
         values=dict(zip(start, (at * units).tolist(), strict=True)),
-        covariance=_inverse_on(_hessian(objective, x, at), free) * np.outer(units, units),
+        covariance=_inverse_on(hessian, free) * np.outer(units, units),
         log_likelihood=-minimum,
     )
 
@@ -106,21 +107,6 @@ def _minimize(
         f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
         f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
     )
-
-
-def _hessian(objective: Any, x: Any, at: NDArray[np.float64] | list[float]) -> NDArray[np.float64]:
-    """Return the Hessian (parameter, parameter) of an expression in `x` at given values."""
-    return np.array(ca.Function("h", [x], [ca.hessian(objective, x)[0]])(at))
-
-
-def information(values: Mapping[str, float], moments: Moments) -> NDArray[np.float64]:
-    """Return the Hessian of the negative log-likelihood at given parameters.
-
-    At the expected moments it is the Fisher information, since the log-likelihood is linear in the statistics.
-    """
-    x = ca.SX.sym("x", len(values))
-    objective = negative_log_likelihood({name: x[i] for i, name in enumerate(values)}, moments)
-    return _hessian(objective, x, list(values.values()))
 
 
 def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:

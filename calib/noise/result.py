@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.histogram import Histogram
 from faintfield.calib.noise_model import Map, NoiseModel
+
+# Quantities without which there is no noise model.
+_REQUIRED = ("offset_dn", "gain_dn_per_e", "read_noise_e")
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,26 @@ class TransferPoint:
 
 
 @dataclass(frozen=True)
+class Histogram:
+    """Observed and predicted values of one dark series.
+
+    Attributes
+    ----------
+    exposure_s : float
+        Exposure time.
+    value_dn : array (value,)
+        All digital numbers from the lowest to the highest.
+    count, expected : array (value,)
+        Number of times each occurred among the sampled pixels and frames, and its expectation by the fit.
+    """
+
+    exposure_s: float
+    value_dn: NDArray[np.int64]
+    count: NDArray[np.int64]
+    expected: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
 class NoiseCalibration:
     """Result of `calib.noise.calibrate`.
 
@@ -129,21 +151,18 @@ class NoiseCalibration:
         NotIdentifiable
             Offset, gain or read noise has no value.
         """
-        required = {name: self._value(name) for name in ("offset_dn", "gain_dn_per_e", "read_noise_e")}
-        dark, efficiency = self.estimates["dark_current_e_per_s"].value, self.estimates["quantum_efficiency"].value
-        fields: dict[str, Map] = {**required, "dark_current_e_per_s": max(dark or 0.0, 0.0)}
+        values = {name: self.estimates[name].value for name in (*_REQUIRED, "dark_current_e_per_s")}
+        for name in _REQUIRED:
+            if values[name] is None:
+                raise NotIdentifiable(f"{name}: no value: {self.estimates[name].why}")
+        efficiency = self.estimates["quantum_efficiency"].value
+        fields: dict[str, Map] = {name: value or 0.0 for name, value in values.items()}
+        fields["dark_current_e_per_s"] = max(values["dark_current_e_per_s"] or 0.0, 0.0)
         if per_pixel:
-            maps = {name: getattr(self.maps, name) for name in ("offset_dn", "read_noise_e", "dark_current_e_per_s")}
+            maps = {name: getattr(self.maps, name, None) for name in fields}
             fields |= {name: values for name, values in maps.items() if values is not None}
         return NoiseModel(
             **fields,
             quantum_efficiency=None if efficiency is None else min(efficiency, 1.0),
             saturation_dn=self.saturation_dn,
         )
-
-    def _value(self, name: str) -> float:
-        """Return the value of a quantity, or raise NotIdentifiable."""
-        estimate = self.estimates[name]
-        if estimate.value is None:
-            raise NotIdentifiable(f"{name}: no value: {estimate.why}")
-        return estimate.value

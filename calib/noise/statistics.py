@@ -130,13 +130,8 @@ class SeriesSums:
     def __init__(self, conditions: Conditions, saturation_dn: float = np.inf) -> None:
         self.conditions = conditions
         self.saturation_dn = saturation_dn
-        self._names: list[str] = []
-        self._digests: list[bytes] = []
-        self._samples: list[NDArray[np.int32]] = []
-        self._levels_dn: list[float] = []
-        self._spreads_dn2: list[float] = []
-        self._rows: list[NDArray[np.float64]] = []
-        self._columns: list[NDArray[np.float64]] = []
+        # Of each frame: its name, hash and sample, the mean level, rows and columns, and the spread of the rest
+        self._frames: list[tuple[Any, ...]] = []
         self._floor_dn = np.iinfo(np.int64).max
 
     def add(self, name: str, frame_dn: NDArray[Any]) -> None:
@@ -151,15 +146,14 @@ class SeriesSums:
         """
         if self.conditions.kind == "flat":
             _check_range(name, frame_dn, self.saturation_dn)
-        if not self._names:
+        if not self._frames:
             self._begin(frame_dn)
         if frame_dn.shape != self._suspect.shape:
             raise ValueError(f"{name}: {frame_dn.shape} pixels, where the series began with {self._suspect.shape}")
-        self._names.append(name)
-        self._digests.append(hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest())
-        self._samples.append(frame_dn.ravel()[self._sampled].astype(np.int32))
+        digest = hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest()
+        sample = frame_dn.ravel()[self._sampled].astype(np.int32)
         self._floor_dn = min(self._floor_dn, int(frame_dn.min()))
-        self._add_residual(frame_dn.astype(np.float64))
+        self._frames.append((name, digest, sample, *self._add_residual(frame_dn.astype(np.float64))))
 
     def _begin(self, first_dn: NDArray[Any]) -> None:
         """Allocate the sums for frames like the first."""
@@ -170,21 +164,21 @@ class SeriesSums:
         self._sampled = sample_index(first_dn.shape)
         self._pattern, self._squares = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
 
-    def _add_residual(self, residual_dn: NDArray[np.float64]) -> None:
-        """Subtract level, row and column means from a frame, in place, and add the rest to the sums."""
+    def _add_residual(self, residual_dn: NDArray[np.float64]) -> tuple[Any, ...]:
+        """Subtract level, row and column means from a frame, in place, and add the rest to the sums.
+
+        Return the means and the spread of the rest.
+        """
         level = residual_dn.mean(where=self._regular)
         residual_dn -= level
         rows = residual_dn.sum(1, where=self._regular) / self._row_count
         residual_dn -= rows[:, None]
         columns = residual_dn.sum(0, where=self._regular) / self._column_count
         residual_dn -= columns
-        self._levels_dn.append(float(level))
-        self._rows.append(rows)
-        self._columns.append(columns)
         self._pattern += residual_dn
         residual_dn *= residual_dn
         self._squares += residual_dn
-        self._spreads_dn2.append(float(residual_dn.mean(where=self._regular)))
+        return level, rows, columns, residual_dn.mean(where=self._regular)
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
@@ -196,17 +190,18 @@ class SeriesSums:
         ValueError
             No frame was given.
         """
-        frames = len(self._names)
+        frames = len(self._frames)
         if not frames:
             raise ValueError("a series needs at least one frame, got none")
         mean = self._pattern / frames
         within = np.maximum(self._squares - frames * mean**2, 0.0)
-        rows, columns = np.array(self._rows), np.array(self._columns)
+        names, digests, samples, *per_frame = zip(*self._frames, strict=True)
+        levels, rows, columns, spreads_dn2 = map(np.array, per_frame)
         series = Series(
             conditions=self.conditions,
-            names=tuple(self._names),
-            digests=tuple(self._digests),
-            levels_dn=np.array(self._levels_dn),
+            names=names,
+            digests=digests,
+            levels_dn=levels,
             row_dn=rows.mean(0),
             column_dn=columns.mean(0),
             row_noise_dn2=float(rows.var(0, ddof=1).mean()) if frames > 1 else 0.0,
@@ -214,10 +209,10 @@ class SeriesSums:
             pattern_dn=mean.astype(np.float32),
             within_dn2=within.astype(np.float32),
             suspect=self._suspect,
-            sample_dn=np.array(self._samples),
+            sample_dn=np.array(samples),
             floor_dn=self._floor_dn,
         )
-        _check_alike(series, np.array(self._spreads_dn2))
+        _check_alike(series, spreads_dn2)
         return series
 
 

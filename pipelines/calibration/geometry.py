@@ -21,7 +21,7 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from faintfield.calib.geometry.stage import StageEstimate, StageReport, approach_directions, stage_report
+from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import WrongSize
@@ -37,7 +37,6 @@ from faintfield.pipelines.formats.results.geometry import (
     LensRecord,
     NodeRecord,
     RepeatabilityRecord,
-    StageFigure,
     StageRecord,
 )
 from faintfield.pipelines.formats.sets.board_set import BoardSet, BoardView
@@ -89,15 +88,16 @@ def measure_geometry(board_set: BoardSet, settings: GeometrySettings) -> Measure
 
 def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> GeometryRecord:
     """Return the record of a measured geometry."""
-    rig, repeatability = measured.rig, measured.rig.repeatability
-    nodes = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
-    inputs = dict(measured.board_set.input_hashes())
+    rig, lens = measured.rig, measured.rig.lens
+    lens_sigma = tuple(np.sqrt(np.diag(rig.covariance)[: len(lens.parameters)]).tolist())
+    poses = zip(rig.nodes, rig.rt_cam_ref.tolist(), rig.sigma_mm().tolist(), rig.sigma_rad().tolist(), strict=True)
     return GeometryRecord(
-        format=1,
-        lens=_lens_record(rig),
-        size_px=rig.lens.size_px,
+        lens=LensRecord(
+            rig.lens_model, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion), lens_sigma
+        ),
+        size_px=lens.size_px,
         reference_node=rig.nodes[rig.reference],
-        nodes=[NodeRecord(*of_node) for of_node in nodes],
+        nodes=[NodeRecord(*pose) for pose in poses],
         rms_inlier_px=rig.rms_inlier_px,
         rms_mrcal_px=rig.rms_mrcal_px,
         corner_sigma_px=rig.sigma_px,
@@ -108,10 +108,10 @@ def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> Geo
         transfer_sigma_px={
             f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in measured.settings.depths_mm
         },
-        repeatability=None if repeatability is None else RepeatabilityRecord(**asdict(repeatability)),
+        repeatability=msgspec.convert(rig.repeatability, RepeatabilityRecord | None, from_attributes=True),
         boards=_board_records(measured),
-        stage=_stage_record(measured.stage),
-        **msgspec.structs.asdict(provenance("geometry", options, inputs)),
+        stage=msgspec.convert(measured.stage, StageRecord, from_attributes=True),
+        **msgspec.structs.asdict(provenance("geometry", options, dict(measured.board_set.input_hashes()))),
     )
 
 
@@ -124,7 +124,7 @@ def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
     rig = measured.rig
     solved = {board.target for board in rig.boards}
     files: dict[str, bytes | str] = {
-        COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.intrinsics),
+        COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.lens.parameters),
         CORNERS_FILE: _corners_npz([seen for seen in measured.observations if seen.target in solved]),
     }
     for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True):
@@ -182,14 +182,6 @@ def _inform_of_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> No
         inform(f"printed in OpenCV's older layout, which begins with a white square: {', '.join(legacy)}")
 
 
-def _lens_record(rig: RigGeometry) -> LensRecord:
-    """Return the lens with the standard deviation of each number."""
-    lens, sigma = rig.lens, np.sqrt(np.diag(rig.covariance)[: len(rig.intrinsics)])
-    return LensRecord(
-        rig.lens_model, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, tuple(lens.distortion), tuple(sigma.tolist())
-    )
-
-
 def _board_records(measured: MeasuredGeometry) -> list[BoardRecord]:
     """Return each board with what is printed on it, so that the stored corners can be solved again."""
     warp_x_mm, warp_y_mm = measured.rig.warp_mm.tolist()
@@ -202,14 +194,6 @@ def _board_records(measured: MeasuredGeometry) -> list[BoardRecord]:
         )
         for pose in measured.rig.boards
     ]
-
-
-def _stage_record(stage: StageReport) -> StageRecord:
-    """Return the figures of the stage as they stand in geometry.json."""
-    figures: dict[str, Any] = {
-        name: StageFigure(**asdict(value)) for name, value in vars(stage).items() if isinstance(value, StageEstimate)
-    }
-    return StageRecord(**figures, residuals_mm=stage.residuals_mm, warnings=stage.warnings)
 
 
 def _corners_npz(observations: Sequence[BoardObservation]) -> bytes:

@@ -1,11 +1,13 @@
 """A sensor's noise from a noise set: each phase of its mosaic calibrated, as the record and the maps of the result."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
@@ -75,23 +77,21 @@ def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
 def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     """Return the record of a calibration, without the hash of its maps."""
     readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
-    mosaic: dict[str, Any] = {}
-    if readout.mosaic is not None:
-        records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
-        mosaic = {"mosaic": readout.mosaic, "planes": records}
+    records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
     bad_pixels: dict[str, Any] = {
-        f"{kind}_pixels": np.argwhere(_assembled(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
+        f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
         for kind in ("hot", "noisy", "dead")
     }
     temperature_c, warnings = temperature_notes(settings)
     warnings += [warning for calibration in phases for warning in calibration.warnings]
     return NoiseRecord(
-        **_quantities({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
+        **_records({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
         covariance=_covariance(phases),
         likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
         saturation_dn=readout.saturation_dn,
         size_px=readout.size_px,
-        **mosaic,
+        mosaic=readout.mosaic or UNSET,
+        planes=records if readout.mosaic else UNSET,
         **bad_pixels,
         temperature_c=temperature_c,
         frames=settings.frame,
@@ -103,15 +103,15 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
 def noise_maps(sensor: SensorCalibration) -> dict[str, NDArray[Any]]:
     """Return the arrays of `noise_maps.npz` (row, column): float32 by the names in `NoiseMaps`, and the bool `mask`."""
     readout, phases = sensor.readout, sensor.phases
-    maps = {"mask": _assembled(readout, [c.maps.unusable for c in phases], fill=True)}
+    maps = {"mask": _interleave(readout, [c.maps.unusable for c in phases], fill=True)}
     for name, fill in _MAPS.items():
         parts = [getattr(c.maps, name) for c in phases]
         if all(part is not None for part in parts):
-            maps[name] = _assembled(readout, parts, fill)
+            maps[name] = _interleave(readout, parts, fill)
     gains = [c.estimates["gain_dn_per_e"].value for c in phases]
     if len(gains) > 1 and None not in gains:
         shape = phases[0].maps.offset_dn.shape
-        maps["gain_dn_per_e"] = _assembled(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
+        maps["gain_dn_per_e"] = _interleave(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
     return maps
 
 
@@ -135,7 +135,7 @@ def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> 
     if abs(offset.value - black_dn) <= _BLACK_TOLERANCE_DN + 3 * (offset.se or 0.0):
         return []
     return [
-        f"the darks' offset is {offset.value:.1f} DN, the black level that the files bring {black_dn:.1f} DN (at most "
+        f"the darks' offset is {offset.value:.1f} DN, the black level stated in the files {black_dn:.1f} DN (at most "
         f"{_BLACK_TOLERANCE_DN:g} DN apart is usual); the lens was not quite covered, or the amplifier glows"
     ]
 
@@ -147,11 +147,11 @@ def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRec
         colour=phase.colour,
         likelihood=str(calibration.likelihood),
         masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
-        **_quantities(calibration.estimates),
+        **_records(calibration.estimates),
     )
 
 
-def _assembled(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
+def _interleave(readout: Readout, parts: Sequence[NDArray[Any]], fill: float | bool) -> NDArray[Any]:
     """Return the phases' arrays interleaved to the size of a frame."""
     width, height = readout.size_px
     whole = np.full((height, width), fill, parts[0].dtype)
@@ -174,12 +174,9 @@ def _mean(estimates: Sequence[Estimate]) -> Estimate:
     return Estimate(value, se, (value - 1.96 * se, value + 1.96 * se))
 
 
-def _quantities(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
-    """Return estimates as noise.json has them: with their uncertainty, or with the reason why there is no value."""
-    return {
-        name: Measured(None, why=it.why) if it.value is None else Measured(**asdict(it))
-        for name, it in estimates.items()
-    }
+def _records(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    """Return the entries of estimates in noise.json."""
+    return msgspec.convert(estimates, dict[str, Measured], from_attributes=True)
 
 
 def _covariance(calibrations: Sequence[NoiseCalibration]) -> CovarianceRecord:

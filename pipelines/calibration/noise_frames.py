@@ -89,7 +89,7 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
         if index == 0 or conditions != frames[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
         frame = read_frame(path)
-        pixels = _checked(frame, path, readout)[readout.rows, readout.columns]
+        pixels = _check_frame(frame, path, readout)[readout.rows, readout.columns]
         for phase, phase_sums in zip(readout.phases, sums, strict=True):
             phase_sums.add(str(path), phase.of(pixels))
             if conditions.kind == "dark" and frame.black_dn is not None:
@@ -131,7 +131,7 @@ def _slices(region: Region | None, shape: tuple[int, int], period: tuple[int, in
     return slice(*region.rows), slice(*region.columns)
 
 
-def _checked(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
+def _check_frame(frame: Frame, path: Path, readout: Readout) -> NDArray[Any]:
     """Return a frame's pixels; a frame unlike the first is refused."""
     pixels = frame.pixels_dn
     width, height = readout.size_px

@@ -7,7 +7,7 @@ import msgspec
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
-from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, GeometryRecord
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, CameraPoses
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
 from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
@@ -105,7 +105,7 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
             (),
             inputs=lambda: _frames(session, "charuco"),
             results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
-            sidecars=lambda content: msgspec.json.decode(content, type=GeometryRecord).files_beside(),
+            sidecars=lambda content: msgspec.json.decode(content, type=CameraPoses).files_beside(),
             make=measure_geometry,
         ),
         *_steps_of_request(session, request),

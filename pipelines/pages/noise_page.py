@@ -82,7 +82,7 @@ def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
         Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _reason_to_omit(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
@@ -91,7 +91,6 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw variance against mean minus that of the dark, with the line of the model."""
     offset = calibration.estimates["offset_dn"].value or 0.0
     measured = [point for point in calibration.points if point.frames > 1]
-    flats = any(point.kind == "flat" for point in measured)
     for kind, colour in (("dark", _SECOND), ("flat", _INK)):
         points = [point for point in measured if point.kind == kind]
         if not points:
@@ -103,11 +102,10 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
     at = np.array([point.model_mean_dn - offset for point in order])
     x = np.unique(np.concatenate([np.linspace(at[0], at[-1], 200), np.geomspace(0.1, max(at[-1], 1), 200)]))
     axes.plot(x, np.interp(x, at, _column(order, "model_variance_dn2")), color=_MODEL, lw=1, label="model, eq. (1)")
-    if flats:
+    if any(point.kind == "flat" for point in measured):
         axes.set_xscale("symlog", linthresh=10)
         axes.set_yscale("log")
-    axes.set_xlabel(r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]")
-    axes.set_ylabel(r"$\sigma_y^2$ [DN²]")
+    axes.set(xlabel=r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]", ylabel=r"$\sigma_y^2$ [DN²]")
     axes.legend(fontsize=8)
 
 
@@ -119,8 +117,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
     order = np.argsort(t)
     model = _column(points, "model_mean_dn")
     axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
-    axes.set_xlabel("exposure time [s]")
-    axes.set_ylabel(r"$\mu_{y.\mathrm{dark}}$ [DN]")
+    axes.set(xlabel="exposure time [s]", ylabel=r"$\mu_{y.\mathrm{dark}}$ [DN]")
     # Legend and inset are placed beside the line, whether it rises or falls.
     falls = model[order[-1]] < model[order[0]]
     axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
@@ -134,7 +131,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw a table of the numbers with their intervals."""
     axes.axis("off")
-    cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
+    cells = [[label, *_value_and_interval(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
     table = axes.table(
         cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
     )
@@ -146,7 +143,7 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.text(0.5, 0.0, f"{words} pixels", ha="center", fontsize=9, transform=axes.transAxes)
 
 
-def _words(estimate: Estimate) -> tuple[str, str]:
+def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
     """Return value and interval as text, rounded to the standard error."""
     if estimate.value is None or estimate.ci95 is None:
         return "—", "not identifiable"
@@ -162,14 +159,13 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         assert values is not None
         low, high = np.quantile(values[~unusable], [0.005, 0.995])
         image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
-        axes.set_xlabel("column [px]")
-        axes.set_ylabel("row [px]")
+        axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Plot(title, draw, _sameness(values, unusable))
+    return Plot(title, draw, _reason_to_omit(values, unusable))
 
 
-def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+def _reason_to_omit(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
     """Return why a map has nothing to show, None if it has."""
     if values is None:
         return "not identifiable from these frames"
@@ -186,13 +182,9 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
         axes.plot(histogram.value_dn[seen], histogram.count[seen], ".", ms=4, color=colour, label=label)
         axes.plot(histogram.value_dn, np.maximum(histogram.expected, 1e-3), color=_MODEL, lw=1)
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
-    axes.set_yscale("log")
+    axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_span(calibration), yscale="log")
     axes.set_ylim(bottom=0.5)
-    low, high = _span(calibration)
-    axes.set_xlim(low, high)
     axes.locator_params(axis="x", nbins=6)
-    axes.set_xlabel("$y$ [DN]")
-    axes.set_ylabel("count")
     axes.legend(fontsize=8)
 
 
@@ -219,8 +211,7 @@ def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
     white = float(np.sqrt((deviation**2).mean()))
     axes.axhline(white, color=_MODEL, lw=1, ls="--", label="same variance, no pattern")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("spatial frequency [cycles/px]")
-    axes.set_ylabel("amplitude [DN]")
+    axes.set(xlabel="spatial frequency [cycles/px]", ylabel="amplitude [DN]")
     axes.legend(fontsize=8)
 
 

@@ -106,7 +106,7 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> NoiseS
         pages=[(_link(directory, page), data_uri(page.read_bytes(), ".png")) for page in pages],
         record=record,
         rows=[
-            NoiseRow(words, unit, _digits(measured.se), measured)
+            NoiseRow(words, unit, _decimals(measured.se), measured)
             for name, words, unit in _NOISE_ROWS
             if isinstance(measured := getattr(record, name), Measured)
         ],
@@ -114,18 +114,17 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> NoiseS
     )
 
 
-def _digits(error: float | None) -> int:
+def _decimals(error: float | None) -> int:
     """Return the decimals that a number with a standard error deserves."""
     return int(np.clip(np.ceil(1 - np.log10(error)), 0, 6)) if error else 4
 
 
 def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> GeometrySection:
     """Return what the page says of where the camera was; parameters as for `noise_section`."""
-    # These load the calibration of geometries, which most reports do not show
-    from faintfield.pipelines.pages.node_drawings import node_drawing, sigma_maps
-    from faintfield.pipelines.pages.stage_page import stage_rows
+    # This loads the calibration of geometries, which most reports do not show
+    from faintfield.pipelines.pages.stage_page import node_drawing, sigma_maps, stage_rows
 
-    record = read_geometry(path)
+    record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
     return GeometrySection(
         **_origin(directory, path, inputs),

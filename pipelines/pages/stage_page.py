@@ -1,13 +1,15 @@
 """The page of a measured geometry: tables of the stage and the lens, and drawings of the nodes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.results.geometry import GeometryRecord, LensRecord, StageFigure, StageRecord
-from faintfield.pipelines.pages.node_drawings import node_drawing, sigma_maps
-from faintfield.pipelines.pages.page import figure, template
+from faintfield.pipelines.pages.page import INK, figure, inked, svg, template
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -20,6 +22,15 @@ _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("tilt_rad", "tilt of the camera's axis to the grid", "mrad", 1e3),
     ("node_residual_rms_mm", "nodes off the regular grid, rms", "µm", 1e3),
 )
+
+# The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
+_MAX_DRAWN_SHARE = 0.35
+
+# Rotations are shown in mrad from here on, in µrad below.
+_COARSE_RAD = 1e-4
+
+# With more nodes than this, numbers would not fit into their cells.
+_MAX_WRITTEN = 121
 
 # In OpenCV's order.
 _DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -90,3 +101,109 @@ def _row(estimate: StageFigure, words: str, unit: str, factor: float) -> Row:
     digits = int(np.clip(1 - np.floor(np.log10(sigma)), 0, 7)) if sigma > 0 else 3
     value = f"{estimate.value * factor:.{digits}f}".replace("-", "−")
     return Row(words, value, f"± {sigma:.{digits}f}", unit)
+
+
+def node_drawing(geometry: GeometryRecord) -> str | None:
+    """Return real against nominal nodes as SVG, deviations magnified; None without a regular grid to compare."""
+    from matplotlib.figure import Figure  # loading it costs most of a second
+
+    stage = geometry.stage
+    pitch = np.array([stage.pitch_x_mm.value, stage.pitch_y_mm.value], float)
+    residuals = np.array(stage.residuals_mm, float)
+    if not len(residuals) or np.isnan(pitch).any():
+        return None
+    nodes = np.array([entry.node for entry in geometry.nodes], float)
+    nominal = (nodes - geometry.reference_node)[:, ::-1] * pitch
+    factor = _magnification(residuals, float(pitch.min()))
+    real = nominal + factor * residuals[:, :2]
+    across_mm = np.ptp(nominal, axis=0) + 2 * pitch
+    height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
+    drawing = Figure(figsize=(5.4, height), layout="constrained")
+    axes = drawing.subplots()
+    axes.plot(
+        *nominal.T, "+", color=INK, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
+    )
+    limit = 1e3 * (float(np.abs(residuals[:, 2]).max()) or 1e-6)
+    look: dict[str, Any] = {"cmap": "coolwarm", "vmin": -limit, "vmax": limit, "edgecolors": INK, "linewidths": 0.6}
+    dots = axes.scatter(real[:, 0], real[:, 1], s=60, zorder=3, c=1e3 * residuals[:, 2], **look)
+    dots.set_label(f"camera, deviation × {factor:g}")
+    for start, end in zip(nominal, real, strict=True):
+        axes.plot(*np.array([start, end]).T, color=INK, linewidth=0.8, alpha=0.7, zorder=2)
+    _colour_bar(dots, axes, "along the normal (µm)")
+    axes.set_aspect("equal")
+    axes.margins(0.1)
+    axes.invert_yaxis()
+    axes.set(xlabel="x (mm)", ylabel="y, downwards (mm)")
+    inked(axes)
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
+    return svg(drawing)
+
+
+def sigma_maps(geometry: GeometryRecord) -> list[str]:
+    """Return maps over the nodes of the standard deviation of position and of rotation, an SVG each."""
+    nodes = [entry.node for entry in geometry.nodes]
+    sigma_um = [1e3 * entry.sigma_mm for entry in geometry.nodes]
+    largest_rad = max(entry.sigma_rad for entry in geometry.nodes)
+    per_rad, unit = (1e3, "mrad") if largest_rad >= _COARSE_RAD else (1e6, "µrad")
+    sigma_rotation = [per_rad * entry.sigma_rad for entry in geometry.nodes]
+    return [
+        _sigma_map(nodes, sigma_um, "σ of position, √ of the variances' sum (µm)"),
+        _sigma_map(nodes, sigma_rotation, f"σ of rotation, √ of the variances' sum ({unit})"),
+    ]
+
+
+def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words: str) -> str:
+    """Return the map of one number of each node."""
+    from matplotlib.figure import Figure
+
+    drawing = Figure(figsize=(4.8, 4.0), layout="constrained")
+    axes = drawing.subplots()
+    first, values = _map_of_nodes(nodes, sigmas)
+    rows, columns = values.shape
+    extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
+    image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
+    _colour_bar(image, axes, words)
+    if values.size <= _MAX_WRITTEN:
+        _write_values(axes, first, values)
+    axes.set(xlabel="column of the grid", ylabel="row of the grid")
+    axes.locator_params(integer=True)
+    inked(axes)
+    return svg(drawing)
+
+
+def _map_of_nodes(
+    nodes: Sequence[tuple[int, int]], numbers: Sequence[float]
+) -> tuple[tuple[int, int], NDArray[np.float64]]:
+    """Return the first row and column, and each node's number at its place, NaN where there is no node."""
+    places = np.array(nodes)
+    first = places.min(axis=0)
+    values = np.full(np.ptp(places, axis=0) + 1, np.nan)
+    values[tuple((places - first).T)] = numbers
+    return (int(first[0]), int(first[1])), values
+
+
+def _write_values(axes: Any, first: tuple[int, int], values: NDArray[np.float64]) -> None:
+    """Write each number into its cell, dark on light and light on dark."""
+    for (row, column), value in np.ndenumerate(values):
+        if np.isfinite(value):
+            colour = "black" if value > 0.6 * np.nanmax(values) else "white"
+            words = f"{value:.0f}" if np.nanmax(values) >= 10 else f"{value:.2g}"
+            axes.text(column + first[1], row + first[0], words, ha="center", va="center", fontsize=7, color=colour)
+
+
+def _colour_bar(image: Any, axes: Any, words: str) -> None:
+    """Draw a colour bar in the page's ink."""
+    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8)
+    bar.set_label(words, color=INK)
+    bar.ax.tick_params(colors=INK)
+    bar.outline.set_edgecolor(INK)
+
+
+def _magnification(residuals: NDArray[np.float64], pitch_mm: float) -> float:
+    """Return the factor by which deviations are magnified: a round number that keeps the largest within its cell."""
+    largest = float(np.linalg.norm(residuals[:, :2], axis=1).max())
+    if largest <= 0:
+        return 1.0
+    wanted = _MAX_DRAWN_SHARE * pitch_mm / largest
+    power = 10 ** np.floor(np.log10(wanted))
+    return float(max(next(step for step in (5, 2, 1) if step * power <= wanted) * power, 1.0))

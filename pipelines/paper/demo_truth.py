@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
@@ -111,7 +111,7 @@ def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method
 def _geometry_errors(session: Path) -> GeometryErrors:
     """Return how far the measured camera centres and directions are off in the reference frame."""
     poses = true_poses(session)
-    measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session).nodes}
+    measured = {entry.node: np.array(entry.rt_cam_ref) for entry in read_geometry(session, CameraPoses).nodes}
     shared = sorted(measured.keys() & poses.keys())
     off_mm = np.array([_centre_mm(measured[node]) - _centre_mm(poses[node]) for node in shared])
     turned_rad = np.array([relative(measured[node], poses[node])[:3] for node in shared])

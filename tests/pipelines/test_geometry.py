@@ -27,6 +27,8 @@ from faintfield.pipelines.formats.results.geometry import (
     CORNERS_FILE,
     COVARIANCE_FILE,
     DEFAULT_DEPTHS_MM,
+    CameraPoses,
+    GeometryRecord,
     read_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
@@ -61,7 +63,7 @@ def test_the_files_say_where_the_camera_was(measured: tuple[Path, GeometrySummar
     folder, result = measured
     truth = read_truth(scene)
     assert truth is not None
-    found = read_geometry(folder)
+    found = read_geometry(folder, GeometryRecord)
     np.testing.assert_allclose([node.rt_cam_ref for node in found.nodes], truth.true_rt_cam_ref, atol=0.6)
     assert found.camera_lens().fx_px == pytest.approx(400.0, abs=1.0)
     assert result.rms_inlier_px < 0.1
@@ -94,7 +96,7 @@ def test_the_depths_of_the_command_are_those_of_the_calibration() -> None:
 
 def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, GeometrySummary]) -> None:
     folder, _ = measured
-    content = read_geometry(folder)
+    content = read_geometry(folder, GeometryRecord)
     corners = read_corners(folder / CORNERS_FILE)
     names = Board.__dataclass_fields__
     boards = {entry.name: Board(**{name: getattr(entry, name) for name in names}) for entry in content.boards}
@@ -108,7 +110,7 @@ def test_solving_its_own_stored_inputs_again_agrees(measured: tuple[Path, Geomet
 
 def test_mrcal_opens_the_camera_models(measured: tuple[Path, GeometrySummary]) -> None:
     folder, _ = measured
-    found = read_geometry(folder)
+    found = read_geometry(folder, GeometryRecord)
     for node in found.nodes:
         row, column = node.node
         model = mrcal.cameramodel(str(folder / "cameras" / f"node_r{row}_c{column}.cameramodel"))
@@ -122,9 +124,31 @@ def test_mrcal_opens_the_camera_models(measured: tuple[Path, GeometrySummary]) -
 
 def test_measured_poses_replace_the_sets_own(measured: tuple[Path, GeometrySummary], scene: Path) -> None:
     loaded = with_measured_geometry(load_set(scene), measured[0])
-    assert loaded.settings.view[0].rt_cam_ref == read_geometry(measured[0]).nodes[0].rt_cam_ref
-    assert loaded.lens.fx_px == read_geometry(measured[0]).lens.fx_px
+    assert loaded.settings.view[0].rt_cam_ref == read_geometry(measured[0], GeometryRecord).nodes[0].rt_cam_ref
+    assert loaded.lens.fx_px == read_geometry(measured[0], GeometryRecord).lens.fx_px
     assert "geometry.json" in dict(loaded.input_hashes())
+
+
+def test_a_geometry_written_by_hand_needs_lens_and_poses_only(scene: Path, tmp_path: Path) -> None:
+    poses = [[0.0, 0.0, 0.0, -100.0 * (column - 1), -100.0 * (row - 1), 0.0] for row, column in np.ndindex(3, 3)]
+    content = {
+        "lens": {"model": "pinhole", "fx_px": 390.0, "fy_px": 390.0, "cx_px": 159.0, "cy_px": 119.0, "distortion": []},
+        "size_px": [320, 240],
+        "reference_node": [1, 1],
+        "nodes": [
+            {"node": node, "rt_cam_ref": pose, "sigma_mm": 0.1, "sigma_rad": 1e-4}
+            for node, pose in zip(np.ndindex(3, 3), poses, strict=True)
+        ],
+    }
+    (tmp_path / "geometry.json").write_text(json.dumps(content))
+    loaded = with_measured_geometry(load_set(scene), tmp_path)
+    assert loaded.lens.fx_px == 390.0
+    np.testing.assert_array_equal(loaded.poses_rt_cam_ref, poses)
+    assert "geometry.html" in read_geometry(tmp_path, CameraPoses).files_beside()
+    del content["reference_node"]
+    (tmp_path / "geometry.json").write_text(json.dumps(content))
+    with pytest.raises(BadValue, match="reference_node"):
+        with_measured_geometry(load_set(scene), tmp_path)
 
 
 def test_measured_poses_of_another_camera_are_refused(measured: tuple[Path, GeometrySummary], tmp_path: Path) -> None:

@@ -92,9 +92,9 @@ def test_one_picture_is_a_grid_of_one(tmp_path: Path, done: Command) -> None:
             [f"PXL_20240101_1200{second:02}123.png" for second in range(4)],
             (),
             "BadValue",
-            "PXL_20240101_120000123.png would make a grid of 1 x 3001 of 4 pictures: they are no row and column",
+            "PXL_20240101_120000123.png would make a grid of 1 x 3001 of 4 pictures, so they are not row and column",
         ),
-        (["DSC_1_0.png", "DSC_800000000_900000000.png"], (), "BadValue", "they are no row and column; give --rows"),
+        (["DSC_1_0.png", "DSC_800000000_900000000.png"], (), "BadValue", "they are not row and column; give --rows"),
     ],
 )
 def test_grids_with_gaps_and_doubles_are_refused(

@@ -16,7 +16,7 @@ from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import Frame, exif_exposure_s
 from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
+from faintfield.pipelines.formats.results.noise import read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.pages.noise_page import draw_page, page_plots
@@ -94,6 +94,20 @@ def test_the_result_is_what_reconstruction_reads(tmp_path: Path) -> None:
     assert fitted.model.gain_dn_per_e == result.gain_dn_per_e.value
     assert fitted.model.saturation_dn == 65535
     np.testing.assert_array_equal(np.argwhere(fitted.unusable), result.hot_pixels)
+
+
+def test_a_noise_json_written_by_hand_needs_four_numbers_only(tmp_path: Path) -> None:
+    numbers = {"offset_dn": 10.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.5, "dark_current_e_per_s": 0.2}
+    path = tmp_path / "noise.json"
+    path.write_text(json.dumps({name: {"value": value} for name, value in numbers.items()}))
+    fitted = read_fitted_noise(path, (4, 3))
+    assert {name: getattr(fitted.model, name) for name in numbers} == numbers
+    assert fitted.unusable.shape == (3, 4)
+    assert not fitted.unusable.any()
+    assert (fitted.response, fitted.mosaic, fitted.model.quantum_efficiency) == (None, None, None)
+    path.write_text(json.dumps({"offset_dn": {"value": 10.0}}))
+    with pytest.raises(BadValue, match="gain_dn_per_e"):
+        read_fitted_noise(path, (4, 3))
 
 
 def test_what_cannot_be_told_is_null_with_the_reason(tmp_path: Path) -> None:
@@ -319,7 +333,7 @@ def test_masked_pixels_that_disagree_with_the_darks_raise_a_warning(
     assert isinstance(result.planes, list)
     assert [plane.masked_black_dn for plane in result.planes] == [100, 100, 100, 140]
     assert result.saturation_dn == 4095
-    warnings = [warning for warning in result.warnings if "black level that the files bring" in warning]
+    warnings = [warning for warning in result.warnings if "black level stated in the files" in warning]
     assert len(warnings) == 1
     assert warnings[0].startswith("plane B_r1c1: the darks' offset is ")
 

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from faintfield.pipelines.formats.exchange.colmap import MODEL_FILES, ColmapImage, ColmapModel, write_model
-from faintfield.pipelines.formats.exchange.posed_images import lens_of_each_view
+from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
 from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 

@@ -6,8 +6,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
 from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
-from faintfield.pipelines.formats.exchange.posed_images import lens_of_each_view
 from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
 from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
-from faintfield.pipelines.formats.exchange.posed_images import ImportedSet, import_posed
 
 
 def import_mrcal(
@@ -33,7 +33,7 @@ def import_mrcal(
     reference
         Name of the image whose camera is the reference; the one nearest to the middle by default.
     exposure_s
-        Of each image; from EXIF by default, 1 s where there is none.
+        Exposure of each image; by default that of EXIF, or 1 s where there is none.
     overwrite
         Replace an earlier set in OUT.
     """

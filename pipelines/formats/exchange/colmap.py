@@ -100,7 +100,7 @@ def write_model(folder: Path, model: ColmapModel, *, binary: bool) -> None:
     if not binary:
         spaced = [image.name for image in model.images if len(image.name.split()) > 1]
         if spaced:
-            raise BadValue(f"'{spaced[0]}': of a name in a text model COLMAP reads what precedes a space; use --binary")
+            raise BadValue(f"'{spaced[0]}': has a space, where COLMAP ends a name in a text model; use --binary")
         lines = [
             f"{n} {name} {w} {h} {' '.join(map(repr, p))}" for n, name, w, h, p in map(_camera, model.lenses.items())
         ]

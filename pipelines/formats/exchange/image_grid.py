@@ -10,7 +10,7 @@ from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 
-# Missing pictures per picture there is: where more are missing, the numbers in the names are not rows and columns.
+# Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
 _MAX_MISSING_RATIO = 10
 
 type Node = tuple[int, int]
@@ -115,7 +115,8 @@ def _counted_from_zero(folder: Path, named: dict[Node, Path]) -> ImageGrid:
         example = next(iter(grid.paths.values())).name
         raise BadValue(
             f"{folder}: numbers in names like {example} would make a grid of {rows} x {columns} "
-            f"of {len(named)} pictures: they are no row and column; give --rows and --columns to take files in order"
+            f"of {len(named)} pictures, so they are not row and column; "
+            "give --rows and --columns to take files in order"
         )
     if missing:
         row, column = next(node for node in grid_nodes(rows, columns) if node not in grid.paths)

@@ -1,5 +1,6 @@
-"""An elemental set made of copies of other pictures, with lens and poses that other programs found."""
+"""Elemental sets made of copies of other pictures, with the lens and poses that other programs found."""
 
+import re
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,12 +14,13 @@ from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import BadValue, WrongBitDepth, WrongSize
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,84 @@ class PosedModel:
 
     files: list[Path]
     images: list[PosedImage]
+
+
+class ImportedSet(msgspec.Struct, frozen=True):
+    """The result of an import: the folder, the number of views, and the image whose camera is the reference."""
+
+    out: str
+    views: int
+    reference: str
+
+
+def import_posed(
+    out: Path,
+    model: PosedModel,
+    *,
+    mm_per_unit: float,
+    reference: str | None,
+    exposure_s: float | None,
+    command: str,
+    overwrite: bool,
+) -> ImportedSet:
+    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        An image is missing, a pose is not finite, or the reference is none of the images.
+    """
+    _check_images(model.images)
+    scale = np.repeat([1.0, mm_per_unit], 3)
+    images = [
+        replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
+        for image, node in zip(model.images, _nodes(model.images), strict=True)
+    ]
+    index = _reference(images, reference)
+    write_imported_set(
+        out,
+        images,
+        reference=index,
+        noise=Noise(gain_dn_per_e=1.0, read_noise_e=0.0),
+        exposure_s=exposure_s,
+        command=command,
+        options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
+        models=model.files,
+        overwrite=overwrite,
+    )
+    inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
+    return ImportedSet(str(out), len(images), images[index].path.name)
+
+
+def _check_images(images: Sequence[PosedImage]) -> None:
+    """Refuse images that are missing, and poses that are not finite."""
+    for image in images:
+        if not image.path.is_file():
+            raise MissingFile(
+                f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
+            )
+        if not np.isfinite(image.rt_cam_world).all():
+            raise BadValue(
+                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
+            )
+
+
+def _reference(images: Sequence[PosedImage], name: str | None) -> int:
+    """Return the index of the image asked for, or of the one nearest to the middle of all cameras."""
+    if name is not None:
+        found = [index for index, image in enumerate(images) if image.path.name == Path(name).name]
+        if not found:
+            raise BadValue(f"--reference {name}: is none of the {len(images)} images with a pose; name one of them")
+        return found[0]
+    centres = np.array([-cv2.Rodrigues(i.rt_cam_world[:3])[0].T @ i.rt_cam_world[3:] for i in images])
+    return int(np.argmin(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
+
+
+def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
+    """Return the rows and columns in names such as view_r3_c12.tiff; None for each if the names are not of a grid."""
+    found = [re.search(r"r(\d+)_c(\d+)$", image.path.stem) for image in images]
+    nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
+    return nodes if len(set(nodes)) == len(images) else [None] * len(images)
 
 
 def write_imported_set(
@@ -75,7 +155,7 @@ def write_imported_set(
     first = read_picture(images[0].path)
     _check_lenses([image.lens for image in images], images[0].path, first)
     exposure_s = exposure_s or _stated_exposure_s(first)
-    noise = _completed(noise, first)
+    noise = _complete_noise(noise, first)
     inputs = [*models, *(image.path for image in images)]
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
         views = [
@@ -96,7 +176,7 @@ def _stated_exposure_s(first: Frame) -> float:
     return 1.0
 
 
-def _completed(noise: Noise, first: Frame) -> Noise:
+def _complete_noise(noise: Noise, first: Frame) -> Noise:
     """Return the noise with black level and saturation of a picture filled in."""
     return msgspec.structs.replace(
         noise,
@@ -110,7 +190,7 @@ def read_picture(path: Path) -> Frame:
     frame = read_frame(path)
     if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
         raise BadValue(
-            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are wanted; convert it"
+            f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are needed; convert it"
         )
     return frame
 
@@ -127,7 +207,7 @@ def _check_lenses(lenses: Sequence[Lens], path: Path, first: Frame) -> None:
     count = len({replace(lens, cx_px=0.0, cy_px=0.0) for lens in lenses})
     if count > 1:
         raise BadValue(
-            f"{path}: it and the others have {count} lenses; one camera on a gantry is one lens, of which only the "
+            f"{path}: it and the others have {count} lenses; a camera on a gantry has one lens, of which only the "
             "principal point may differ; calibrate all images as one camera (COLMAP: ImageReader.single_camera)"
         )
     height, width = first.pixels_dn.shape[:2]
@@ -157,7 +237,7 @@ def _copy(path: Path, folder: Path, first: Frame) -> str:
     if pixels.dtype != first.pixels_dn.dtype:
         raise WrongBitDepth(
             f"{path}: has {8 * pixels.itemsize} bits per pixel, the first picture {8 * first.pixels_dn.itemsize}; "
-            "they are full at one value in a set; export all of them alike"
+            "all pictures of a set saturate at one value; export all of them alike"
         )
     as_it_is = path.suffix.lower() in RAW_SUFFIXES or pixels.dtype == np.uint16
     name = path.name if as_it_is else f"{path.stem}.tiff"
@@ -168,3 +248,8 @@ def _copy(path: Path, folder: Path, first: Frame) -> str:
     else:
         write_frame(folder / name, pixels.astype(np.uint16))
     return name
+
+
+def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
+    """Return the lens of each view: the camera's, with the principal point of the view."""
+    return [replace(loaded.lens, cx_px=cx_px, cy_px=cy_px) for cx_px, cy_px in loaded.principal_points_px().tolist()]

@@ -49,7 +49,7 @@ class PlaneStack:
 
     @property
     def levels(self) -> int:
-        """How many resolutions the planes are kept in."""
+        """Number of resolutions that are stored."""
         levels, longest = 1, max(self.shape[2:])
         while longest > _COARSEST_PX and min(self.shape[2:]) >> levels:
             levels, longest = levels + 1, longest // 2
@@ -73,7 +73,7 @@ def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
     """
     planes = planes_in_order(records)
     if not planes:
-        raise BadValue(f"{folder}: holds planes given by a pose only; a stack is of depths: reconstruct some")
+        raise BadValue(f"{folder}: holds no planes at depths, only planes given by a pose; reconstruct some at depths")
     shapes = sorted({record.shape for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
@@ -117,11 +117,11 @@ def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = Fal
             plane = np.atleast_3d(np.asarray(read_frame(stack.folder / Path(record.file).name).pixels_dn, np.float32))
             for level in range(stack.levels):
                 group[str(level)][:, index] = np.moveaxis(plane, 2, 0)
-                plane = _halved(plane)
+                plane = _halve(plane)
 
 
 def require_zarr() -> Any:
-    """Return the zarr module, if it and the library of OME-Zarr's metadata are installed; no other format needs them.
+    """Return the zarr module, if it and ome-zarr-models are installed.
 
     Raises
     ------
@@ -186,7 +186,7 @@ def _dataset(group: Any, stack: PlaneStack, level: int) -> Any:
     )
 
 
-def _halved(plane: NDArray[np.float32]) -> NDArray[np.float32]:
+def _halve(plane: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return a plane (row, column, colour) with the mean of each two by two samples; an odd last one is left out."""
     rows, columns = plane.shape[0] // 2, plane.shape[1] // 2
     blocks = plane[: 2 * rows, : 2 * columns].reshape(rows, 2, columns, 2, -1)

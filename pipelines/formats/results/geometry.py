@@ -15,7 +15,6 @@ from msgspec import Meta, Struct
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import remove, write_json, write_whole
-from faintfield.pipelines.formats.provenance import Provenance
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -23,7 +22,7 @@ CORNERS_FILE = "geometry_corners.npz"
 GEOMETRY_PAGE = "geometry.html"
 CAMERA_FILE = "cameras/node_r{}_c{}.cameramodel"
 
-# Depths of the planes by which a geometry is judged where none are stated: the paper's.
+# Depths at which a geometry is judged unless others are stated; the paper's.
 DEFAULT_DEPTHS_MM = (500.0, 700.0)
 
 type Pose = tuple[float, float, float, float, float, float]
@@ -38,7 +37,7 @@ class LensRecord(Struct, frozen=True):
     cx_px: float
     cy_px: float
     distortion: tuple[float, ...]
-    sigma: tuple[float, ...]
+    sigma: tuple[float, ...] = ()
 
 
 class NodeRecord(Struct, frozen=True):
@@ -54,6 +53,25 @@ class NodeRecord(Struct, frozen=True):
         rt = np.array(self.rt_cam_ref)
         x, y, z = (-cv2.Rodrigues(rt[:3])[0].T @ rt[3:]).tolist()
         return x, y, z
+
+
+class CameraPoses(Struct, frozen=True, kw_only=True):
+    """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else."""
+
+    format: Literal[1] = 1
+    lens: LensRecord
+    size_px: tuple[int, int]
+    reference_node: tuple[int, int]
+    nodes: Annotated[list[NodeRecord], Meta(min_length=1)]
+
+    def camera_lens(self) -> Lens:
+        """Return the lens."""
+        lens = self.lens
+        return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+
+    def files_beside(self) -> list[str]:
+        """Return the names of the files that lie beside geometry.json."""
+        return [COVARIANCE_FILE, CORNERS_FILE, GEOMETRY_PAGE, *(CAMERA_FILE.format(*it.node) for it in self.nodes)]
 
 
 class RepeatabilityRecord(Struct, frozen=True):
@@ -110,14 +128,9 @@ class GeometryOptions(Struct, frozen=True):
     limit_px: float
 
 
-class GeometryRecord(Provenance[GeometryOptions], frozen=True):
-    """`geometry.json`: the lens, the camera's poses, how well they are known, and how they were found."""
+class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
+    """`geometry.json` whole: the lens and the poses, how well they are known, and how they were found."""
 
-    format: Literal[1]
-    lens: LensRecord
-    size_px: tuple[int, int]
-    reference_node: tuple[int, int]
-    nodes: Annotated[list[NodeRecord], Meta(min_length=1)]
     rms_inlier_px: float
     rms_mrcal_px: float
     corner_sigma_px: float
@@ -129,19 +142,14 @@ class GeometryRecord(Provenance[GeometryOptions], frozen=True):
     repeatability: RepeatabilityRecord | None
     boards: list[BoardRecord]
     stage: StageRecord
-
-    def camera_lens(self) -> Lens:
-        """Return the lens."""
-        lens = self.lens
-        return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-
-    def files_beside(self) -> list[str]:
-        """Return the names of the files that lie beside this one."""
-        return [COVARIANCE_FILE, CORNERS_FILE, GEOMETRY_PAGE, *(CAMERA_FILE.format(*it.node) for it in self.nodes)]
+    command: str
+    options: GeometryOptions
+    inputs: dict[str, str]
+    versions: dict[str, str]
 
 
-def read_geometry(path: Path) -> GeometryRecord:
-    """Read geometry.json, or that of a folder.
+def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
+    """Read geometry.json, or that of a folder, whole or only the camera's poses.
 
     Raises
     ------
@@ -152,7 +160,7 @@ def read_geometry(path: Path) -> GeometryRecord:
     if not path.is_file():
         raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
     try:
-        geometry = msgspec.json.decode(path.read_bytes(), type=GeometryRecord)
+        geometry = msgspec.json.decode(path.read_bytes(), type=kind)
         geometry.camera_lens()
     except (msgspec.MsgspecError, ValueError, OSError) as failure:
         raise BadValue(f"{path}: is not the result of `faintfield geometry` ({failure}); run that again") from failure

@@ -14,8 +14,7 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.fitted_noise import FittedNoise, read_fitted_noise
-from faintfield.pipelines.formats.results.noise import NOISE_MAPS
+from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import (
     FILE_NAME,

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, GeometryRecord, read_geometry
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
 
@@ -19,7 +19,7 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
         A view has no node, a node was not measured, the reference is another, or the image has another size.
     """
     path = path / GEOMETRY_FILE if path.is_dir() else path
-    geometry, settings = read_geometry(path), loaded.settings
+    geometry, settings = read_geometry(path, CameraPoses), loaded.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
     _check_match(path, geometry, loaded)
     lens = geometry.camera_lens()
@@ -34,7 +34,7 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
     return replace(loaded, settings=measured, lens=lens, measured_in=path, poses="measured")
 
 
-def _check_match(path: Path, geometry: GeometryRecord, loaded: ElementalSet) -> None:
+def _check_match(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> None:
     """Refuse a geometry of images of another size, of other nodes, or with another reference than the set."""
     settings, nodes = loaded.settings, {entry.node for entry in geometry.nodes}
     if geometry.size_px != settings.camera.size_px:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, read_geometry
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
@@ -62,7 +61,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
             raise MissingFile(
                 f"{path}: no such file; run `faintfield {command} {folder}` first, or `faintfield run {folder}` for all"
             )
-    lens = read_geometry(measured_in).camera_lens()
+    lens = read_geometry(measured_in, CameraPoses).camera_lens()
     noise = read_fitted_noise(folder / NOISE_FILE, lens.size_px)
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
     views = [_view(stop, plan.centre, names) for stop, names in frames]

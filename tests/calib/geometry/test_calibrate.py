@@ -36,7 +36,7 @@ def calibrated(given: Simulated, settings: GeometrySettings | None = None) -> Ri
 def pose_errors(geometry: RigGeometry, truth: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the joint error of lens and poses without the reference's, and its covariance."""
     true_lens = np.array([OPTICS.fx_px, OPTICS.fy_px, OPTICS.cx_px, OPTICS.cy_px, *OPTICS.distortion])
-    error = np.concatenate([geometry.intrinsics - true_lens, (geometry.rt_cam_ref - truth).ravel()])
+    error = np.concatenate([geometry.lens.parameters - true_lens, (geometry.rt_cam_ref - truth).ravel()])
     known = np.diag(geometry.covariance) > 0
     assert (~known).sum() == 6  # the gauge
     return error[known], geometry.covariance[np.ix_(known, known)]

@@ -7,7 +7,7 @@ import pytest
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.selection import NoiseLikelihood
+from faintfield.calib.noise.fitting import NoiseLikelihood
 from tests.calib.noise.darkroom import Chip, Frames, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

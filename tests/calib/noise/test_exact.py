@@ -8,9 +8,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
-from faintfield.calib.noise.mass import DARK_LOG_WEIGHTS, DARK_NODES, mass_function
-from faintfield.calib.noise.selection import NoiseLikelihood
+from faintfield.calib.noise.fitting import NoiseLikelihood
+from faintfield.calib.noise.marginal import (
+    DARK_LOG_WEIGHTS,
+    DARK_NODES,
+    PARAMETERS,
+    Counts,
+    MarginalLikelihood,
+    mass_function,
+)
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

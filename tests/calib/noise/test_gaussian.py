@@ -7,9 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from faintfield.calib.noise import Conditions, Sensor, Series, calibrate, cramer_rao, measure_series
+from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, negative_log_likelihood
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
+from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)

@@ -7,10 +7,11 @@ expected values is exactly the Fisher information. Nothing is sampled.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.gaussian import ROUNDING_DN2, information, main_quantities
+from faintfield.calib.noise.gaussian import ROUNDING_DN2, main_quantities, negative_log_likelihood
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 
 
@@ -72,7 +73,9 @@ def cramer_rao(
     """
     values = _parameters(sensor)
     moments = _expected_moments(sensor, np.asarray(exposures_s, float), frames, pixels, flat_signals_dn, flat_frames)
-    fisher = information(values, moments)
+    x = ca.SX.sym("x", len(values))
+    objective = negative_log_likelihood({name: x[i] for i, name in enumerate(values)}, moments)
+    fisher = np.array(ca.Function("fisher", [x], [ca.hessian(objective, x)[0]])(list(values.values())))
     # A spread of zero is on the boundary of the model, and does not affect the errors of the others.
     free = [i for i, (name, value) in enumerate(values.items()) if value > 0 or not name.endswith(("dn2", "per_s2"))]
     covariance = np.linalg.inv(fisher[np.ix_(free, free)])
