@@ -21,11 +21,7 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position
 from faintfield.rig.stages.settings import StageSettings
 
-app = App(
-    name="stage",
-    help="Bring up a stage: identify it, home it, move it, test it.",
-    help_epilogue="Example: faintfield stage test --port simulated:grbl",
-)
+app = App(name="stage", help_epilogue="Example: faintfield stage test --port simulated:grbl")
 
 
 @Parameter(name="*")
