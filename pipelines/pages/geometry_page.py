@@ -160,38 +160,23 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words:
 
     figure = Figure(figsize=(4.8, 4.0), layout="constrained")
     axes = figure.subplots()
-    first, values = _map_of_nodes(nodes, sigmas)
-    rows, columns = values.shape
-    extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
+    places = np.array(nodes)
+    (top, left), (rows, columns) = places.min(axis=0), np.ptp(places, axis=0) + 1
+    values = np.full((rows, columns), np.nan)  # where there is no node
+    values[tuple((places - (top, left)).T)] = sigmas
+    extent = (left - 0.5, left + columns - 0.5, top + rows - 0.5, top - 0.5)
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
     _colour_bar(figure, image, axes, words)
     if values.size <= _MAX_WRITTEN:
-        _write_values(axes, first, values)
+        for (row, column), sigma in zip(nodes, sigmas, strict=True):
+            colour = "black" if sigma > 0.6 * max(sigmas) else "white"
+            text = f"{sigma:.0f}" if max(sigmas) >= 10 else f"{sigma:.2g}"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set_xlabel("column of the grid")
     axes.set_ylabel("row of the grid")
     axes.locator_params(integer=True)
     inked(axes)
     return svg(figure)
-
-
-def _map_of_nodes(
-    nodes: Sequence[tuple[int, int]], numbers: Sequence[float]
-) -> tuple[tuple[int, int], NDArray[np.float64]]:
-    """Return the first row and column, and each node's number at its place, NaN where there is no node."""
-    places = np.array(nodes)
-    first = places.min(axis=0)
-    values = np.full(np.ptp(places, axis=0) + 1, np.nan)
-    values[tuple((places - first).T)] = numbers
-    return (int(first[0]), int(first[1])), values
-
-
-def _write_values(axes: Any, first: tuple[int, int], values: NDArray[np.float64]) -> None:
-    """Write each number into its cell, dark on light and light on dark."""
-    for (row, column), value in np.ndenumerate(values):
-        if np.isfinite(value):
-            colour = "black" if value > 0.6 * np.nanmax(values) else "white"
-            words = f"{value:.0f}" if np.nanmax(values) >= 10 else f"{value:.2g}"
-            axes.text(column + first[1], row + first[0], words, ha="center", va="center", fontsize=7, color=colour)
 
 
 def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:

@@ -1,6 +1,7 @@
 """What only the simulated world knows of a capture: its views without noise, its textures and its poses."""
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +14,10 @@ from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
-from faintfield.recon.metrics import (
-    expected_snr_from_powers,
-    photons_from_linear_snr,
-    photons_from_moments,
-)
+from faintfield.recon.metrics import expected_snr_from_powers, photons_from_linear_snr, photons_from_moments
 from faintfield.rig.grid import grid_nodes
 from faintfield.rig.simulation.experiment import SimulatedExperiment
-from faintfield.rig.simulation.scene import TexturedPlane, render
+from faintfield.rig.simulation.scene import render
 from faintfield.rig.simulation.sensor import through_mosaic
 
 NOISE_FREE = "noise_free"
@@ -160,19 +157,14 @@ def _write_noise_free_set(folder: Path, scene: RenderedScene, white_e: float) ->
 def _write_textures(folder: Path, scene: RenderedScene, white_e: float) -> list[TruePlane]:
     """Write each object's texture in electrons, and where the ideal reference view shows it."""
     planes, optics = scene.experiment.planes, scene.experiment.optics
-    all_visible = next(render([plane.grey() for plane in planes], optics.ideal(), np.zeros((1, 6)))).visible
+    seen_by_ideal = partial(render, optics=optics.ideal(), poses_rt_cam_ref=np.zeros((1, 6)))
+    all_visible = next(seen_by_ideal([plane.grey() for plane in planes])).visible
     entries = []
     for plane in planes:
-        texture, visible = (
-            f"truth/{name}" for name in (f"plane_{plane.depth_mm:07.1f}.tiff", f"visible_{plane.depth_mm:07.1f}.png")
-        )
-        light = _alone(plane if scene.mosaic else plane.grey(), scene.experiment)
+        texture = f"truth/plane_{plane.depth_mm:07.1f}.tiff"
+        visible = f"truth/visible_{plane.depth_mm:07.1f}.png"
+        light = next(seen_by_ideal([plane if scene.mosaic else plane.grey()])).light
         write_plane(folder / texture, light * white_e, plane.depth_mm / optics.fx_px)
         write_png(folder / visible, mask_picture(all_visible[plane.name] > 0.5))
         entries.append(TruePlane(plane.name, plane.depth_mm, texture, visible))
     return entries
-
-
-def _alone(plane: TexturedPlane, experiment: SimulatedExperiment) -> NDArray[np.float32]:
-    """Return one object alone, as a pinhole at the reference node sees it: the plane to be reconstructed."""
-    return next(render([plane], experiment.optics.ideal(), np.zeros((1, 6)))).light

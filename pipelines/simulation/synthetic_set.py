@@ -1,20 +1,24 @@
-"""The elemental set of a synthetic scene, with its ground truth: the work of `faintfield simulate`."""
+"""The elemental set of a synthetic scene with its ground truth, and the exposures of a simulated sensor."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
+from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME
+from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Noise
+from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
 from faintfield.pipelines.formats.sets.ground_truth import Truth
-from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
 from faintfield.pipelines.simulation.scene_truth import render_scene, write_ground_truth
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.sensor import SimulatedSensor
 
 
 class SyntheticOptions(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,8 +48,10 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         The detector is too small to show the objects.
     """
     generator = np.random.default_rng(options.seed)
-    experiment = _experiment(options)
-    sensor = experiment.sensor
+    paper = paper_experiment(*options.size_px)
+    grid = (options.rows, options.columns, options.pitch_mm)
+    experiment = SimulatedExperiment(paper.planes, paper.optics, paper.sensor, *grid, options.exposure_s)
+    sensor = paper.sensor
     dark_e = sensor.dark_current_e_per_s * options.exposure_s
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None) as folder:
         true = experiment.poses_rt_cam_ref(options.position_error_mm, options.rotation_error_mrad * 1e-3, generator)
@@ -63,8 +69,33 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
     return truth
 
 
-def _experiment(options: SyntheticOptions) -> SimulatedExperiment:
-    """Return the paper's experiment with the grid and the detector of the options."""
-    paper = paper_experiment(*options.size_px)
-    grid = (options.rows, options.columns, options.pitch_mm)
-    return SimulatedExperiment(paper.planes, paper.optics, paper.sensor, *grid, options.exposure_s)
+def stated_noise(sensor: SimulatedSensor) -> Noise:
+    """Return the `[noise]` table of a set taken with a sensor."""
+    return Noise(
+        gain_dn_per_e=sensor.gain_dn_per_e,
+        read_noise_e=sensor.read_noise_e,
+        offset_dn=sensor.offset_dn,
+        dark_current_e_per_s=sensor.dark_current_e_per_s,
+        quantum_efficiency=sensor.quantum_efficiency,
+        saturation_dn=float(sensor.saturation_dn),
+    )
+
+
+def write_exposures(
+    folder: Path,
+    names: Iterable[str],
+    signal_e: Iterable[NDArray[np.floating]],
+    sensor: SimulatedSensor,
+    exposure_s: float,
+    generator: np.random.Generator,
+) -> None:
+    """Expose every view and write it under its name; an exposure without light is the noise reference.
+
+    Parameters
+    ----------
+    signal_e : iterable of array (row, column)
+        Expected photoelectrons of each view.
+    """
+    for name, view_e in zip(names, signal_e, strict=True):
+        write_frame(folder / name, sensor.expose(view_e / sensor.quantum_efficiency, exposure_s, generator))
+    write_frame(folder / NOISE_REFERENCE, sensor.expose(np.zeros_like(view_e), exposure_s, generator))
