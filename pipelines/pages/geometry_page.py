@@ -134,8 +134,7 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     axes.set_aspect("equal")
     axes.margins(0.1)
     axes.invert_yaxis()
-    axes.set_xlabel("x (mm)")
-    axes.set_ylabel("y, downwards (mm)")
+    axes.set(xlabel="x (mm)", ylabel="y, downwards (mm)")
     inked(axes)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
     return svg(figure)
@@ -172,8 +171,7 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words:
             colour = "black" if sigma > 0.6 * max(sigmas) else "white"
             text = f"{sigma:.0f}" if max(sigmas) >= 10 else f"{sigma:.2g}"
             axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
-    axes.set_xlabel("column of the grid")
-    axes.set_ylabel("row of the grid")
+    axes.set(xlabel="column of the grid", ylabel="row of the grid")
     axes.locator_params(integer=True)
     inked(axes)
     return svg(figure)

@@ -106,8 +106,7 @@ def _photon_transfer(axes: Axes, calibration: NoiseCalibration) -> None:
     if flats:
         axes.set_xscale("symlog", linthresh=10)
         axes.set_yscale("log")
-    axes.set_xlabel(r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]")
-    axes.set_ylabel(r"$\sigma_y^2$ [DN²]")
+    axes.set(xlabel=r"$\mu_y - \mu_{y.\mathrm{dark}}(0)$ [DN]", ylabel=r"$\sigma_y^2$ [DN²]")
     axes.legend(fontsize=8)
 
 
@@ -119,8 +118,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
     order = np.argsort(t)
     model = _column(points, "model_mean_dn")
     axes.plot(t[order], model[order], color=_MODEL, lw=1, label="model")
-    axes.set_xlabel("exposure time [s]")
-    axes.set_ylabel(r"$\mu_{y.\mathrm{dark}}$ [DN]")
+    axes.set(xlabel="exposure time [s]", ylabel=r"$\mu_{y.\mathrm{dark}}$ [DN]")
     # Legend and inset are placed beside the line, whether it rises or falls.
     falls = model[order[-1]] < model[order[0]]
     axes.legend(fontsize=8, loc="upper right" if falls else "upper left")
@@ -162,8 +160,7 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         assert values is not None
         low, high = np.quantile(values[~unusable], [0.005, 0.995])
         image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
-        axes.set_xlabel("column [px]")
-        axes.set_ylabel("row [px]")
+        axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
     return Plot(title, draw, _sameness(values, unusable))
@@ -188,22 +185,19 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.5)
-    low, high = _span(calibration)
-    axes.set_xlim(low, high)
+    axes.set_xlim(*_span(calibration))
     axes.locator_params(axis="x", nbins=6)
-    axes.set_xlabel("$y$ [DN]")
-    axes.set_ylabel("count")
+    axes.set(xlabel="$y$ [DN]", ylabel="count")
     axes.legend(fontsize=8)
 
 
 def _span(calibration: NoiseCalibration) -> tuple[float, float]:
     """Return the range of values between the quantiles 1e-4 and 1 - 1e-4."""
-    low, high = np.inf, -np.inf
+    inner: list[float] = []
     for histogram in calibration.histograms:
         share = np.cumsum(histogram.count) / histogram.count.sum()
-        inner = histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)]
-        low, high = min(low, float(inner.min())), max(high, float(inner.max()))
-    return low - 3, high + 3
+        inner += histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)].tolist()
+    return min(inner) - 3, max(inner) + 3
 
 
 def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
@@ -219,8 +213,7 @@ def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
     white = float(np.sqrt((deviation**2).mean()))
     axes.axhline(white, color=_MODEL, lw=1, ls="--", label="same variance, no pattern")
     axes.set_ylim(bottom=0)
-    axes.set_xlabel("spatial frequency [cycles/px]")
-    axes.set_ylabel("amplitude [DN]")
+    axes.set(xlabel="spatial frequency [cycles/px]", ylabel="amplitude [DN]")
     axes.legend(fontsize=8)
 
 

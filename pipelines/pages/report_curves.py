@@ -29,8 +29,7 @@ def focus_curve(focus: FocusCurve) -> str:
         axes.annotate(
             f"{depth:.0f} mm", (depth, top), xytext=(4, -2), textcoords="offset points", color="#d95f02", va="top"
         )
-    axes.set_xlabel("depth (mm)", color=INK)
-    axes.set_ylabel("detail both halves\nof the views agree on (e⁻²)", color=INK)
+    axes.set(xlabel="depth (mm)", ylabel="detail both halves\nof the views agree on (e⁻²)")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
     inked(axes)
     return svg(figure)
@@ -76,8 +75,7 @@ def weight_curves(planes: Sequence[Plane]) -> str | None:
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         axis_format("{x:g}")
-    axes.set_xlabel("penalty weight β")
-    axes.set_ylabel("held-out views: −log likelihood\nabove its least")
+    axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove its least")
     axes.legend(frameon=False, labelcolor=INK)
     inked(axes)
     return svg(figure)
