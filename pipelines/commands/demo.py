@@ -20,7 +20,7 @@ from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.demo import FULL, QUICK, demo_metrics, demo_rig, true_set, write_truth
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
 from faintfield.pipelines.reconstruction.steps import run_steps
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE
 
 # The file that marks a folder as made by a demo; the next demo may replace such a folder.
 _MARK = "demo.json"

@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_s
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.request import folder_of_method
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE, render_scene, write_ground_truth
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.rig.boards import BoardSettings
 from faintfield.rig.cameras.settings import SimulatedSettings

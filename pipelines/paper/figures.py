@@ -36,8 +36,7 @@ from faintfield.pipelines.paper.figure_records import (
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
-from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, SyntheticOptions, write_synthetic_set
 from faintfield.recon.smoothing import blurred
 
 type FigureNumber = Literal[2, 3, 4]
