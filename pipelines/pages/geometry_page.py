@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.results.geometry import GeometryRecord, LensRecord, StageFigure, StageRecord
-from faintfield.pipelines.pages.page import INK, figure, inked, svg, template
+from faintfield.pipelines.pages.page import INK, figure, ink, svg, template
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -135,7 +135,7 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     axes.margins(0.1)
     axes.invert_yaxis()
     axes.set(xlabel="x (mm)", ylabel="y, downwards (mm)")
-    inked(axes)
+    ink(axes)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
     return svg(figure)
 
@@ -173,7 +173,7 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words:
             axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set(xlabel="column of the grid", ylabel="row of the grid")
     axes.locator_params(integer=True)
-    inked(axes)
+    ink(axes)
     return svg(figure)
 
 

@@ -82,7 +82,7 @@ def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
         Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _sameness(maps.offset_dn, maps.unusable)),
+        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
@@ -132,7 +132,7 @@ def _dark_signal(axes: Axes, calibration: NoiseCalibration) -> None:
 def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw a table of the numbers with their intervals."""
     axes.axis("off")
-    cells = [[label, *_words(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
+    cells = [[label, *_value_and_interval(calibration.estimates[name]), unit] for name, label, unit in _ROWS]
     table = axes.table(
         cells, colWidths=[0.26, 0.18, 0.34, 0.22], loc="upper center", cellLoc="left", edges="horizontal"
     )
@@ -144,7 +144,7 @@ def _table(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.text(0.5, 0.0, f"{words} pixels", ha="center", fontsize=9, transform=axes.transAxes)
 
 
-def _words(estimate: Estimate) -> tuple[str, str]:
+def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
     """Return value and interval as text, rounded to the standard error."""
     if estimate.value is None or estimate.ci95 is None:
         return "—", "not identifiable"
@@ -163,11 +163,11 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Plot(title, draw, _sameness(values, unusable))
+    return Plot(title, draw, _why_empty(values, unusable))
 
 
-def _sameness(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
-    """Return why a map has nothing to show, None if it has."""
+def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+    """Return why a map has nothing to show, None if it has something."""
     if values is None:
         return "not identifiable from these frames"
     if unusable.all():
@@ -185,13 +185,13 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.5)
-    axes.set_xlim(*_span(calibration))
+    axes.set_xlim(*_value_range(calibration))
     axes.locator_params(axis="x", nbins=6)
     axes.set(xlabel="$y$ [DN]", ylabel="count")
     axes.legend(fontsize=8)
 
 
-def _span(calibration: NoiseCalibration) -> tuple[float, float]:
+def _value_range(calibration: NoiseCalibration) -> tuple[float, float]:
     """Return the range of values between the quantiles 1e-4 and 1 - 1e-4."""
     inner: list[float] = []
     for histogram in calibration.histograms:

@@ -6,7 +6,7 @@ from itertools import cycle
 import numpy as np
 
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, FocusCurve
-from faintfield.pipelines.pages.page import INK, inked, svg
+from faintfield.pipelines.pages.page import INK, ink, svg
 from faintfield.pipelines.pages.report_planes import Plane
 
 # Colour and mark of the curves of several planes.
@@ -31,7 +31,7 @@ def focus_curve(focus: FocusCurve) -> str:
         )
     axes.set(xlabel="depth (mm)", ylabel="detail both halves\nof the views agree on (e⁻²)")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
-    inked(axes)
+    ink(axes)
     return svg(figure)
 
 
@@ -75,9 +75,9 @@ def weight_curves(planes: Sequence[Plane]) -> str | None:
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         axis_format("{x:g}")
-    axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove its least")
+    axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove their minimum")
     axes.legend(frameon=False, labelcolor=INK)
-    inked(axes)
+    ink(axes)
     return svg(figure)
 
 

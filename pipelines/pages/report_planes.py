@@ -81,7 +81,7 @@ class Plane:
 
     @property
     def place(self) -> tuple[float, str]:
-        """What planes of several columns have in common when they stand side by side."""
+        """Depth and name, which planes of several columns share when they stand side by side."""
         return (self.depth_mm, self.name)
 
     def pixels(self) -> NDArray[Any]:
@@ -91,7 +91,7 @@ class Plane:
     def sigma_e(self) -> NDArray[Any] | None:
         """Return the standard deviation of each sample, None if it was not asked for."""
         name = self.records[0].sigma_file
-        return read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
+        return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
 def method_title(records: Sequence[PlaneRecord]) -> str:
@@ -116,13 +116,13 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
             # The folders of a method and of a session's reconstructions tell nothing more
             parts = [part for part in where.parts if part not in (method, RECONSTRUCTIONS)]
             column = f"{parts[-1]}/{method}" if parts else method
-            path = existing(folder / Path(name).name)
+            path = _existing(folder / Path(name).name)
             planes.append(Plane(column, method, result.options.poses, records[0].depth_mm, path, records))
     poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
     return sorted(planes, key=lambda it: (poses(it.poses), it.column.rpartition("/")[0], methods(it.method)))
 
 
-def existing(path: Path) -> Path:
+def _existing(path: Path) -> Path:
     """Return the path of a file that reconstruction.json names, if it exists (else MissingFile)."""
     if not path.is_file():
         raise MissingFile(f"{path}: is recorded in reconstruction.json but missing; reconstruct again")
@@ -198,10 +198,10 @@ def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
 
 
 def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
-    """Return whether errors are of a plane's method and poses; errors of stated poses say if these are true."""
+    """Return whether errors are of a plane's method and poses; poses that a set states match those of any kind."""
     return errors.method == plane.method and plane.poses in ("stated", errors.poses)
 
 
 def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:
-    """Return the title of the method of errors, as beside the planes."""
+    """Return the title of the method of errors, as the planes have it."""
     return next((plane.title for plane in planes if _is_of(errors, plane)), METHOD_NAMES[errors.method])

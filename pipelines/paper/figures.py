@@ -63,7 +63,7 @@ class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
     size_px: tuple[int, int]
 
 
-class _FigureProvenance(Provenance[dict[str, object]], frozen=True):
+class _FigureProvenance(Provenance[dict[str, object]], frozen=True, kw_only=True):
     """The provenance of a figure, which is written last: it says that the figure is whole."""
 
     wall_time_s: float
