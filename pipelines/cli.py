@@ -1,4 +1,4 @@
-"""The command line: runs a command, prints its result, and turns its end into an exit code.
+"""The command line: runs a command, prints its result, and returns an exit code.
 
 A command is a function of its arguments that returns its result, a JSON-able object. `pipelines.registry` lists the
 commands by name, so that a module is imported only when its command runs.

@@ -6,7 +6,7 @@ from typing import Any
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings, stage_settings_path
-from faintfield.pipelines.live.preflight import changed_settings, needed_bytes, survey_lines
+from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 

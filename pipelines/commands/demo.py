@@ -17,11 +17,10 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.paper.demo_rig import DemoSize, demo_rig
-from faintfield.pipelines.paper.demo_truth import demo_metrics, true_set, write_truth
+from faintfield.pipelines.paper.demo import FULL, QUICK, demo_metrics, demo_rig, true_set, write_truth
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
 from faintfield.pipelines.reconstruction.steps import run_steps
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE
 
 # The file that marks a folder as made by a demo; the next demo may replace such a folder.
 _MARK = "demo.json"
@@ -58,7 +57,7 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
         Seed of the random generator.
     """
     _make_free(out)
-    settings = demo_rig(DemoSize.quick() if quick else DemoSize.full(), snr, seed)
+    settings = demo_rig(QUICK if quick else FULL, snr, seed)
     write_toml(out / "rig.toml", settings)
     session = out / "session"
     inform(

@@ -8,8 +8,7 @@ from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, Positive, Seed, SizePx
 from faintfield.pipelines.paper.figure_records import Figure2, Figure3, Figure4
-from faintfield.pipelines.paper.figures import FigureNumber, FigureOptions, make_figures
-from faintfield.pipelines.paper.figures_page import PAGE_FILE
+from faintfield.pipelines.paper.figures import PAGE_FILE, FigureNumber, FigureOptions, make_figures
 
 
 class FiguresMade(msgspec.Struct, frozen=True):

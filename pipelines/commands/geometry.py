@@ -24,7 +24,7 @@ from faintfield.pipelines.formats.results.geometry import (
     write_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
-from faintfield.pipelines.pages.stage_page import stage_page
+from faintfield.pipelines.pages.geometry_page import geometry_page
 
 # Above this the nodes of one sweep no longer stand for those of another.
 _MAX_REPEATABILITY_MM = 0.020
@@ -77,7 +77,7 @@ def geometry(
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
     measured = measure_geometry(board_set, GeometrySettings(lens, options.depth_mm, limit_px))
     record = geometry_record(measured, options)
-    write_geometry(out, record, {**files_beside(measured), GEOMETRY_PAGE: stage_page(record)})
+    write_geometry(out, record, {**files_beside(measured), GEOMETRY_PAGE: geometry_page(record)})
     _inform_of(measured, record)
     figures = {name: getattr(record, name) for name in GeometrySummary.__struct_fields__[2:]}
     return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)

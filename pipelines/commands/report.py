@@ -2,19 +2,11 @@
 
 from pathlib import Path
 
-import msgspec
-
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.pages.report import write_report
 
 
-class Reported(msgspec.Struct, frozen=True):
-    """The result of `faintfield report`."""
-
-    report: str
-
-
-def report(directory: Path, /) -> Reported:
+def report(directory: Path, /) -> dict[str, str]:
     """Write report.html again from the results in a folder and the folders within it.
 
     The page begins with the planes next to what the camera saw. Then come sliders; errors; noise and geometry of the
@@ -28,4 +20,4 @@ def report(directory: Path, /) -> Reported:
     """
     path = write_report(directory)
     inform(f"{path}")
-    return Reported(str(path))
+    return {"report": str(path)}

@@ -16,15 +16,17 @@ from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.firmware import serving
-from faintfield.rig.stages.conformance import Check, check_conformance
+from faintfield.rig.stages.conformance import Check
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
 
-app = App(
-    name="stage",
-    help="Bring up a stage: identify it, home it, move it, test it.",
-    help_epilogue="Example: faintfield stage test --port simulated:grbl",
-)
+app = App(name="stage", help_epilogue="Example: faintfield stage test --port simulated:grbl")
+
+
+class _RigFile(msgspec.Struct):
+    """The part of a rig.toml that describes the stage; other tables are ignored."""
+
+    stage: StageSettings
 
 
 @Parameter(name="*")
@@ -55,7 +57,7 @@ class Connection:
         if self.rig is not None:
             if stated:
                 raise WrongUsage(f"--rig describes the whole stage; leave out --{stated[0]}, or --rig")
-            return stage_table(self.rig)
+            return read_toml(self.rig, _RigFile).stage
         if self.port is None:
             raise WrongUsage(
                 "no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml"
@@ -68,23 +70,6 @@ class Connection:
                     f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
                 )
         return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
-
-
-class _RigFile(msgspec.Struct):
-    """The part of a rig.toml that describes the stage; other tables are ignored."""
-
-    stage: StageSettings
-
-
-def stage_table(path: Path) -> StageSettings:
-    """Return the `[stage]` table of a rig.toml.
-
-    Raises
-    ------
-    MissingFile, BadValue, UnknownKey
-        The file cannot be read; the message names it and what is wrong.
-    """
-    return read_toml(path, _RigFile).stage
 
 
 @app.command(sort_key=1)
@@ -169,12 +154,14 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     StageUnfit
         A check failed; the table shows which.
     """
+    table, checks = Table("", "check", "measured", "limit"), []
     with _connected(connection) as stage:
-        checks = []
-        for check in check_conformance(stage):
+        for check in conformance(stage):
             inform(f"tried: {check.name}")
+            mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
+            table.add_row(mark, check.name, check.measured, check.limit)
             checks.append(check)
-    console.print(_table(checks))
+    console.print(table)
     failed = [check for check in checks if not check.passed]
     if failed:
         raise StageUnfit(
@@ -216,12 +203,3 @@ def _connected(connection: Connection) -> Iterator[Gantry]:
         yield stage
     finally:
         stage.close()
-
-
-def _table(checks: list[Check]) -> Table:
-    """Return the checks as a table."""
-    table = Table("", "check", "measured", "limit")
-    for check in checks:
-        mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
-        table.add_row(mark, check.name, check.measured, check.limit)
-    return table

@@ -2,18 +2,10 @@
 
 from pathlib import Path
 
-import msgspec
-
 from faintfield.pipelines.pages.napari_layers import show_planes
 
 
-class Viewed(msgspec.Struct, frozen=True):
-    """The result of `faintfield view`."""
-
-    layers: list[str]
-
-
-def view(directory: Path, /) -> Viewed:
+def view(directory: Path, /) -> dict[str, list[str]]:
     """Open the planes of a folder in napari, if it is installed: in millimetres, on one grey scale.
 
     A few planes are one layer each; a sweep in equal steps is one layer per method, with a slider over depth.
@@ -23,4 +15,4 @@ def view(directory: Path, /) -> Viewed:
     directory
         Folder with reconstruction.json, or whose folders have one: what `reconstruct` wrote, or a session.
     """
-    return Viewed(show_planes(directory))
+    return {"layers": show_planes(directory)}

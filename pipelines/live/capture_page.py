@@ -22,7 +22,7 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.routing import Route
 
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel
 from faintfield.pipelines.live.terminal import LABELS, display_levels
 from faintfield.rig.capture.guide import format_duration
 
@@ -80,7 +80,10 @@ def _application(panel: CapturePanel, token: str) -> Starlette:
     async def picture(_: Request) -> Response:
         if panel.shown is None:
             return Response(status_code=404, headers=_HEADERS)
-        return Response(_frame_png(panel.shown), media_type="image/png", headers=_HEADERS)
+        grey = display_levels(panel.shown.pixels, _PICTURE_PX)
+        zero = np.zeros_like(grey)
+        red = encoded(np.dstack([grey, zero, zero]), ".png")
+        return Response(red, media_type="image/png", headers=_HEADERS)
 
     async def press(request: Request) -> Response:
         try:
@@ -108,29 +111,20 @@ def _application(panel: CapturePanel, token: str) -> Starlette:
 def _state(panel: CapturePanel) -> dict[str, Any]:
     """Return what the page shows, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
-    words = list(REQUESTS) if asked is None else list(asked.prompt.answers)
+    words = REQUESTS if asked is None else asked.prompt.answers
+    frame = None
+    if shown is not None:
+        counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
+        frame = {
+            "name": shown.frame.name,
+            "values": dict(shown.values),
+            "histogram": np.log1p(counts).tolist(),
+            "range_dn": [float(edges[0]), float(edges[-1])],
+        }
     return {
         "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
         "status": None if status is None else msgspec.to_builtins(status),
         "to_go": "" if status is None else format_duration(status.to_go_s),
         "buttons": [{"word": word, "label": LABELS[word]} for word in words],
-        "frame": None if shown is None else _frame_state(shown),
-    }
-
-
-def _frame_png(shown: ShownFrame) -> bytes:
-    """Return a frame as PNG, in red only."""
-    grey = display_levels(shown.pixels, _PICTURE_PX)
-    zero = np.zeros_like(grey)
-    return encoded(np.dstack([grey, zero, zero]), ".png")
-
-
-def _frame_state(shown: ShownFrame) -> dict[str, Any]:
-    """Return name, measured values and histogram of a frame."""
-    counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
-    return {
-        "name": shown.frame.name,
-        "values": dict(shown.values),
-        "histogram": np.log1p(counts).tolist(),
-        "range_dn": [float(edges[0]), float(edges[-1])],
+        "frame": frame,
     }

@@ -1,7 +1,8 @@
-"""Run a guided capture: plan or resume the session, and show it in the terminal and on the page."""
+"""Run a guided capture: survey the rig, plan or resume the session, and show it in the terminal and on the page."""
 
+import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -11,15 +12,20 @@ from faintfield.pipelines.errors import InputError
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.panel import CapturePanel
-from faintfield.pipelines.live.preflight import duration_words, needed_bytes
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import survey
-from faintfield.rig.devices import open_rig
+from faintfield.rig.capture.survey import Survey, survey
+from faintfield.rig.devices import is_simulated, open_rig
+from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.resume import check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
+from faintfield.rig.stages.protocol import StageSettings
+
+# Frames that are taken again keep their earlier file: ask for half as much room again.
+_ROOM_FACTOR = 1.5
 
 
 def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, page: bool) -> int:
@@ -98,3 +104,37 @@ def _stop_on_interrupt(panel: CapturePanel) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def needed_bytes(plan: CapturePlan) -> int:
+    """Return the free room on disk that a capture should have."""
+    return round(_ROOM_FACTOR * plan.disk_bytes())
+
+
+def duration_words(duration_s: float, stage: StageSettings) -> str:
+    """Return the duration of a capture in words, and by which clock if the stage is simulated."""
+    words = f"{format_duration(duration_s)} without prompts"
+    return f"{words} by the simulated stage's clock, far less by yours" if is_simulated(stage) else words
+
+
+def survey_lines(found: Survey, stage: StageSettings, rig: Path) -> list[str]:
+    """Return a line each about stage, camera, plan and the disk of the rig.toml."""
+    plan, travel = found.plan, found.stage.travel_mm
+    size_mb, need_mb = plan.disk_bytes() / 1e6, needed_bytes(plan) / 1e6
+    free_mb = shutil.disk_usage(rig.absolute().parent).free / 1e6
+    return [
+        f"stage: {found.stage.firmware}, travel {travel}; all {len(plan.path())} points of the path are allowed",
+        f"camera: {found.camera.name}; all exposure times are offered",
+        f"plan: {plan.frame_count()} frames in {len(plan.steps)} steps, {duration_words(found.duration_s, stage)}",
+        f"disk: {size_mb:.0f} MB of frames; {need_mb:.0f} MB are wanted, {free_mb:.0f} MB are free",
+    ]
+
+
+def changed_settings(stored: Mapping[str, str], present: Mapping[str, str]) -> list[str]:
+    """Return a warning for each setting of the stage that differs from the stored one."""
+    return [
+        f"the stage's {key} was {stored.get(key, 'absent')} when stored and is {present.get(key, 'absent')} now; "
+        "set it back, or store it with --remember"
+        for key in sorted(stored.keys() | present.keys())
+        if stored.get(key) != present.get(key)
+    ]

@@ -1,7 +1,7 @@
-"""Hold what terminal and page share: one prompt, one status, one queue of pressed buttons.
+"""State that terminal and page share: one prompt, one status, one queue of pressed buttons.
 
-Both show the same, and the first answer counts, wherever it comes from. The capture runs in the main thread and reads
-the queue, into which keys, clicks and Ctrl-C are put alike.
+Both show the same state, and the first answer from either counts. The capture runs in the main thread and reads the
+queue; keys, clicks and Ctrl-C all write to it.
 """
 
 import itertools

@@ -6,7 +6,7 @@ import sys
 import termios
 import threading
 import tty
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 import cv2
@@ -20,7 +20,6 @@ from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Prompt, Status, format_duration
 
-KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
 LABELS = {
     "go": "go on",
     "again": "try again",
@@ -30,6 +29,7 @@ LABELS = {
     "stop": "stop",
     "pause": "pause",
 }
+_KEYS = {"go": "g", "again": "a", "keep": "k", "retake": "r", "skip": "s", "stop": "q", "pause": "p"}
 # Width of the frame's picture in characters.
 _PICTURE_COLUMNS = 48
 _BARS = " ▁▂▃▄▅▆▇█"
@@ -84,20 +84,19 @@ class TerminalView:
         if self._panel.status is not None:
             parts.append(Text(status_line(self._panel.status)))
         if self._panel.asked is None:
-            keys = "  ".join(f"[{KEYS[word]}] {LABELS[word]}" for word in ("pause", "retake", "skip", "stop"))
-            parts.append(Text(keys, style="dim"))
+            parts.append(Text(_key_line(("pause", "retake", "skip", "stop"), "  "), style="dim"))
         return Group(*parts)
 
 
 def prompt_lines(prompt: Prompt) -> list[str]:
     """Return a prompt as lines of text."""
-    answers = "   ".join(f"[{KEYS[answer]}] {LABELS[answer]}" for answer in prompt.answers)
-    return [
-        "",
-        prompt.title,
-        *(f"  {line}" for line in prompt.lines),
-        f"  {answers}   (Enter: {LABELS[prompt.answers[0]]})",
-    ]
+    answers = f"{_key_line(prompt.answers, '   ')}   (Enter: {LABELS[prompt.answers[0]]})"
+    return ["", prompt.title, *(f"  {line}" for line in (*prompt.lines, answers))]
+
+
+def _key_line(words: Iterable[str], gap: str) -> str:
+    """Return each key with its label."""
+    return gap.join(f"[{_KEYS[word]}] {LABELS[word]}" for word in words)
 
 
 def status_line(status: Status) -> str:
@@ -147,7 +146,7 @@ def _keys(panel: CapturePanel) -> Iterator[None]:
         return
     before = termios.tcgetattr(sys.stdin)
     wake_read, wake_write = os.pipe()
-    words = {key: word for word, key in KEYS.items()}
+    words = {key: word for word, key in _KEYS.items()}
 
     def listen() -> None:
         while True:

@@ -72,14 +72,12 @@ def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list
     method = result.planes[0].method
     where = folder.relative_to(directory).as_posix()
     name = method_title(result.planes) + (f", {where}" if where not in (".", method) else "")
-    alone = [_plane_layer(folder, plane, f"{name}, {plane.name}") for plane in tilted]
-    if not planes:
-        return alone
-    step_mm = stack_scale(planes).step_mm
-    one_shape = len({record.shape for record in planes}) == 1
-    if len(planes) < _MIN_DEPTHS_OF_A_STACK or step_mm is None or not one_shape:
-        return [*(_plane_layer(folder, plane, f"{name}, {plane.depth_mm:g} mm") for plane in planes), *alone]
-    return [_stack_layer(folder, planes, name, step_mm), *alone]
+    step_mm = stack_scale(planes).step_mm if len(planes) >= _MIN_DEPTHS_OF_A_STACK else None
+    if step_mm is not None and len({record.shape for record in planes}) == 1:
+        layers = [_stack_layer(folder, planes, name, step_mm)]
+    else:
+        layers = [_plane_layer(folder, plane, f"{name}, {plane.depth_mm:g} mm") for plane in planes]
+    return layers + [_plane_layer(folder, plane, f"{name}, {plane.name}") for plane in tilted]
 
 
 def _plane_layer(folder: Path, plane: PlaneRecord, name: str) -> Layer:

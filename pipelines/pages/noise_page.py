@@ -82,7 +82,7 @@ def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
         Plot("Dark values and the fitted mass function", _histograms, no_mass),
-        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _reason_to_omit(maps.offset_dn, maps.unusable)),
+        Plot("Spectrogram of the offset (DSNU)", _spectrogram, _why_empty(maps.offset_dn, maps.unusable)),
         _map("Relative response to light", maps.relative_response, maps.unusable),
     )
 
@@ -162,11 +162,11 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
-    return Plot(title, draw, _reason_to_omit(values, unusable))
+    return Plot(title, draw, _why_empty(values, unusable))
 
 
-def _reason_to_omit(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
-    """Return why a map has nothing to show, None if it has."""
+def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> str | None:
+    """Return why a map has nothing to show, None if it has something."""
     if values is None:
         return "not identifiable from these frames"
     if unusable.all():
@@ -184,18 +184,19 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
     axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_span(calibration), yscale="log")
     axes.set_ylim(bottom=0.5)
+    axes.set_xlim(*_value_range(calibration))
     axes.locator_params(axis="x", nbins=6)
+    axes.set(xlabel="$y$ [DN]", ylabel="count")
     axes.legend(fontsize=8)
 
 
-def _span(calibration: NoiseCalibration) -> tuple[float, float]:
+def _value_range(calibration: NoiseCalibration) -> tuple[float, float]:
     """Return the range of values between the quantiles 1e-4 and 1 - 1e-4."""
-    low, high = np.inf, -np.inf
+    inner: list[float] = []
     for histogram in calibration.histograms:
         share = np.cumsum(histogram.count) / histogram.count.sum()
-        inner = histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)]
-        low, high = min(low, float(inner.min())), max(high, float(inner.max()))
-    return low - 3, high + 3
+        inner += histogram.value_dn[(share > 1e-4) & (share < 1 - 1e-4)].tolist()
+    return min(inner) - 3, max(inner) + 3
 
 
 def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:

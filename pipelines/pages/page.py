@@ -64,7 +64,7 @@ def svg(figure: "Figure") -> str:
     return drawn[drawn.index("<svg") :].replace(INK, "currentColor")
 
 
-def inked(*axes: Any) -> None:
+def ink(*axes: Any) -> None:
     """Give axes the colour `INK`, and remove the frame above and to the right."""
     for one in axes:
         one.tick_params(which="both", colors=INK)

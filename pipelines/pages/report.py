@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
+import numpy as np
 from msgspec import UNSET
 
 from faintfield.pipelines.formats.files import write_whole
@@ -14,39 +15,43 @@ from faintfield.pipelines.formats.results.records import (
     OVERVIEW_FILE,
     RECONSTRUCTION_FILE,
     REPORT_FILE,
-    PlaneRecord,
+    GeometryErrors,
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.result_files import files_below, results_below
 from faintfield.pipelines.formats.results.stacks import at_depths
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
-from faintfield.pipelines.pages.page import template
+from faintfield.pipelines.pages.page import figure, template
 from faintfield.pipelines.pages.report_calibration import (
-    calibration_origins,
+    GeometrySection,
+    NoiseSection,
     find_beside,
     geometry_section,
     noise_section,
 )
-from faintfield.pipelines.pages.report_depth import depth_sections
-from faintfield.pipelines.pages.report_errors import error_sections
-from faintfield.pipelines.pages.report_lead import facts
-from faintfield.pipelines.pages.report_pictures import plane_sections
-from faintfield.pipelines.pages.report_planes import method_title, read_planes
-from faintfield.pipelines.pages.report_sets import set_sections
+from faintfield.pipelines.pages.report_pictures import depth_sections, plane_sections
+from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
+from faintfield.pipelines.pages.report_sets import SetSection, set_sections
+
+
+@dataclass(frozen=True)
+class Fact:
+    """A number with its name and what it means."""
+
+    name: str
+    value: str
+    means: str
 
 
 @dataclass(frozen=True)
 class Origin:
-    """How the planes of one folder were made, and when."""
+    """A reconstruction, with its folder, method, options and time of writing as the page shows them."""
 
     where: str
     method: str
     written: str
-    planes: list[PlaneRecord]
     options: dict[str, object]
-    inputs: dict[str, str]
-    versions: dict[str, str]
-    wall_time_s: float
+    record: ReconstructionRecord
 
 
 def write_report(directory: Path, *, noise: Path | None = None, geometry: Path | None = None) -> Path:
@@ -65,7 +70,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         There is no result in the folder, or one that cannot be read.
     """
     results = results_below(directory)
-    inputs = {name: digest for result in results.values() for name, digest in result.inputs.items()}
+    inputs = {digest for result in results.values() for digest in result.inputs.values()}
     noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
     of_noise = noise_section(directory, noise, inputs) if noise else None
     of_geometry = geometry_section(directory, geometry, inputs) if geometry else None
@@ -73,9 +78,16 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     planes = read_planes(directory, results)
     shown, errors = plane_sections(planes, results.values()), error_sections(directory, planes)
     the_set = sets[0] if sets else None
+    facts = _light(the_set) if the_set else []
+    facts.append(_poses(of_geometry, errors.geometry_off))
+    facts += _noise(of_noise, the_set)
+    if best := errors.of(shown.best):
+        values = ", ".join(figure(row.mse_bright) for row in best)
+        depths = ", ".join(f"{row.depth_mm:g}" for row in best)
+        facts.append(Fact("Mean square error", values, f"at {depths} mm; objects 0…1, truth: plenty of light"))
     page = template("report.html").render(
         title=_title(directory, results),
-        facts=facts(the_set, of_noise, of_geometry, against_truth=errors.geometry_off, errors=errors.of(shown.best)),
+        facts=facts,
         sets=sets,
         **vars(shown),
         depth_maps=depth_sections(directory, results),
@@ -84,7 +96,6 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         **vars(errors),
         links=_links(directory),
         results=[_origin(directory, folder, result) for folder, result in results.items()],
-        calibrations=calibration_origins(of_noise, of_geometry),
     )
     path = directory / REPORT_FILE
     write_whole(path, page)
@@ -103,18 +114,10 @@ def _links(directory: Path) -> list[tuple[str, str]]:
 
 
 def _origin(directory: Path, folder: Path, result: ReconstructionRecord) -> Origin:
-    """Return how the planes of one folder were made, and when."""
+    """Return how and when the planes of one folder were made."""
     written = datetime.fromtimestamp(int((folder / RECONSTRUCTION_FILE).stat().st_mtime), UTC)
-    return Origin(
-        where=folder.relative_to(directory).as_posix(),
-        method=method_title(result.planes),
-        written=f"{written:%Y-%m-%d %H:%M:%S} UTC",
-        planes=result.planes,
-        options=msgspec.to_builtins(result.options),
-        inputs=result.inputs,
-        versions=result.versions,
-        wall_time_s=result.wall_time_s,
-    )
+    where, method = folder.relative_to(directory).as_posix(), method_title(result.planes)
+    return Origin(where, method, f"{written:%Y-%m-%d %H:%M:%S} UTC", msgspec.to_builtins(result.options), result)
 
 
 def _title(directory: Path, results: dict[Path, ReconstructionRecord]) -> str:
@@ -129,7 +132,56 @@ def _title(directory: Path, results: dict[Path, ReconstructionRecord]) -> str:
 
 
 def _name(folder: Path) -> str:
-    """Return the name of what is reconstructed in a folder: of a session, its own name and which of its sets."""
+    """Return the name of what is reconstructed in a folder; for one set of a session, the names of both."""
     if folder.name == RECONSTRUCTIONS:
         return folder.parent.name
     return f"{folder.parent.parent.name}, {folder.name}" if folder.parent.name == RECONSTRUCTIONS else folder.name
+
+
+def _light(the_set: SetSection) -> list[Fact]:
+    """Return the SNR and the light of a view."""
+    light = the_set.overview.brightness
+    if light.snr is None or the_set.noise_free:
+        return []
+    found = [Fact("SNR of a view", figure(light.snr), f"eq. (4): {light.region} against {light.noise_from}")]
+    if light.photons_from_moments is not None:
+        value = f"{figure(light.photons_from_moments)} photons/px"
+        found.append(Fact("Light", value, f"from moments; {figure(light.photons_linear)} by the paper’s eq. (7)"))
+    elif light.electrons_from_moments is not None:
+        value = f"{figure(light.electrons_from_moments)} e⁻/px"
+        reason = "the quantum efficiency is not known, so that this is no number of photons"
+        found.append(Fact("Light", value, f"from moments; {figure(light.electrons_linear)} by eq. (7); {reason}"))
+    return found
+
+
+def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None) -> Fact:
+    """Return how well the camera's positions are known."""
+    if geometry is None:
+        return Fact("Poses", "as stated", "by the set; not measured")
+    record = geometry.record
+    sigma_mm = [node.sigma_mm for node in record.nodes if node.node != record.reference_node]
+    known = f"± {_length(float(np.sqrt(np.mean(np.square(sigma_mm))))) if sigma_mm else '–'}"
+    means = f"σ of a node’s position, of {len(record.nodes)} nodes"
+    if (off := record.stage.node_residual_rms_mm.value) is not None:
+        means += f"; they lie {_length(off)} rms off a regular grid"
+    if against_truth:
+        means += f". Against the truth: {_length(against_truth.centre_rms_mm)} rms"
+    return Fact("Poses, measured" if geometry.used else "Poses, not used here", known, means)
+
+
+def _noise(noise: NoiseSection | None, the_set: SetSection | None) -> list[Fact]:
+    """Return the sensor's noise, as measured or else as the set states it."""
+    if noise is None:
+        if the_set is None or the_set.noise_free:
+            return []
+        return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} e⁻", "as the set states it")]
+    read, dark = noise.record.read_noise_e, noise.record.dark_current_e_per_s
+    means = [f"± {figure(read.se, 2)}"] if read.se else []
+    means += [] if dark.value is None else [f"dark current {figure(dark.value)} e⁻/s"]
+    name = "Read noise, measured" if noise.used else "Read noise, not used here"
+    return [Fact(name, f"{figure(read.value)} e⁻", "; ".join(means))]
+
+
+def _length(length_mm: float) -> str:
+    """Return a length in the unit that suits it."""
+    return f"{figure(length_mm)} mm" if length_mm >= 0.1 else f"{figure(1e3 * length_mm)} µm"

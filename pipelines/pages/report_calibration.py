@@ -1,6 +1,6 @@
 """The camera in a report: its noise and its geometry."""
 
-from collections.abc import Mapping
+from collections.abc import Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,12 +9,13 @@ import msgspec
 import numpy as np
 
 from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
 from faintfield.pipelines.pages.page import data_uri
 
 if TYPE_CHECKING:
-    from faintfield.pipelines.pages.stage_page import Row
+    from faintfield.pipelines.pages.geometry_page import Row
 
 _NOISE_ROWS = (
     ("offset_dn", "offset", "DN"),
@@ -40,15 +41,25 @@ class NoiseRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A calibration on the page: its address, its hash, whether the planes were made with it, and pages beside it.
+    """A calibration on the page.
 
-    `pages` are addresses, each with the page itself as a data URI where it is a picture.
+    Attributes
+    ----------
+    where, sha256 : str
+        Address and hash of its file.
+    used : bool
+        The planes were made with it.
+    pages : list of (str, str or None)
+        Addresses of its own pages, each with the page as a data URI if it is a picture.
+    made : Provenance, optional
+        How it was made, if its file says so.
     """
 
     where: str
     sha256: str
     used: bool
     pages: list[tuple[str, str | None]]
+    made: Provenance[dict[str, object]] | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,24 +81,13 @@ class GeometrySection(Section):
     maps: list[str]
 
 
-@dataclass(frozen=True)
-class CalibrationOrigin:
-    """Where a calibration is, and what it was made by and from."""
-
-    where: str
-    sha256: str
-    options: Mapping[str, object]
-    inputs: dict[str, str]
-    versions: dict[str, str]
-
-
 def find_beside(directory: Path, name: str) -> Path | None:
     """Return a calibration's file: in the folder, else in one of the two above it, else in a folder within it."""
     folders = [directory, *list(directory.resolve().parents)[:2], *sorted(p for p in directory.glob("*") if p.is_dir())]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
 
 
-def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> NoiseSection:
+def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection:
     """Return what the page says of the sensor's noise.
 
     Parameters
@@ -96,14 +96,15 @@ def noise_section(directory: Path, path: Path, inputs: dict[str, str]) -> NoiseS
         The folder of the page.
     path : Path
         The noise.json.
-    inputs : dict
-        SHA-256 by name of the files that the planes were made from.
+    inputs : set of str
+        SHA-256 of the files that the planes were made from.
     """
     record = read_noise(path)
     pages = sorted(path.parent.glob("noise_page*.png"))
     return NoiseSection(
         **_origin(directory, path, inputs),
         pages=[(_link(directory, page), data_uri(page.read_bytes(), ".png")) for page in pages],
+        made=record.provenance,
         record=record,
         rows=[
             NoiseRow(words, unit, _decimals(measured.se), measured)
@@ -119,16 +120,18 @@ def _decimals(error: float | None) -> int:
     return int(np.clip(np.ceil(1 - np.log10(error)), 0, 6)) if error else 4
 
 
-def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> GeometrySection:
+def geometry_section(directory: Path, path: Path, inputs: Set[str]) -> GeometrySection:
     """Return what the page says of where the camera was; parameters as for `noise_section`."""
-    # This loads the calibration of geometries, which most reports do not show
-    from faintfield.pipelines.pages.stage_page import node_drawing, sigma_maps, stage_rows
+    # Loads the calibration of geometries, which most reports do not show
+    from faintfield.pipelines.pages.geometry_page import node_drawing, sigma_maps, stage_rows
 
     record = read_geometry(path, GeometryRecord)
     page = path.with_name(GEOMETRY_PAGE)
+    options = msgspec.structs.asdict(record.options)
     return GeometrySection(
         **_origin(directory, path, inputs),
         pages=[(_link(directory, page), None)] if page.is_file() else [],
+        made=Provenance(command=record.command, options=options, inputs=record.inputs, versions=record.versions),
         record=record,
         rows=stage_rows(record.stage),
         drawing=node_drawing(record),
@@ -136,23 +139,12 @@ def geometry_section(directory: Path, path: Path, inputs: dict[str, str]) -> Geo
     )
 
 
-def _origin(directory: Path, path: Path, inputs: dict[str, str]) -> dict[str, Any]:
+def _origin(directory: Path, path: Path, inputs: Set[str]) -> dict[str, Any]:
     """Return where a calibration lies, and whether the planes were made with it: the beginning of a `Section`."""
     digest = sha256(path)
-    return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs.values()}
+    return {"where": _link(directory, path), "sha256": digest, "used": digest in inputs}
 
 
 def _link(directory: Path, path: Path) -> str:
     """Return a file's address relative to the page's folder."""
     return path.resolve().relative_to(directory.resolve(), walk_up=True).as_posix()
-
-
-def calibration_origins(noise: NoiseSection | None, geometry: GeometrySection | None) -> list[CalibrationOrigin]:
-    """Return where and how the calibrations were made, for the page's last part."""
-    found: list[CalibrationOrigin] = []
-    if noise is not None and (made := noise.record.provenance) is not None:
-        found.append(CalibrationOrigin(noise.where, noise.sha256, made.options, made.inputs, made.versions))
-    if geometry is not None:
-        record, options = geometry.record, msgspec.structs.asdict(geometry.record.options)
-        found.append(CalibrationOrigin(geometry.where, geometry.sha256, options, record.inputs, record.versions))
-    return found

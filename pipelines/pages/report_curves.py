@@ -6,7 +6,7 @@ from itertools import cycle
 import numpy as np
 
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, FocusCurve
-from faintfield.pipelines.pages.page import INK, inked, svg
+from faintfield.pipelines.pages.page import INK, ink, svg
 from faintfield.pipelines.pages.report_planes import Plane
 
 # Colour and mark of the curves of several planes.
@@ -29,10 +29,9 @@ def focus_curve(focus: FocusCurve) -> str:
         axes.annotate(
             f"{depth:.0f} mm", (depth, top), xytext=(4, -2), textcoords="offset points", color="#d95f02", va="top"
         )
-    axes.set_xlabel("depth (mm)", color=INK)
-    axes.set_ylabel("detail both halves\nof the views agree on (e⁻²)", color=INK)
+    axes.set(xlabel="depth (mm)", ylabel="detail both halves\nof the views agree on (e⁻²)")
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
-    inked(axes)
+    ink(axes)
     return svg(figure)
 
 
@@ -76,10 +75,9 @@ def weight_curves(planes: Sequence[Plane]) -> str | None:
     axes.set_xscale("log")
     for axis_format in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         axis_format("{x:g}")
-    axes.set_xlabel("penalty weight β")
-    axes.set_ylabel("held-out views: −log likelihood\nabove its least")
+    axes.set(xlabel="penalty weight β", ylabel="held-out views: −log likelihood\nabove their minimum")
     axes.legend(frameon=False, labelcolor=INK)
-    inked(axes)
+    ink(axes)
     return svg(figure)
 
 

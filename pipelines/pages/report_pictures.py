@@ -1,14 +1,21 @@
-"""The pictures of a report's planes, on one grey scale: the best method, side by side, on sliders; and their sigmas."""
+"""The pictures of a report: planes on one grey scale (side by side, on sliders), their sigmas, and depth maps."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrunk, white_level
-from faintfield.pipelines.formats.results.records import JOINT_METHODS, Certificate, FocusCurve, ReconstructionRecord
+from faintfield.pipelines.formats.results.records import (
+    JOINT_METHODS,
+    Certificate,
+    DepthMapRecord,
+    FocusCurve,
+    ReconstructionRecord,
+)
 from faintfield.pipelines.pages.page import data_uri
 from faintfield.pipelines.pages.report_curves import focus_curve, weight_curves
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, plane_words
@@ -29,20 +36,14 @@ class Row:
 
 
 @dataclass(frozen=True)
-class SigmaPicture:
-    """The standard deviation of a plane as a data URI, and its median."""
-
-    title: str
-    median_e: float
-    src: str
-
-
-@dataclass(frozen=True)
 class Sigmas:
-    """The standard deviations of the planes on one scale; `white` is in electrons."""
+    """The standard deviations of the planes on one scale, whose white is in electrons.
+
+    A picture is its title, the median in electrons, and the data URI.
+    """
 
     white: float
-    pictures: list[SigmaPicture]
+    pictures: list[tuple[str, float, str]]
 
 
 class Slide(TypedDict):
@@ -108,6 +109,17 @@ class PlaneSections:
     sharp_mm: list[float]
 
 
+@dataclass(frozen=True)
+class DepthSection:
+    """A depth map with its pictures as data URIs; None if the file is missing."""
+
+    title: str
+    record: DepthMapRecord
+    all_in_focus: str | None
+    map: str | None
+    confidence: str | None
+
+
 def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
     """Return what the page shows of the planes."""
     depths = sorted({plane.depth_mm for plane in planes if not plane.name})
@@ -170,7 +182,7 @@ def _side_by_side(planes: list[Plane], columns: list[str], depths: list[float], 
     by_place = {(plane.place, plane.column): plane for plane in planes}
     rows = []
     for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
-        found = [by_place.get((place, column)) for column in columns]
+        found = (by_place.get((place, column)) for column in columns)
         cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
         rows.append(Row(plane_words(*place), cells))
     return rows
@@ -184,43 +196,65 @@ def _sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) ->
     if not found:
         return None
     white = max(white_level(sigma) for _, sigma in found)
-    return Sigmas(
-        white,
-        [
-            SigmaPicture(
-                f"{titles[plane.column]}, {plane_words(*plane.place)}",
-                float(np.median(sigma)),
-                _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
-            )
-            for plane, sigma in found
-        ],
-    )
+    pictures = [
+        (
+            f"{titles[plane.column]}, {plane_words(*plane.place)}",
+            float(np.median(sigma)),
+            _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
+        )
+        for plane, sigma in found
+    ]
+    return Sigmas(white, pictures)
 
 
 def _slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[SliderColumn]:
     """Return the pictures of the sliders: the planes of each column by depth."""
-    ordered = sorted(planes, key=lambda plane: plane.place)
-    return [
-        {"title": title, "planes": [_slide(plane, white) for plane in ordered if plane.column == column]}
-        for column, title in titles.items()
-    ]
+    columns: list[SliderColumn] = []
+    for column, title in titles.items():
+        ordered = sorted((plane for plane in planes if plane.column == column), key=lambda plane: plane.place)
+        columns.append({"title": title, "planes": [_slide(plane, white) for plane in ordered]})
+    return columns
 
 
 def _slide(plane: Plane, white: float) -> Slide:
     """Return one picture of the sliders."""
     pixels = plane.pixels()
-    picture = _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg")
-    words = plane_words(*plane.place)
-    return {"depth_mm": plane.depth_mm, "words": words, "samples": pixels.shape[1], "src": picture}
+    return {
+        "depth_mm": plane.depth_mm,
+        "words": plane_words(*plane.place),
+        "samples": pixels.shape[1],
+        "src": _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg"),
+    }
 
 
 def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
     """Return the index of the depth that the slider shows first: the peak of the focus curve if there is one."""
     if focus is None:
         return 0
-    best = max(zip(focus.detail_e2, focus.depth_mm, strict=True))[1]
-    return min(range(len(depths)), key=lambda index: abs(depths[index] - best))
+    best = focus.depth_mm[int(np.argmax(focus.detail_e2))]
+    return int(np.argmin(np.abs(np.array(depths) - best)))
 
 
 def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
     return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)
+
+
+def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -> list[DepthSection]:
+    """Return what the page shows of each depth map."""
+    return [
+        DepthSection(
+            folder.relative_to(directory).as_posix(),
+            found,
+            all_in_focus=_preview(folder / Path(found.all_in_focus).name),
+            map=_preview(folder / Path(found.file).name),
+            confidence=_preview(folder / Path(found.confidence).name),
+        )
+        for folder, result in results.items()
+        if (found := result.depth_map)
+    ]
+
+
+def _preview(path: Path) -> str | None:
+    """Return the preview of a map."""
+    preview = path.with_suffix(".png")
+    return data_uri(preview.read_bytes(), ".png") if preview.is_file() else None

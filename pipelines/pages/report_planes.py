@@ -1,15 +1,26 @@
-"""The planes of a report: read from disk, and in the columns in which the report shows them."""
+"""The planes of a report: read from disk, in the columns of the report, and their errors against the truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.results.records import Method, PlaneRecord, Poses, ReconstructionRecord
+from faintfield.pipelines.formats.results.records import (
+    METRICS_FILE,
+    GeometryErrors,
+    Method,
+    Metrics,
+    PlaneErrors,
+    PlaneRecord,
+    Poses,
+    ReconstructionRecord,
+)
+from faintfield.pipelines.formats.results.result_files import files_below, read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 
 # Order of the columns.
@@ -18,6 +29,9 @@ _POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "nominal", "true", "stated")
 # The poses and the method that a report leads with: the first of these that there are.
 PREFERRED_POSES: tuple[Poses, ...] = ("measured", "stated", "nominal", "true")
 _PREFERRED_METHODS: tuple[Method, ...] = ("occlusion", "joint", "pmlem", "pmlem-osl", "mlem", "backprojection")
+
+# Order of the poses in the comparison of errors.
+_COMPARED_POSES: tuple[Poses, ...] = ("nominal", "measured", "true")
 
 # Names of the methods, in the order of the columns.
 METHOD_NAMES: dict[Method, str] = {
@@ -67,7 +81,7 @@ class Plane:
 
     @property
     def place(self) -> tuple[float, str]:
-        """What planes of several columns have in common when they stand side by side."""
+        """Depth and name, which planes of several columns share when they stand side by side."""
         return (self.depth_mm, self.name)
 
     def pixels(self) -> NDArray[Any]:
@@ -77,7 +91,7 @@ class Plane:
     def sigma_e(self) -> NDArray[Any] | None:
         """Return the standard deviation of each sample, None if it was not asked for."""
         name = self.records[0].sigma_file
-        return read_frame(existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
+        return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 
 def method_title(records: Sequence[PlaneRecord]) -> str:
@@ -102,20 +116,13 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
             # The folders of a method and of a session's reconstructions tell nothing more
             parts = [part for part in where.parts if part not in (method, RECONSTRUCTIONS)]
             column = f"{parts[-1]}/{method}" if parts else method
-            path = existing(folder / Path(name).name)
+            path = _existing(folder / Path(name).name)
             planes.append(Plane(column, method, result.options.poses, records[0].depth_mm, path, records))
-    methods = list(METHOD_NAMES)
-    return sorted(
-        planes,
-        key=lambda plane: (
-            _POSES_IN_ORDER.index(plane.poses),
-            plane.column.rpartition("/")[0],
-            methods.index(plane.method),
-        ),
-    )
+    poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
+    return sorted(planes, key=lambda it: (poses(it.poses), it.column.rpartition("/")[0], methods(it.method)))
 
 
-def existing(path: Path) -> Path:
+def _existing(path: Path) -> Path:
     """Return the path of a file that reconstruction.json names, if it exists (else MissingFile)."""
     if not path.is_file():
         raise MissingFile(f"{path}: is recorded in reconstruction.json but missing; reconstruct again")
@@ -125,15 +132,15 @@ def existing(path: Path) -> Path:
 def column_titles(planes: list[Plane]) -> dict[str, str]:
     """Return the title of each column: the method, with the poses or the set's folder if these differ."""
     columns = {plane.column: plane for plane in planes}
-    by_poses = {column: (plane.method, plane.poses) for column, plane in columns.items()}
-    poses_differ = len(set(by_poses.values())) == len(columns) and len({plane.poses for plane in planes}) > 1
+    kinds = {(plane.method, plane.poses) for plane in columns.values()}
+    poses_differ = len(kinds) == len(columns) and len({plane.poses for plane in planes}) > 1
     titles = {}
     for column, plane in columns.items():
-        where, name = column.rpartition("/")[0], plane.title
+        where = column.rpartition("/")[0]
         if poses_differ and plane.poses != "stated":
-            titles[column] = f"{name}, {plane.poses} poses"
+            titles[column] = f"{plane.title}, {plane.poses} poses"
         else:
-            titles[column] = f"{where} set: {name}" if where else name
+            titles[column] = f"{where} set: {plane.title}" if where else plane.title
     return titles
 
 
@@ -146,3 +153,55 @@ def best_column(planes: list[Plane]) -> str:
 def plane_words(depth_mm: float, name: str) -> str:
     """Return the name of a plane on the page."""
     return f"{name}, {depth_mm:.1f} mm on the axis" if name else f"{round(depth_mm, 1):g} mm"
+
+
+@dataclass(frozen=True)
+class ErrorSections:
+    """What the page shows of errors; the names are those of the template.
+
+    Attributes
+    ----------
+    metrics : list of (str, PlaneErrors)
+        The errors of each plane, after the title of its method.
+    geometry_off : GeometryErrors, optional
+        The errors of the measured poses.
+    pose_kinds : list of Poses
+        The poses of the planes, in the order of the comparison.
+    by_poses : list of ((float, str, str), dict)
+        The errors (bright) by poses of planes with several, after their depth, object and method.
+    """
+
+    metrics: list[tuple[str, PlaneErrors]]
+    geometry_off: GeometryErrors | None
+    pose_kinds: list[Poses]
+    by_poses: list[tuple[tuple[float, str, str], dict[Poses, float]]]
+
+    def of(self, plane: Plane) -> list[PlaneErrors]:
+        """Return the errors of the method and the poses of a plane."""
+        return [errors for _, errors in self.metrics if _is_of(errors, plane)]
+
+
+def error_sections(directory: Path, planes: Sequence[Plane]) -> ErrorSections:
+    """Return the errors against the truth: the folder's own, else those of the folders within it."""
+    own = directory / METRICS_FILE
+    found = [read_result(path, Metrics) for path in ([own] if own.is_file() else files_below(directory, METRICS_FILE))]
+    rows = [(_title_of(errors, planes), errors) for metrics in found for errors in metrics.planes]
+    by_place: dict[tuple[float, str, str], dict[Poses, float]] = {}
+    for title, errors in rows:
+        by_place.setdefault((errors.depth_mm, errors.object, title), {})[errors.poses] = errors.mse_bright
+    return ErrorSections(
+        rows,
+        next((metrics.geometry for metrics in found if metrics.geometry is not UNSET), None),
+        [kind for kind in _COMPARED_POSES if any(errors.poses == kind for _, errors in rows)],
+        sorted((place, errors) for place, errors in by_place.items() if len(errors) > 1),
+    )
+
+
+def _is_of(errors: PlaneErrors, plane: Plane) -> bool:
+    """Return whether errors are of a plane's method and poses; poses that a set states match those of any kind."""
+    return errors.method == plane.method and plane.poses in ("stated", errors.poses)
+
+
+def _title_of(errors: PlaneErrors, planes: Sequence[Plane]) -> str:
+    """Return the title of the method of errors, as the planes have it."""
+    return next((plane.title for plane in planes if _is_of(errors, plane)), METHOD_NAMES[errors.method])

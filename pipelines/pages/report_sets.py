@@ -8,7 +8,6 @@ from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import Overview
 from faintfield.pipelines.formats.results.result_files import read_result
 from faintfield.pipelines.pages.page import data_uri
-from faintfield.pipelines.pages.report_light import PhotonBudget, photon_budget
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (
     BRIGHT_VIEW,
@@ -17,14 +16,35 @@ from faintfield.pipelines.reconstruction.overview import (
     REFERENCE_VIEW,
     REGION_OUTLINED,
 )
+from faintfield.recon.metrics import noise_variance_e2
 
 # Width of a picture that is shown pixel for pixel: two stand side by side.
 _PIXELS_ACROSS = 540
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
+class LightRow:
+    """Light per pixel by one formula: electrons and photons of one view, photons per second, photons of all views."""
+
+    words: str
+    electrons: float
+    photons: float | None = None
+    flux: float | None = None
+    all_views: float | None = None
+
+
+@dataclass(frozen=True)
+class PhotonBudget:
+    """The light on a pixel by each formula, and the variance of eq. (6) with the share of each of its parts."""
+
+    light: list[LightRow]
+    variance_e2: float
+    shares: dict[str, float]
+
+
+@dataclass(frozen=True)
 class SetSection:
-    """What the page shows of one set; pictures are data URIs, None if the file is missing.
+    """What the page shows of one set.
 
     Attributes
     ----------
@@ -32,25 +52,18 @@ class SetSection:
         What overview.json records.
     noise_free : bool
         The set has no read noise.
-    integral, bright, region : str, optional
-        All views, the bright view, and the object region outlined in it.
-    pixels, no_light : str, optional
-        The middle of the reference view and of the noise reference, pixel for pixel.
-    view : str, optional
-        The reference view.
     budget : PhotonBudget, optional
         Its light, if there is any.
+    pictures : dict of str to str
+        Data URIs, None if the file is missing: all views (`integral`), the bright view (`bright`) and the object region
+        outlined in it (`region`), the middle of the reference view (`pixels`) and of the noise reference (`no_light`)
+        pixel for pixel, and the reference view (`view`).
     """
 
     overview: Overview
     noise_free: bool
-    integral: str | None
-    bright: str | None
-    region: str | None
-    pixels: str | None
-    no_light: str | None
-    view: str | None
     budget: PhotonBudget | None
+    pictures: dict[str, str | None]
 
 
 def set_sections(overviews: list[Path]) -> list[SetSection]:
@@ -68,30 +81,25 @@ def set_sections(overviews: list[Path]) -> list[SetSection]:
         overview = read_result(path, Overview)
         pictures = [path.with_name(name) for name in (INTEGRAL_IMAGE, REFERENCE_VIEW)]
         key = tuple(picture.read_bytes() for picture in pictures if picture.is_file()) or (path.read_bytes(),)
-        if key not in distinct or _rank(overview) < _rank(distinct[key][1]):
+        rank = PREFERRED_POSES.index(overview.poses)
+        if key not in distinct or rank < PREFERRED_POSES.index(distinct[key][1].poses):
             distinct[key] = (path.parent, overview)
     sections = [_section(folder, overview) for folder, overview in distinct.values()]
     return sorted(sections, key=lambda section: section.noise_free)
 
 
-def _rank(overview: Overview) -> int:
-    return PREFERRED_POSES.index(overview.poses)
-
-
 def _section(folder: Path, overview: Overview) -> SetSection:
     """Return what the page shows of one set."""
     view = folder / REFERENCE_VIEW
-    return SetSection(
-        overview=overview,
-        noise_free=overview.read_noise_e == 0,
-        integral=_whole(folder / INTEGRAL_IMAGE),
-        bright=_whole(folder / BRIGHT_VIEW),
-        region=_whole(folder / REGION_OUTLINED),
-        pixels=_pixel_for_pixel(view),
-        no_light=_pixel_for_pixel(folder / NOISE_REFERENCE_VIEW),
-        view=_thinned(view),
-        budget=photon_budget(overview),
-    )
+    pictures = {
+        "integral": _whole(folder / INTEGRAL_IMAGE),
+        "bright": _whole(folder / BRIGHT_VIEW),
+        "region": _whole(folder / REGION_OUTLINED),
+        "pixels": _pixel_for_pixel(view),
+        "no_light": _pixel_for_pixel(folder / NOISE_REFERENCE_VIEW),
+        "view": _thinned(view),
+    }
+    return SetSection(overview, overview.read_noise_e == 0, photon_budget(overview), pictures)
 
 
 def _whole(path: Path) -> str | None:
@@ -115,3 +123,40 @@ def _thinned(path: Path) -> str | None:
     picture = read_frame(path).pixels_dn
     step = -(-picture.shape[1] // (2 * _PIXELS_ACROSS))
     return data_uri(encoded(picture[::step, ::step], ".png"), ".png")
+
+
+def photon_budget(overview: Overview) -> PhotonBudget | None:
+    """Return the photon budget of a set, None without light.
+
+    Light is in electrons, and in photons too if the quantum efficiency is known.
+    """
+    light, exposure_s, dark_e = overview.brightness, overview.exposure_s, overview.dark_e
+    signal_e = light.mean_signal_e
+    if signal_e <= 0:
+        return None
+    by_formula = (
+        ("the paper’s linear formula, eq. (7)", light.electrons_linear),
+        ("moments: a uniform object of this SNR, eq. (4) being a ratio of powers", light.electrons_from_moments),
+        ("counted: mean signal above dark", signal_e),
+    )
+    variance = noise_variance_e2(
+        signal_e / exposure_s,
+        exposure_s,
+        quantum_efficiency=1.0,
+        dark_current_e_per_s=dark_e / exposure_s,
+        read_noise_e=overview.read_noise_e,
+    )
+    parts = (("read noise", overview.read_noise_e**2), ("light", signal_e), ("dark current", dark_e))
+    return PhotonBudget(
+        light=[_light_row(words, electrons, overview) for words, electrons in by_formula if electrons is not None],
+        variance_e2=variance,
+        shares={words: part / variance for words, part in parts},
+    )
+
+
+def _light_row(words: str, electrons: float, overview: Overview) -> LightRow:
+    """Return light per pixel in all its units."""
+    if overview.quantum_efficiency is None:
+        return LightRow(words, electrons)
+    photons = electrons / overview.quantum_efficiency
+    return LightRow(words, electrons, photons, photons / overview.exposure_s, photons * overview.views)

@@ -194,21 +194,13 @@ def mean_curves(errors: Sequence[ErrorPoint]) -> list[CurvePoint]:
     groups: dict[tuple[str, str, float], list[ErrorPoint]] = {}
     for error in errors:
         groups.setdefault((error.object, error.method, error.snr), []).append(error)
-    return [_mean_point(group) for group in groups.values()]
-
-
-def _mean_point(draws: list[ErrorPoint]) -> CurvePoint:
-    """Return the mean of the draws at one point."""
-    first, mses = draws[0], [error.mse for error in draws]
-    return CurvePoint(
-        first.object,
-        first.method,
-        first.snr,
-        draws=len(draws),
-        mse=float(np.mean(mses)),
-        standard_error=float(np.std(mses, ddof=1) / np.sqrt(len(draws))) if len(draws) > 1 else None,
-        mse_texture=float(np.mean([error.mse_texture for error in draws])),
-    )
+    points = []
+    for (name, method, snr), draws in groups.items():
+        mses = [error.mse for error in draws]
+        standard_error = float(np.std(mses, ddof=1) / np.sqrt(len(draws))) if len(draws) > 1 else None
+        mse_texture = float(np.mean([error.mse_texture for error in draws]))
+        points.append(CurvePoint(name, method, snr, len(draws), float(np.mean(mses)), standard_error, mse_texture))
+    return points
 
 
 def is_monotone(points: Sequence[CurvePoint], method: str) -> bool:

@@ -61,9 +61,7 @@ def draw_figure3(
             (above[1], reference, "(b) noise reference"),
         ):
             image = axes.imshow(frame, cmap="gray", vmin=scale_dn[0], vmax=scale_dn[1], interpolation="none")
-            axes.set_title(title)
-            axes.set_xlabel("column (px)")
-            axes.set_ylabel("row (px)")
+            axes.set(title=title, xlabel="column (px)", ylabel="row (px)")
         figure.colorbar(image, ax=above.tolist(), shrink=0.85, label="DN")
         _draw_planes(figure, below.tolist(), planes, "cd", "TV-PMLEM")
         return _png(figure)
@@ -77,9 +75,7 @@ def _draw_planes(figure: Figure, axes: Sequence[Axes], planes: Sequence[ShownPla
         left, top = (start - plane.pitch_mm / 2 for start in plane.origin_mm)
         extent = (left, left + columns * plane.pitch_mm, top + rows * plane.pitch_mm, top)
         image = one.imshow(plane.pixels, cmap="gray", vmin=0, vmax=white, extent=extent, interpolation="none")
-        one.set_title(f"({letter}) {what} at {plane.depth_mm:g} mm")
-        one.set_xlabel("x (mm)")
-        one.set_ylabel("y, downwards (mm)")
+        one.set(title=f"({letter}) {what} at {plane.depth_mm:g} mm", xlabel="x (mm)", ylabel="y, downwards (mm)")
     figure.colorbar(image, ax=list(axes), shrink=0.85, label="expected e⁻ per pixel")
 
 
@@ -103,8 +99,7 @@ def draw_figure4(points: Sequence[CurvePoint]) -> bytes:
             for index, method in enumerate(METHODS):
                 _curve(axes, _of(points, name, method.name), index, method.title)
             axes.axhspan(*PAPERS_AXIS, color="0.93", zorder=0)
-            axes.set_yscale("log")
-            axes.set_title(f"({letter}) {name}: all methods")
+            axes.set(yscale="log", title=f"({letter}) {name}: all methods")
             _name_axes(axes)
             axes.label_outer()
         handles, labels = np.atleast_1d(panels)[0].get_legend_handles_labels()
@@ -133,8 +128,7 @@ def _curve(axes: Axes, points: Sequence[CurvePoint], index: int, label: str) -> 
 
 def _name_axes(axes: Axes) -> None:
     """Label the axes of a panel of curves."""
-    axes.set_xlabel("SNR, eq. (4)")
-    axes.set_ylabel("mean square error, object 0…1")
+    axes.set(xlabel="SNR, eq. (4)", ylabel="mean square error, object 0…1")
     axes.set_xticks(SNRS[::2] if axes.get_position().width < 0.3 else SNRS)
     axes.grid(alpha=0.3, linewidth=0.5)
 

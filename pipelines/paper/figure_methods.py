@@ -27,8 +27,8 @@ class FigureMethod:
         Takes the operator, the images and, if the method has one, a weight; returns the plane (row, column) in
         electrons.
     weights : tuple of float
-        Weights to try if the method is given the best one, which is found from the true object: no experiment can do
-        that. Empty if the method finds its own weight.
+        Weights to try if the method is given the best one, which only the true object tells and no experiment can
+        find. Empty if the method finds its own weight.
     draws : int, optional
         Number of draws of the noise, fewer for methods that are slow and far from the best.
     """

@@ -12,18 +12,20 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM
 from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
+from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.paper.figure4 import is_monotone, mean_curves, measure_errors, over_best
+from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, is_monotone, mean_curves, measure_errors, over_best
 from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
 from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, tv_denoiser
 from faintfield.pipelines.paper.figure_records import (
     DarkPlaneRow,
     DetailRow,
+    ErrorPoint,
     Figure2,
     Figure3,
     Figure4,
@@ -31,15 +33,19 @@ from faintfield.pipelines.paper.figure_records import (
     Row,
     as_csv,
 )
-from faintfield.pipelines.paper.figures_page import CURVES_FILE, PAGE_FILE, provenance_file, write_page
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE
-from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, SyntheticOptions, write_synthetic_set
 from faintfield.recon.smoothing import blurred
 
 type FigureNumber = Literal[2, 3, 4]
+
+PAGE_FILE = "figures.html"
+_CURVES_FILE = "figure4_curves.json"
+
+# By the number of a figure, the type of its JSON file.
+_KINDS = {2: Figure2, 3: Figure3, 4: list[ErrorPoint]}
 
 _SCENE, _BRIGHT, _DARK = "dark-scene", "bright", "dark"
 
@@ -55,6 +61,20 @@ class FigureOptions(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     seeds: int
     size_px: tuple[int, int]
+
+
+class _FigureProvenance(Provenance[dict[str, object]], frozen=True, kw_only=True):
+    """The provenance of a figure, which is written last: it says that the figure is whole."""
+
+    wall_time_s: float
+
+
+class _FoundFigure(msgspec.Struct):
+    """A figure that lies in the folder."""
+
+    src: str
+    numbers: object
+    provenance: _FigureProvenance
 
 
 def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figure3 | Figure4]:
@@ -79,12 +99,13 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
     made = {}
     for number in options.only:
         started = time.monotonic()
-        remove(out / provenance_file(number))
+        remove(_provenance_path(out, number))
         made[f"figure{number}"] = makers[number](out, options)
-        origin = msgspec.structs.asdict(provenance("figures", options, {}))
-        write_json(out / provenance_file(number), origin | {"wall_time_s": time.monotonic() - started})
-        inform(f"figure {number}: {time.monotonic() - started:.1f} s")
-    write_page(out)
+        origin = msgspec.structs.asdict(provenance("figures", msgspec.structs.asdict(options), {}))
+        made_in_s = time.monotonic() - started
+        write_json(_provenance_path(out, number), _FigureProvenance(**origin, wall_time_s=made_in_s))
+        inform(f"figure {number}: {made_in_s:.1f} s")
+    _write_page(out)
     return made
 
 
@@ -151,8 +172,7 @@ def _figure4(out: Path, options: FigureOptions) -> Figure4:
     points = mean_curves(errors)
     monotone = {method.name: is_monotone(points, method.name) for method in METHODS}
     numbers = Figure4(monotone, over_best(points, OURS, BEST), points)
-    curves = Figure4Curves(numbers.monotone, numbers.over_best, numbers.curves, options.size_px)
-    write_json(out / CURVES_FILE, curves)
+    write_json(out / _CURVES_FILE, Figure4Curves(**msgspec.structs.asdict(numbers), size_px=options.size_px))
     _write(out, 4, draw_figure4(points), errors, errors)
     return numbers
 
@@ -178,3 +198,33 @@ def _write(out: Path, number: int, picture: bytes, rows: Sequence[Row], numbers:
     write_whole(out / f"figure{number}.csv", as_csv(rows))
     write_whole(out / f"figure{number}.png", picture)
     write_json(out / f"figure{number}.json", numbers)
+
+
+def _provenance_path(folder: Path, number: int) -> Path:
+    """Return the path of a figure's provenance."""
+    return folder / f"figure{number}_provenance.json"
+
+
+def _write_page(folder: Path) -> None:
+    """Write figures.html of the figures that are in a folder."""
+    found = {number: _read(folder, number) for number in _KINDS if _provenance_path(folder, number).is_file()}
+    curves = None
+    if 4 in found:
+        curves = msgspec.json.decode((folder / _CURVES_FILE).read_bytes(), type=Figure4Curves)
+    page = template(PAGE_FILE).render(
+        found=found,
+        curves=curves,
+        methods=[method for method in METHODS if curves is None or method.name in curves.monotone],
+        ours=OURS,
+        papers_axis=PAPERS_AXIS,
+    )
+    write_whole(folder / PAGE_FILE, page)
+
+
+def _read(folder: Path, number: int) -> _FoundFigure:
+    """Return a figure's picture, numbers and origin."""
+    return _FoundFigure(
+        src=data_uri((folder / f"figure{number}.png").read_bytes(), ".png"),
+        numbers=msgspec.json.decode((folder / f"figure{number}.json").read_bytes(), type=_KINDS[number]),
+        provenance=msgspec.json.decode(_provenance_path(folder, number).read_bytes(), type=_FigureProvenance),
+    )

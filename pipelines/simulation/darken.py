@@ -18,7 +18,7 @@ from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, Ele
 from faintfield.pipelines.reconstruction.brightness import brightness
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
-from faintfield.pipelines.simulation.exposures import stated_noise, write_exposures
+from faintfield.pipelines.simulation.synthetic_set import stated_noise, write_exposures
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
 from faintfield.rig.simulation.optics import SimulatedSensor
 
@@ -136,19 +136,18 @@ def _light(bright: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> ND
     return light
 
 
-def _view_names(bright: ElementalSet) -> list[str]:
-    """Return the file names of the dark views: those of the bright views where that keeps them apart."""
-    stems = [Path(view.image).stem for view in bright.settings.view]
-    if len({*stems, *_TAKEN_STEMS}) < len(stems) + len(_TAKEN_STEMS):
-        stems = [f"view_{index:03d}" for index in range(len(stems))]
-    return [f"{stem}.tiff" for stem in stems]
-
-
 def _write_dark_views(
     bright: ElementalSet, layouts: list[ChannelLayout], folder: Path, options: DarkeningOptions, scale_e: float
 ) -> None:
-    """Expose every view anew and write the set; a mosaic stays a mosaic."""
-    names, sensor, generator = _view_names(bright), options.sensor, np.random.default_rng(options.seed)
+    """Expose every view anew and write the set; a mosaic stays a mosaic.
+
+    A dark view has the name of its bright view, unless two files would then have the same name.
+    """
+    sensor, generator = options.sensor, np.random.default_rng(options.seed)
+    stems = [Path(view.image).stem for view in bright.settings.view]
+    if len({*stems, *_TAKEN_STEMS}) < len(stems) + len(_TAKEN_STEMS):
+        stems = [f"view_{index:03d}" for index in range(len(stems))]
+    names = [f"{stem}.tiff" for stem in stems]
     with closing(progress(bright.image_paths, "exposing views")) as paths:
         signal_e = (_light(bright, path, layouts) * scale_e for path in paths)
         write_exposures(folder, names, signal_e, sensor, options.exposure_s, generator)

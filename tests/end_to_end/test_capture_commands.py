@@ -10,7 +10,7 @@ import pytest
 
 from faintfield.pipelines import cli
 from faintfield.pipelines.formats.rig_file import read_rig
-from faintfield.pipelines.live.preflight import duration_words
+from faintfield.pipelines.live.guided import duration_words
 from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames

@@ -9,7 +9,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
-from faintfield.pipelines.paper.demo_truth import true_set, write_truth
+from faintfield.pipelines.paper.demo import true_set, write_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
 from faintfield.pipelines.reconstruction.run import reconstruct_set

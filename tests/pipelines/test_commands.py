@@ -8,30 +8,31 @@ from subprocess import CompletedProcess
 import pytest
 
 from faintfield.pipelines import cli
-from faintfield.pipelines.registry import COMMANDS, EXPORTS, IMPORTS, Command
+from faintfield.pipelines.registry import COMMANDS, EXPORTS, IMPORTS
 
-EXAMPLES = [
-    *(example for commands in COMMANDS.values() for example in commands),
-    *(each._replace(example=f"import {each.example}") for each in IMPORTS),
-    *(each._replace(example=f"export {each.example}") for each in EXPORTS),
-]
+EXAMPLES = [*(example for examples in COMMANDS.values() for example in examples), *IMPORTS, *EXPORTS]
 
 
-@pytest.mark.parametrize("command", EXAMPLES, ids=lambda command: command.example)
-def test_every_example_is_a_call_of_its_command(command: Command) -> None:
-    words = shlex.split(command.example)
-    function, bound, _ = cli.app.parse_args(words, print_error=False, exit_on_error=False)
-    module, _, name = command.target.partition(":")
-    assert (function.__module__, function.__name__) == (module, name)
-    assert command.name in words[:2]
+def _path(example: str) -> list[str]:
+    """The words that name a command."""
+    words = shlex.split(example)
+    return words[: 2 if words[0] in ("import", "export") else 1]
+
+
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_every_example_is_a_call_of_its_command(example: str) -> None:
+    function, bound, _ = cli.app.parse_args(shlex.split(example), print_error=False, exit_on_error=False)
+    path = _path(example)
+    module = path[0] if len(path) == 1 else f"{path[0]}s.{path[1]}"
+    assert function.__module__ == f"faintfield.pipelines.commands.{module}"
+    assert function.__name__ == "_".join(path)
     assert bound.arguments
 
 
-@pytest.mark.parametrize("command", EXAMPLES, ids=lambda command: command.example)
-def test_every_help_ends_with_its_example(command: Command, faintfield: Callable[..., CompletedProcess[str]]) -> None:
-    words = shlex.split(command.example)
-    said = faintfield(*words[: words.index(command.name) + 1], "--help").stdout
-    assert " ".join(said.split()).endswith(f" Example: faintfield {command.example}")  # wrapped at the console's width
+@pytest.mark.parametrize("example", EXAMPLES)
+def test_every_help_ends_with_its_example(example: str, faintfield: Callable[..., CompletedProcess[str]]) -> None:
+    said = faintfield(*_path(example), "--help").stdout
+    assert " ".join(said.split()).endswith(f" Example: faintfield {example}")  # wrapped at the console's width
 
 
 def test_groups_stand_in_the_order_of_an_experiment(faintfield: Callable[..., CompletedProcess[str]]) -> None:

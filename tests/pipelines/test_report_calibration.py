@@ -19,10 +19,10 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_png
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
 from faintfield.pipelines.formats.results.records import Brightness, Overview
+from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_beside
-from faintfield.pipelines.pages.report_light import photon_budget
-from faintfield.pipelines.pages.stage_page import holdout_rows
+from faintfield.pipelines.pages.report_sets import photon_budget
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -249,7 +249,7 @@ def test_the_photon_budget_is_that_of_the_papers_equations() -> None:
     assert counted.photons == pytest.approx(0.96 / 0.5)
     # Eq. (6)
     assert budget.variance_e2 == pytest.approx(0.96 + 0.02 + 12)
-    assert {part.words: part.share for part in budget.shares} == pytest.approx(
+    assert budget.shares == pytest.approx(
         {"read noise": 12 / 12.98, "light": 0.96 / 12.98, "dark current": 0.02 / 12.98}
     )
 
@@ -328,7 +328,7 @@ def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> Non
     path.write_text(json.dumps(content))
     done("report", folder)
     text = (folder / "report.html").read_text()
-    table = text[text.index("What it is worth to know the poses") : text.index("All planes")]
+    table = text[text.index("What knowing the poses is worth") : text.index("All planes")]
     assert [table.index(f"{kind} poses") for kind in ("nominal", "measured", "true")] == sorted(
         table.index(f"{kind} poses") for kind in errors
     )

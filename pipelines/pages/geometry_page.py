@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.geometry import GeometrySettings
 from faintfield.pipelines.formats.results.geometry import GeometryRecord, LensRecord, StageFigure, StageRecord
-from faintfield.pipelines.pages.page import INK, figure, inked, svg, template
+from faintfield.pipelines.pages.page import INK, figure, ink, svg, template
 
 _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("pitch_x_mm", "pitch along rows", "mm", 1.0),
@@ -23,6 +23,10 @@ _FIGURES: tuple[tuple[str, str, str, float], ...] = (
     ("node_residual_rms_mm", "nodes off the regular grid, rms", "µm", 1e3),
 )
 
+# In OpenCV's order.
+_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+
+
 # The largest deviation is drawn at most this long, as a share of the pitch, so that it stays within its cell.
 _MAX_DRAWN_SHARE = 0.35
 
@@ -31,9 +35,6 @@ _COARSE_RAD = 1e-4
 
 # With more nodes than this, numbers would not fit into their cells.
 _MAX_WRITTEN = 121
-
-# In OpenCV's order.
-_DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,12 @@ class Row:
     why: str = ""
 
 
-def stage_page(geometry: GeometryRecord) -> str:
+def geometry_page(geometry: GeometryRecord) -> str:
     """Return geometry.html: the stage, the nodes and the lens of a measured geometry."""
     return template("geometry.html").render(
         rows=stage_rows(geometry.stage),
         holdout=holdout_rows(geometry),
-        lens=lens_rows(geometry.lens),
+        lens=_lens_rows(geometry.lens),
         drawing=node_drawing(geometry),
         maps=sigma_maps(geometry),
         geometry=geometry,
@@ -82,7 +83,7 @@ def holdout_rows(geometry: GeometryRecord) -> list[Row]:
     ]
 
 
-def lens_rows(lens: LensRecord) -> list[Row]:
+def _lens_rows(lens: LensRecord) -> list[Row]:
     """Return the table of the lens."""
     in_px = ("focal length fx", "focal length fy", "principal point cx", "principal point cy")
     words = [*((name, "px") for name in in_px), *((f"distortion {name}", "") for name in _DISTORTION)]
@@ -118,8 +119,8 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     real = nominal + factor * residuals[:, :2]
     across_mm = np.ptp(nominal, axis=0) + 2 * pitch
     height = float(np.clip(4.9 * across_mm[1] / across_mm[0], 2.2, 7)) + 0.9
-    drawing = Figure(figsize=(5.4, height), layout="constrained")
-    axes = drawing.subplots()
+    figure = Figure(figsize=(5.4, height), layout="constrained")
+    axes = figure.subplots()
     axes.plot(
         *nominal.T, "+", color=INK, markersize=10, markeredgewidth=1, alpha=0.6, label="regular grid that fits best"
     )
@@ -129,14 +130,14 @@ def node_drawing(geometry: GeometryRecord) -> str | None:
     dots.set_label(f"camera, deviation × {factor:g}")
     for start, end in zip(nominal, real, strict=True):
         axes.plot(*np.array([start, end]).T, color=INK, linewidth=0.8, alpha=0.7, zorder=2)
-    _colour_bar(dots, axes, "along the normal (µm)")
+    _colour_bar(figure, dots, axes, "along the normal (µm)")
     axes.set_aspect("equal")
     axes.margins(0.1)
     axes.invert_yaxis()
     axes.set(xlabel="x (mm)", ylabel="y, downwards (mm)")
-    inked(axes)
+    ink(axes)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, labelcolor=INK)
-    return svg(drawing)
+    return svg(figure)
 
 
 def sigma_maps(geometry: GeometryRecord) -> list[str]:
@@ -156,44 +157,29 @@ def _sigma_map(nodes: Sequence[tuple[int, int]], sigmas: Sequence[float], words:
     """Return the map of one number of each node."""
     from matplotlib.figure import Figure
 
-    drawing = Figure(figsize=(4.8, 4.0), layout="constrained")
-    axes = drawing.subplots()
-    first, values = _map_of_nodes(nodes, sigmas)
-    rows, columns = values.shape
-    extent = (first[1] - 0.5, first[1] + columns - 0.5, first[0] + rows - 0.5, first[0] - 0.5)
+    figure = Figure(figsize=(4.8, 4.0), layout="constrained")
+    axes = figure.subplots()
+    places = np.array(nodes)
+    (top, left), (rows, columns) = places.min(axis=0), np.ptp(places, axis=0) + 1
+    values = np.full((rows, columns), np.nan)  # where there is no node
+    values[tuple((places - (top, left)).T)] = sigmas
+    extent = (left - 0.5, left + columns - 0.5, top + rows - 0.5, top - 0.5)
     image = axes.imshow(values, cmap="cividis", vmin=0, extent=extent)
-    _colour_bar(image, axes, words)
+    _colour_bar(figure, image, axes, words)
     if values.size <= _MAX_WRITTEN:
-        _write_values(axes, first, values)
+        for (row, column), sigma in zip(nodes, sigmas, strict=True):
+            colour = "black" if sigma > 0.6 * max(sigmas) else "white"
+            text = f"{sigma:.0f}" if max(sigmas) >= 10 else f"{sigma:.2g}"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7, color=colour)
     axes.set(xlabel="column of the grid", ylabel="row of the grid")
     axes.locator_params(integer=True)
-    inked(axes)
-    return svg(drawing)
+    ink(axes)
+    return svg(figure)
 
 
-def _map_of_nodes(
-    nodes: Sequence[tuple[int, int]], numbers: Sequence[float]
-) -> tuple[tuple[int, int], NDArray[np.float64]]:
-    """Return the first row and column, and each node's number at its place, NaN where there is no node."""
-    places = np.array(nodes)
-    first = places.min(axis=0)
-    values = np.full(np.ptp(places, axis=0) + 1, np.nan)
-    values[tuple((places - first).T)] = numbers
-    return (int(first[0]), int(first[1])), values
-
-
-def _write_values(axes: Any, first: tuple[int, int], values: NDArray[np.float64]) -> None:
-    """Write each number into its cell, dark on light and light on dark."""
-    for (row, column), value in np.ndenumerate(values):
-        if np.isfinite(value):
-            colour = "black" if value > 0.6 * np.nanmax(values) else "white"
-            words = f"{value:.0f}" if np.nanmax(values) >= 10 else f"{value:.2g}"
-            axes.text(column + first[1], row + first[0], words, ha="center", va="center", fontsize=7, color=colour)
-
-
-def _colour_bar(image: Any, axes: Any, words: str) -> None:
+def _colour_bar(figure: Any, image: Any, axes: Any, words: str) -> None:
     """Draw a colour bar in the page's ink."""
-    bar = axes.figure.colorbar(image, ax=axes, shrink=0.8)
+    bar = figure.colorbar(image, ax=axes, shrink=0.8)
     bar.set_label(words, color=INK)
     bar.ax.tick_params(colors=INK)
     bar.outline.set_edgecolor(INK)

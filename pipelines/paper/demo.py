@@ -1,7 +1,7 @@
-"""The truth about a session of the simulated lab, and how far its results are from it."""
+"""The demo: its simulated rig, the truth about its session, and how far the results are from that."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -11,27 +11,104 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, Measured, read_noise
+from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session, nominal_session
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.request import folder_of_method
-from faintfield.pipelines.simulation.scene_truth import NOISE_FREE, render_scene, write_ground_truth
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, render_scene, write_ground_truth
+from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.plan import Grid
 from faintfield.rig.session.session import read_plan, taken_frames
+from faintfield.rig.settings import (
+    BoardSettings,
+    CheckSettings,
+    DriftSettings,
+    RigSettings,
+    SceneSettings,
+    SettleSettings,
+    StepSettings,
+)
 from faintfield.rig.simulation.experiment import SimulatedExperiment
-from faintfield.rig.simulation.lab import TRUE_POSE, lab_experiment
+from faintfield.rig.simulation.lab import TRUE_POSE, flat_photons_per_s, lab_experiment
+from faintfield.rig.simulation.scene import render
+from faintfield.rig.stages.protocol import Point, StageSettings
 
 type Node = tuple[int, int]
+
+_EXPOSURE_S = 0.1
+
+# Sweeps over the nodes with a board at another place each.
+_BOARD_SWEEPS = 6
+
+
+@dataclass(frozen=True)
+class DemoSize:
+    """How much is captured: nodes along each side of the grid, their pitch, pixels, and dark and flat frames."""
+
+    nodes: int
+    pitch_mm: float
+    size_px: tuple[int, int]
+    frames: int
+
+
+# The paper's grid and a detector of the usual size; and the same baseline with fewer nodes, pixels and frames.
+FULL = DemoSize(7, 50.0, (640, 480), 10)
+QUICK = DemoSize(5, 75.0, (320, 240), 6)
+
+
+def demo_rig(size: DemoSize, snr: float, seed: int) -> RigSettings:
+    """Return the configuration of the demo's rig.
+
+    Parameters
+    ----------
+    size : DemoSize
+        How much is captured.
+    snr : float
+        SNR of the dark views, eq. (4); it sets the light.
+    seed : int
+        Seed of the random generator.
+    """
+    camera = SimulatedSettings(size.size_px, position_error_mm=0.3, rotation_error_mrad=3.5, seed=seed)
+    steps = [
+        *[StepSettings("charuco", 0.1)] * _BOARD_SWEEPS,
+        StepSettings("bright", 0.02),
+        StepSettings("dark_scene", _EXPOSURE_S),
+        StepSettings("noise_reference", _EXPOSURE_S, at="centre"),
+        StepSettings("dark", (0.1, 1.0, 10.0, 60.0), size.frames),
+        StepSettings("flat", (0.05, 0.1), size.frames, photons_per_s=flat_photons_per_s(camera)),
+    ]
+    return RigSettings(
+        stage=StageSettings("simulated", port="simulated:grbl:pty"),
+        camera=msgspec.structs.replace(camera, unlit_photons_per_s=_photons_per_s(camera, snr)),
+        grid=Grid(size.nodes, size.nodes, size.pitch_mm, Point(-350.0, -350.0)),
+        step=tuple(steps),
+        settle=SettleSettings(measure=False, wait_s=2.5),
+        checks=CheckSettings(saturation_dn=float(camera.saturation_dn)),
+        drift=DriftSettings(),
+        scene=SceneSettings((500.0, 700.0)),
+        board=(BoardSettings("large", 9, 7, 40.0, 30.0, "DICT_4X4_50"),),
+    )
+
+
+def _photons_per_s(camera: SimulatedSettings, snr: float) -> float:
+    """Return the light of a white object, in photons per second and pixel, that gives the reference view an SNR."""
+    experiment = lab_experiment(camera)
+    sensor = experiment.sensor
+    view = next(render(experiment.planes, experiment.optics, np.zeros((1, 6)), samples_per_px=1))
+    on_object = view.light[np.sum(list(view.visible.values()), axis=0) > 0.5]
+    dark_e = sensor.dark_current_e_per_s * _EXPOSURE_S
+    white_e = signal_scale_for_snr(on_object, snr, dark_e, sensor.read_noise_e)
+    return white_e / (sensor.quantum_efficiency * _EXPOSURE_S)
 
 
 def write_truth(out: Path, session: Path, snr: float) -> Path:
     """Write the noise-free views, the textures and the true poses of a session of the simulated lab; return `out`."""
-    frozen = read_plan(session)
-    camera, grid = _simulated(frozen.rig.camera), frozen.rig.grid
+    camera, grid = _camera(session), read_plan(session).rig.grid
     poses = true_poses(session)
     exposures = {frame.exposure_s for frame, _, _ in taken_frames(session) if frame.kind == "dark_scene"}
     lab = lab_experiment(camera)
@@ -63,7 +140,7 @@ def true_set(session: Path, truth: Path) -> ElementalSet:
     poses = {view.node: view.rt_cam_ref for view in free.settings.view}
     views = [msgspec.structs.replace(view, rt_cam_ref=poses[view.node]) for view in loaded.settings.view]
     camera = msgspec.structs.replace(free.settings.camera, flat=None, mosaic=loaded.settings.camera.mosaic)
-    sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
+    sensor = lab_experiment(_camera(session)).sensor
     names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "quantum_efficiency")
     noise = NoiseModel(**{name: getattr(sensor, name) for name in names}, saturation_dn=float(sensor.saturation_dn))
     return replace(
@@ -126,11 +203,11 @@ def _geometry_errors(session: Path) -> GeometryErrors:
 
 def _noise_errors(session: Path) -> dict[str, KnownValue]:
     """Return what was measured of the sensor, with the truth."""
-    sensor = lab_experiment(_simulated(read_plan(session).rig.camera)).sensor
+    sensor = lab_experiment(_camera(session)).sensor
     noise = read_noise(session / NOISE_FILE)
     names = ("read_noise_e", "dark_current_e_per_s", "gain_dn_per_e", "offset_dn")
-    measured: dict[str, Measured] = {name: getattr(noise, name) for name in names}
-    return {name: KnownValue(found.value, found.se, getattr(sensor, name)) for name, found in measured.items()}
+    found = {name: getattr(noise, name) for name in names}
+    return {name: KnownValue(it.value, it.se, getattr(sensor, name)) for name, it in found.items()}
 
 
 def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -138,7 +215,8 @@ def _centre_mm(rt_cam_ref: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(-cv2.Rodrigues(rt_cam_ref[:3])[0].T @ rt_cam_ref[3:], np.float64)
 
 
-def _simulated(camera: object) -> SimulatedSettings:
-    """Return the settings of a camera that is known to be simulated."""
+def _camera(session: Path) -> SimulatedSettings:
+    """Return the settings of a session's camera, which is known to be simulated."""
+    camera = read_plan(session).rig.camera
     assert isinstance(camera, SimulatedSettings)
     return camera
