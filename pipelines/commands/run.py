@@ -17,9 +17,14 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_depths
 from faintfield.pipelines.reconstruction.planes import Settings
-from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method
+from faintfield.pipelines.reconstruction.request import (
+    DEFAULT_METHOD,
+    Request,
+    distinct_depths,
+    folder_of_method,
+    swept_depths,
+)
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 from faintfield.rig.session.session import PLAN

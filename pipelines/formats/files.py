@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import hashlib
 import os
 import secrets
 import shutil
@@ -16,6 +15,7 @@ from typing import Any, BinaryIO
 import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
+from faintfield.rig.session import durable
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -48,7 +48,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             unfinished.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        durable.sync_folder(path.parent)
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -92,8 +92,7 @@ def writing_folder(
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
     with translated_write_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        # Named before it is created, so that an interrupt at any moment can remove it
-        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
+        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")  # named first, as in `writing`
         try:
             building.mkdir(mode=0o700)
             yield building
@@ -102,7 +101,7 @@ def writing_folder(
         except BaseException:
             shutil.rmtree(building, ignore_errors=True)
             raise
-        _sync_folder(out.parent)
+        durable.sync_folder(out.parent)
 
 
 def _put_in_place(building: Path, out: Path) -> None:
@@ -195,8 +194,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return durable.sha256(path)
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
@@ -226,12 +224,3 @@ def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
     return mask
-
-
-def _sync_folder(folder: Path) -> None:
-    """Flush a folder's entries, so that a rename survives a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

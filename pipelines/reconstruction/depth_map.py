@@ -21,8 +21,7 @@ from faintfield.pipelines.formats.results.plane_files import Origin, read_curren
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.grids import plane_grid
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.best_focus import SURE
 

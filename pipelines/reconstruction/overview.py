@@ -1,4 +1,4 @@
-"""A set at a glance, beside its reconstruction: all views small, one view large, and how dark it is."""
+"""A set at a glance: how dark it is, where its objects are, and its views as pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -12,8 +12,121 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, grey_levels, white_level, write_png
 from faintfield.pipelines.formats.results.records import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.brightness import brightness_within
-from faintfield.pipelines.reconstruction.object_region import Region, bright_electrons, object_region
+from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
+
+# Mask of the objects in the reference view, beside a set's images if it is known.
+OBJECT_REGION = "object_region.png"
+
+type Region = NDArray[np.bool_]
+
+
+def object_region(loaded: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
+    """Return the object region (row, column) of the reference view, None if it is not known, and its name.
+
+    Parameters
+    ----------
+    loaded : ElementalSet
+        The set.
+    path : Path, optional
+        Mask to use instead of the set's own.
+    """
+    path = path or loaded.folder / OBJECT_REGION
+    if path.is_file():
+        return read_frame(path).pixels_dn > 127, "object region"
+    light_e = bright_electrons(loaded)
+    region = None if light_e is None else segmented(light_e, ~loaded.unusable)
+    return (None, "whole view") if region is None else (region, "object region of the bright view")
+
+
+def bright_electrons(loaded: ElementalSet) -> NDArray[np.float32] | None:
+    """Return the electrons of the reference view in plenty of light (row, column), above dark; None if there is none.
+
+    A colour camera gives the mean of the colours around each pixel, enough to tell where objects are.
+    """
+    if loaded.bright_view is None:
+        return None
+    path, exposure_s = loaded.bright_view
+    frame = read_frame(path)
+    pixels = frame.pixels_dn if frame.pixels_dn.ndim == 2 else frame.pixels_dn.mean(axis=2)
+    light_e = loaded.noise.electrons(pixels) - np.asarray(loaded.noise.background_e(exposure_s), np.float32)
+    mosaic = loaded.settings.camera.mosaic or frame.mosaic
+    return np.asarray(light_e if mosaic is None else cv2.blur(light_e, (len(mosaic[0]), len(mosaic))), np.float32)
+
+
+def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
+    """Return the object region (row, column): above Li's threshold; None if the brightness is uniform.
+
+    Li's threshold minimises the cross entropy between an image and its two levels, which weights a difference relative
+    to the brightness, as suits photon counts. Otsu's weights its square, and misses the darker parts of objects.
+    """
+    from skimage.filters import threshold_li  # loading it takes a while
+
+    level = light_e[usable]
+    if not level.size or not np.ptp(level):
+        return None
+    region: Region = (light_e > threshold_li(level)) & usable
+    return region if region.any() else None
+
+
+def brightness(loaded: ElementalSet, region_path: Path | None = None) -> Brightness:
+    """Measure the reference view of a set, all colours together; over the set's own object region by default."""
+    region, name = object_region(loaded, region_path)
+    return brightness_within(loaded, region, name)
+
+
+def brightness_within(loaded: ElementalSet, region: Region | None, name: str) -> Brightness:
+    """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
+    has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
+    signal, reference = [], []
+    for layout in channel_layouts(loaded):
+        images = view_electrons(loaded, layout, loaded.frame_paths(loaded.reference_view))
+        no_light = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
+        for index, lattice in enumerate(layout.lattices):
+            where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
+            signal.append(images[index][0][where])
+            if has_reference:
+                reference.append(no_light[index][0].ravel())
+            else:
+                noise = lattice_noise(loaded, lattice, None)
+                dark_e = loaded.background_e(noise)
+                power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
+                reference.append(np.sqrt(power).ravel())
+    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), name, has_reference)
+
+
+def _figures(
+    loaded: ElementalSet,
+    signal_e: NDArray[np.floating],
+    reference_e: NDArray[np.floating],
+    region: str,
+    has_reference: bool,
+) -> Brightness:
+    """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
+    noise = loaded.noise
+    read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
+    snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
+    dark_e = float(np.mean(loaded.background_e(noise)))
+    linear_e = moments_e = None
+    if snr and snr > 0:
+        # With a quantum efficiency of 1 the formulas for photons give electrons
+        counting = {"quantum_efficiency": 1.0, "read_noise_e": read_noise_e}
+        linear_e, moments_e = (
+            photons_from_linear_snr(snr, **counting),
+            photons_from_moments(snr, dark_e=dark_e, **counting),
+        )
+    efficiency = noise.quantum_efficiency
+    return Brightness(
+        region=region,
+        noise_from="noise reference" if has_reference else "noise model",
+        snr=snr,
+        electrons_linear=linear_e,
+        electrons_from_moments=moments_e,
+        mean_signal_e=float(np.mean(signal_e, dtype=np.float64)) - dark_e,
+        photons_linear=linear_e / efficiency if efficiency and linear_e else None,
+        photons_from_moments=moments_e / efficiency if efficiency and moments_e else None,
+    )
+
 
 INTEGRAL_IMAGE = "integral_image.png"
 REFERENCE_VIEW = "reference_view.png"

@@ -32,10 +32,9 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
 from faintfield.pipelines.reconstruction.depth_map import write_depth_map
-from faintfield.pipelines.reconstruction.depths import distinct_depths
-from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid, tilted_grid
+from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import write_overview
-from faintfield.pipelines.reconstruction.request import Request, folder_of_method
+from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
 from faintfield.pipelines.reconstruction.sweep import Runner, Sweep, run_serially
 from faintfield.recon.operator.grid import PlaneGrid
 
@@ -79,12 +78,11 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     focus, records = sweep.focus(), sweep.records
     for name, folder in folders.items():
         result = ReconstructionRecord(
-            1,
-            [record for record in records if record.method == name],
-            focus,
-            request.found,
-            depth_map,
-            time.monotonic() - started,
+            planes=[record for record in records if record.method == name],
+            focus=focus,
+            best_focus=request.found,
+            depth_map=depth_map,
+            wall_time_s=time.monotonic() - started,
             **msgspec.structs.asdict(sweep.origins[name]),
         )
         write_json(folder / RECONSTRUCTION_FILE, result)

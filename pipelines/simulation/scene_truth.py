@@ -12,7 +12,7 @@ from faintfield.pipelines.formats.image_files import mask_picture, write_frame, 
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
-from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
+from faintfield.pipelines.reconstruction.overview import OBJECT_REGION
 from faintfield.recon.metrics import (
     expected_snr_from_powers,
     photons_from_linear_snr,

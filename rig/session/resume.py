@@ -9,7 +9,8 @@ import msgspec
 
 from faintfield.rig.errors import PlanRefused, SessionCorrupt
 from faintfield.rig.session.access import has_session, read_plan
-from faintfield.rig.session.disk import PART, lock_session, set_aside, sha256, sync_folder, translate_errors, write_new
+from faintfield.rig.session.disk import PART, lock_session, set_aside, translate_errors, write_new
+from faintfield.rig.session.durable import sha256, sync_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
 from faintfield.rig.session.session import ASIDE, FRAMES, JOURNAL, PLAN, FrozenPlan, Session, is_sealed
 from faintfield.rig.settings import RigSettings

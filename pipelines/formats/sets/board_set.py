@@ -14,8 +14,7 @@ from faintfield.calib.board import Board
 from faintfield.calib.geometry import Node
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_whole
-from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
+from faintfield.pipelines.formats.frames import at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.rig.grid import centre_node
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
