@@ -12,8 +12,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
 from faintfield.pipelines.formats.results.records import Method
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.cluster import make_runner

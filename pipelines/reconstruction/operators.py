@@ -78,7 +78,7 @@ def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> Pl
             f"plane '{plane.name}': lies behind the camera, at {plane.depth_mm:g} mm along its axis; z points forward: "
             "correct its pose"
         )
-    low, high = _seen_part(loaded, plane) if plane.size_mm is None else _part_around_origin(plane.size_mm)
+    low, high = _covered_part(loaded, plane)
     samples, max_samples = float(np.prod((high - low) / pitch_mm)), _MAX_SAMPLES_PER_PIXEL * width * height
     if samples > max_samples:
         raise GeometryMismatch(
@@ -91,14 +91,11 @@ def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> Pl
         raise GeometryMismatch(f"plane '{plane.name}': {failure}") from failure
 
 
-def _part_around_origin(size_mm: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and highest x, y in mm of a plane of a stated size."""
-    half = np.array(size_mm) / 2
-    return -half, half
-
-
-def _seen_part(loaded: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and highest x, y in mm on a plane that the reference view sees."""
+def _covered_part(loaded: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and highest x, y in mm of a plane: of its stated size, or what the reference view sees."""
+    if plane.size_mm is not None:
+        half = np.array(plane.size_mm) / 2
+        return -half, half
     camera = loaded.settings.camera
     width, height = camera.size_px
     columns, rows = np.meshgrid(np.linspace(-0.5, width - 0.5, 3), np.linspace(-0.5, height - 0.5, 3))
@@ -124,7 +121,9 @@ class OperatorFactory:
         self._images = images
         self._phases = len(layout.lattices)
         lattices = layout.lattices
-        rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
+        rays = np.stack(
+            [loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]].astype(np.float32) for at in lattices]
+        )
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
         response = np.stack([_response(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
@@ -154,9 +153,8 @@ class OperatorFactory:
 
     def _homographies(self, place: Place) -> NDArray[np.float64]:
         """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""
-        rt_ref_plane = (
-            np.array(place.rt_ref_plane) if isinstance(place, TiltedPlane) else fronto_parallel_rt_ref_plane(place)
-        )
+        tilted = isinstance(place, TiltedPlane)
+        rt_ref_plane = np.array(place.rt_ref_plane) if tilted else fronto_parallel_rt_ref_plane(place)
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
         return np.repeat(homographies, self._phases, axis=0)
 
@@ -165,12 +163,6 @@ class OperatorFactory:
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
         return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
-
-
-def _cropped_rays(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
-    """Return the rays of a lattice (row, column, 2); an incomplete period at the far edges is left out."""
-    rays = loaded.lens.rays(lattice.first, lattice.step)
-    return rays[: lattice.shape[0], : lattice.shape[1]].astype(np.float32)
 
 
 def _response(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:

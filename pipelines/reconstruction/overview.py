@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import Picture, contact_sheet, grey_levels, white_level, write_png
+from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, white_level, write_png
 from faintfield.pipelines.formats.results.records import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
@@ -17,6 +17,18 @@ from faintfield.recon.metrics import photons_from_linear_snr, photons_from_momen
 
 # Mask of the objects in the reference view, beside a set's images if it is known.
 OBJECT_REGION = "object_region.png"
+
+INTEGRAL_IMAGE = "integral_image.png"
+REFERENCE_VIEW = "reference_view.png"
+NOISE_REFERENCE_VIEW = "noise_reference.png"
+BRIGHT_VIEW = "bright_view.png"
+REGION_OUTLINED = "object_region_outlined.png"
+
+# Width of the sheet of all views, about as wide as the report.
+_SHEET_WIDTH_PX = 1260
+
+# Visible on white, grey and black.
+_OUTLINE_RGB = (240, 120, 0)
 
 type Region = NDArray[np.bool_]
 
@@ -71,8 +83,7 @@ def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
 
 def brightness(loaded: ElementalSet, region_path: Path | None = None) -> Brightness:
     """Measure the reference view of a set, all colours together; over the set's own object region by default."""
-    region, name = object_region(loaded, region_path)
-    return brightness_within(loaded, region, name)
+    return brightness_within(loaded, *object_region(loaded, region_path))
 
 
 def brightness_within(loaded: ElementalSet, region: Region | None, name: str) -> Brightness:
@@ -92,15 +103,16 @@ def brightness_within(loaded: ElementalSet, region: Region | None, name: str) ->
                 dark_e = loaded.background_e(noise)
                 power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
                 reference.append(np.sqrt(power).ravel())
-    return _figures(loaded, np.concatenate(signal), np.concatenate(reference), name, has_reference)
+    noise_from = "noise reference" if has_reference else "noise model"
+    return _figures(loaded, name, noise_from, np.concatenate(signal), np.concatenate(reference))
 
 
 def _figures(
     loaded: ElementalSet,
+    region: str,
+    noise_from: str,
     signal_e: NDArray[np.floating],
     reference_e: NDArray[np.floating],
-    region: str,
-    has_reference: bool,
 ) -> Brightness:
     """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
     noise = loaded.noise
@@ -111,14 +123,12 @@ def _figures(
     if snr and snr > 0:
         # With a quantum efficiency of 1 the formulas for photons give electrons
         counting = {"quantum_efficiency": 1.0, "read_noise_e": read_noise_e}
-        linear_e, moments_e = (
-            photons_from_linear_snr(snr, **counting),
-            photons_from_moments(snr, dark_e=dark_e, **counting),
-        )
+        linear_e = photons_from_linear_snr(snr, **counting)
+        moments_e = photons_from_moments(snr, dark_e=dark_e, **counting)
     efficiency = noise.quantum_efficiency
     return Brightness(
         region=region,
-        noise_from="noise reference" if has_reference else "noise model",
+        noise_from=noise_from,
         snr=snr,
         electrons_linear=linear_e,
         electrons_from_moments=moments_e,
@@ -128,43 +138,26 @@ def _figures(
     )
 
 
-INTEGRAL_IMAGE = "integral_image.png"
-REFERENCE_VIEW = "reference_view.png"
-NOISE_REFERENCE_VIEW = "noise_reference.png"
-BRIGHT_VIEW = "bright_view.png"
-REGION_OUTLINED = "object_region_outlined.png"
-
-# Width of the sheet of all views, about as wide as the report.
-_SHEET_WIDTH_PX = 1260
-
-# Visible on white, grey and black.
-_OUTLINE_RGB = (240, 120, 0)
-
-
 def write_overview(loaded: ElementalSet, out: Path) -> None:
     """Write the pictures of a set and `overview.json` into `out`; all views share one grey scale."""
     reference = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
     black, white = grey_scale_dn(reference)
-    columns = _columns(loaded)
+    grid = _grid(loaded)
+    columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
-    small = [_as_seen(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
+    small = [grey_levels(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
     write_png(out / INTEGRAL_IMAGE, contact_sheet(small, columns))
-    write_png(out / REFERENCE_VIEW, _as_seen(reference, white, black))
+    write_png(out / REFERENCE_VIEW, grey_levels(reference, white, black))
     if loaded.noise_reference:
         no_light = read_frame(loaded.noise_reference[0]).pixels_dn
-        write_png(out / NOISE_REFERENCE_VIEW, _as_seen(no_light, white, black))
+        write_png(out / NOISE_REFERENCE_VIEW, grey_levels(no_light, white, black))
     region, name = object_region(loaded)
     _write_bright_view(loaded, region, out)
-    write_json(out / OVERVIEW_FILE, _overview(loaded, (black, white), brightness_within(loaded, region, name)))
-
-
-def _overview(loaded: ElementalSet, grey_scale_dn: tuple[float, float], brightness: Brightness) -> Overview:
-    """Return what overview.json records of a set."""
     noise, exposure_s = loaded.noise, loaded.settings.exposure_s
-    return Overview(
+    record = Overview(
         set=loaded.folder.resolve().name,
         views=len(loaded.settings.view),
-        grid=_grid(loaded),
+        grid=grid,
         poses=loaded.poses,
         size_px=loaded.settings.camera.size_px,
         exposure_s=exposure_s,
@@ -173,9 +166,10 @@ def _overview(loaded: ElementalSet, grey_scale_dn: tuple[float, float], brightne
         has_noise_reference=bool(loaded.noise_reference),
         quantum_efficiency=noise.quantum_efficiency,
         dark_e=float(np.mean(noise.background_e(exposure_s))),
-        grey_scale_dn=grey_scale_dn,
-        brightness=brightness,
+        grey_scale_dn=(black, white),
+        brightness=brightness_within(loaded, region, name),
     )
+    write_json(out / OVERVIEW_FILE, record)
 
 
 def _write_bright_view(loaded: ElementalSet, region: Region | None, out: Path) -> None:
@@ -202,17 +196,6 @@ def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
     """Return a frame reduced to about a width by leaving pixels out: averaging would reduce the noise."""
     step = max(round(pixels.shape[1] / width_px), 1)
     return pixels[step // 2 :: step, step // 2 :: step]
-
-
-def _as_seen(pixels_dn: NDArray[Any], white: float, black: float) -> Picture:
-    """Return a frame as 8-bit levels."""
-    return grey_levels(pixels_dn, white=white, black=black)
-
-
-def _columns(loaded: ElementalSet) -> int:
-    """Return the number of views in a row of the sheet: the columns of the grid if the nodes are stated."""
-    grid = _grid(loaded)
-    return int(np.ceil(np.sqrt(len(loaded.settings.view)))) if grid is None else grid[1]
 
 
 def _grid(loaded: ElementalSet) -> tuple[int, int] | None:

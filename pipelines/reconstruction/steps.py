@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile
-from faintfield.pipelines.formats.hashes import Hashes
-from faintfield.pipelines.formats.provenance import Provenance, first_difference, provenance
+from faintfield.pipelines.formats.files import Hashes
+from faintfield.pipelines.formats.provenance import first_difference, provenance
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.rig.session.access import taken_frames
@@ -124,7 +123,7 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
             continue
         try:
             content = (session / file).read_bytes()
-            if difference := first_difference(_provenance_in(content), provenance(step.name, options, inputs)):
+            if difference := first_difference(content, provenance(step.name, options, inputs)):
                 return f"{file} was made with another {difference}"
             sidecars = [(session / file).parent / name for name in step.sidecars(content)]
         except (msgspec.MsgspecError, UnicodeDecodeError, LookupError, TypeError):
@@ -132,15 +131,3 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         if missing := [path for path in sidecars if not path.is_file()]:
             return f"{missing[0].relative_to(session)} is missing"
     return None
-
-
-class _Holder(msgspec.Struct):
-    """A result whose provenance is under a key of its own."""
-
-    provenance: Provenance[dict[str, Any]] | None = None
-
-
-def _provenance_in(content: bytes) -> Provenance[dict[str, Any]]:
-    """Return the provenance of a result file: under a key of its own, or among its other keys."""
-    own = msgspec.json.decode(content, type=_Holder).provenance
-    return own or msgspec.json.decode(content, type=Provenance[dict[str, Any]])

@@ -13,8 +13,7 @@ from faintfield.pipelines.formats.results.fitted_noise import read_fitted_noise
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.rig.plan import CapturePlan, StepKind, Stop
 from faintfield.rig.session.access import has_session, read_plan, taken_frames
 from faintfield.rig.session.frames import planned_frames
