@@ -153,8 +153,10 @@ class OperatorFactory:
 
     def _homographies(self, place: Place) -> NDArray[np.float64]:
         """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""
-        tilted = isinstance(place, TiltedPlane)
-        rt_ref_plane = np.array(place.rt_ref_plane) if tilted else fronto_parallel_rt_ref_plane(place)
+        if isinstance(place, TiltedPlane):
+            rt_ref_plane = np.array(place.rt_ref_plane)
+        else:
+            rt_ref_plane = fronto_parallel_rt_ref_plane(place)
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
         return np.repeat(homographies, self._phases, axis=0)
 

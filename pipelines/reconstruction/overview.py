@@ -108,11 +108,7 @@ def brightness_within(loaded: ElementalSet, region: Region | None, name: str) ->
 
 
 def _figures(
-    loaded: ElementalSet,
-    region: str,
-    noise_from: str,
-    signal_e: NDArray[np.floating],
-    reference_e: NDArray[np.floating],
+    loaded: ElementalSet, region: str, noise_from: str, signal_e: NDArray[Any], reference_e: NDArray[Any]
 ) -> Brightness:
     """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
     noise = loaded.noise
