@@ -19,7 +19,6 @@ from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import (
     Request,
-    check_options,
     resolve,
     select_planes,
     selected_methods,
@@ -117,16 +116,16 @@ def reconstruct(
         Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
     """
     runner = make_runner(workers, scheduler)
-    selection = select_planes(
-        depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or [], depth_map=depth_map
-    )
-    methods = selected_methods(method or [], joint=joint, occlusion=occlusion)
     weight = None if penalty_weight == "auto" else penalty_weight
-    settings = Settings(weight, passes, likelihood, penalty, uncertainty)
-    check_options(selection, methods, settings)
+    selection = select_planes(
+        *(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
+        depth_map=depth_map,
+        methods=selected_methods(method or [], joint=joint, occlusion=occlusion),
+        settings=Settings(weight, passes, likelihood, penalty, uncertainty),
+        pitch_mm=pitch_mm,
+    )
     loaded, out = _open(elemental_set, out, scene, geometry)
-    request = resolve(selection, loaded, out, methods=methods, settings=settings, pitch_mm=pitch_mm)
-    return reconstruct_and_report(loaded, out, request, runner)
+    return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
 
 
 def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
@@ -25,9 +24,6 @@ from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.best_focus import SURE
 
-# Fewer depths leave nothing to interpolate between.
-MIN_DEPTHS = 5
-
 # Fewest bins across the detector: limits the size of a bin.
 _MIN_BINS_ACROSS = 8
 
@@ -38,15 +34,6 @@ _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
 # Widths in inches of the preview and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
-
-
-def check_sweep(depths: Sequence[float]) -> None:
-    """Refuse a depth map from too few depths (WrongUsage)."""
-    if len(depths) < MIN_DEPTHS:
-        raise WrongUsage(
-            f"--depth-map compares depths, and {len(depths)} are given; give at least {MIN_DEPTHS}, by --sweep-mm "
-            "or --sweep-px"
-        )
 
 
 @dataclass(frozen=True)
