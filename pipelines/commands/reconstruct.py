@@ -17,12 +17,7 @@ from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, Scene
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes import Settings
-from faintfield.pipelines.reconstruction.request import (
-    Request,
-    resolve,
-    select_planes,
-    selected_methods,
-)
+from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes, selected_methods
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.recon.likelihood.images import LikelihoodName

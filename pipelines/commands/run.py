@@ -9,12 +9,7 @@ from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, GeometryRecord
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
-from faintfield.pipelines.formats.results.records import (
-    RECONSTRUCTION_FILE,
-    REPORT_FILE,
-    Method,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method, ReconstructionRecord
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.planes import Settings

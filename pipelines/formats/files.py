@@ -244,12 +244,9 @@ class Hashes:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._known: dict[str, _Known] = {}
-        try:
+        self._changed = False
+        with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):  # everything is hashed without a whole file
             self._known = msgspec.json.decode((folder / CACHE_FILE).read_bytes(), type=dict[str, _Known])
-        except (OSError, msgspec.MsgspecError, UnicodeDecodeError):
-            self._changed = True  # there is none, or it cannot be read: everything is hashed
-        else:
-            self._changed = False
 
     def of(self, name: str) -> str:
         """Return the SHA-256 of a file, by its name within the folder."""

@@ -74,10 +74,6 @@ class PlaneFiles:
         """Path of the plane itself."""
         return self.folder / f"{plane_name(self.place)}.tiff"
 
-    def sidecar_path(self, name: str) -> Path:
-        """Return the path of the standard deviation or the opacity of each sample."""
-        return self.folder / f"{plane_name(self.place)}_{name}.tiff"
-
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
         return read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
@@ -135,7 +131,7 @@ class PlaneFiles:
         """Write what else is known of the samples, remove the files of an earlier plane, return the paths."""
         written = {}
         for name in _SIDECARS:
-            path = self.sidecar_path(name)
+            path = self.folder / f"{plane_name(self.place)}_{name}.tiff"
             if all(name in part for part in parts):
                 write_plane(path, _joined(parts, name), pitch_mm)
                 written[name] = path
