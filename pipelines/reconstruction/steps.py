@@ -23,24 +23,24 @@ class Step:
     ----------
     name : str
         Name of the command that does it alone.
+    results : dict of str to mapping or msgspec.Struct
+        The options of each result file, if it is up to date; None if it is enough that the file exists.
+    make : callable
+        Does it.
     needs : tuple of str
         Names of the steps whose results it reads.
     inputs : callable
         Returns the names of all files that it reads.
-    results : dict of str to mapping or msgspec.Struct
-        The options of each result file, if it is up to date; None if it is enough that the file exists.
     sidecars : callable
         Takes a result file's content; returns the names of the files that belong to it, in the same folder.
-    make : callable
-        Does it.
     """
 
     name: str
-    needs: tuple[str, ...]
-    inputs: Callable[[], Sequence[str]]
     results: Mapping[str, object | None]
-    sidecars: Callable[[bytes], Sequence[str]]
     make: Callable[[], object]
+    needs: tuple[str, ...] = ()
+    inputs: Callable[[], Sequence[str]] = tuple
+    sidecars: Callable[[bytes], Sequence[str]] = lambda _: ()
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
