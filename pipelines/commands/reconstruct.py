@@ -54,7 +54,8 @@ def reconstruct(
 
     Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
     entry in reconstruction.json; report.html shows them all. With several methods each has a folder of its own in OUT.
-    Planes that are there, made of the same files with the same options, stay: a sweep that was cut short goes on.
+    Planes that exist already and were made from the same files with the same options are kept, so that an interrupted
+    sweep continues where it stopped.
 
     Parameters
     ----------
@@ -76,8 +77,8 @@ def reconstruct(
     plane_pose
         TOML file of planes of any pose, each with a name and either rt_ref_plane, or point_mm and normal.
     depth_map
-        From the sweep also how far away each pixel is, with the probability of that, and a picture that is sharp
-        everywhere.
+        Write from the sweep also how far away each pixel is, with the probability of that depth, and a picture that is
+        sharp everywhere.
     method
         pmlem (the default; to its optimum, certified), joint and occlusion (the same for all planes together),
         pmlem-osl and mlem (the paper's iterations), or backprojection; give it once per method.
@@ -89,11 +90,11 @@ def reconstruct(
         The paper's β, in the unit of the number of views. auto: for pmlem the weight under which most of the views best
         predict those held out, for pmlem-osl one from the noise level.
     penalty
-        What pmlem holds against rough planes: total variation, the same with small differences squared (huber-tv),
-        squared differences (quadratic), or nothing.
+        Penalty of pmlem for rough planes: total variation, total variation with small differences squared (huber-tv),
+        squared differences (quadratic), or none.
     likelihood
-        How pixels are judged. auto: exactly (poisson-gaussian) where read noise is below 3 electrons, shifted-poisson
-        above, which is faster. poisson ignores read noise; least-squares knows no counts.
+        Model of the pixels' values. auto: the exact one (poisson-gaussian) if read noise is below 3 electrons, else
+        shifted-poisson, which is faster. poisson ignores read noise; least-squares ignores that light is counted.
     uncertainty
         Save the standard deviation of each sample beside the planes of pmlem and joint; see docs/physics.md for what
         it covers.
@@ -106,9 +107,9 @@ def reconstruct(
     scene
         Which of a session's sets: the dark scene, or the bright one.
     workers
-        Have the planes made by so many processes of one thread each; needs the extra faintfield[cluster].
+        Reconstruct in this many processes of one thread each; needs the extra faintfield[cluster].
     scheduler
-        Have the planes made by the workers of the dask scheduler at this address, which see OUT under the same path.
+        Reconstruct on the workers of the dask scheduler at this address; they must see OUT under the same path.
     """
     runner = make_runner(workers, scheduler)
     weight = None if penalty_weight == "auto" else penalty_weight

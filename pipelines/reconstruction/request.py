@@ -210,7 +210,9 @@ def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> li
 def _check_methods(selection: Selection, methods: list[Method], settings: Settings) -> None:
     """Refuse options that contradict one another or would have no effect (WrongUsage)."""
     if selection.tilted and "occlusion" in methods:
-        raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
+        raise WrongUsage(
+            "occlusion needs to know which plane is nearer, which is undefined for planes given by a pose; use joint"
+        )
     if settings.likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     if (settings.uncertainty or settings.penalty != "tv") and not {"pmlem", *JOINT_METHODS} & set(methods):

@@ -75,7 +75,7 @@ def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
     for step in steps:
         if missing := [name for name in step.needs if name in failed]:
             failed[step.name] = failed[missing[0]]
-            inform(f"{step.name}: left as it is, for it needs {missing[0]}")
+            inform(f"{step.name}: skipped, because it needs {missing[0]}")
             continue
         try:
             reason = _out_of_date(session, step, hashes)
@@ -118,7 +118,7 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         inputs[name] = hashes.of(name)
     for file, options in step.results.items():
         if not (session / file).is_file():
-            return f"{file} is not there yet"
+            return f"{file} does not exist yet"
         if options is None:
             continue
         try:

@@ -197,7 +197,9 @@ class Sweep:
             if record := files.finished():
                 self.finished[files.method, files.place] = record
         if self.finished:
-            inform(f"{len(self.finished)} of {len(self.files)} planes are there, made of the same; they stay")
+            inform(
+                f"{len(self.finished)} of {len(self.files)} planes are there, made from the same inputs; they are kept"
+            )
         tasks = self._tasks()
         self._write_complete(self.files)
         with closing(runner(self.loaded, out, tasks)) as done:
