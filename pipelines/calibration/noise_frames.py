@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise import Series, SeriesSums
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
-from faintfield.pipelines.formats.frames import Frame, read_frame
-from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
+from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.sets.noise_set import NoiseSet, Region, group_frames
 
 

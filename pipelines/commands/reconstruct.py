@@ -12,19 +12,12 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
 from faintfield.pipelines.formats.results.records import Method
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes import Settings
-from faintfield.pipelines.reconstruction.request import (
-    Request,
-    check_options,
-    resolve,
-    select_planes,
-    selected_methods,
-)
+from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes, selected_methods
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.recon.likelihood.images import LikelihoodName
@@ -118,16 +111,16 @@ def reconstruct(
         Address of a dask scheduler whose workers make the planes; they must see OUT under the same path.
     """
     runner = make_runner(workers, scheduler)
-    selection = select_planes(
-        depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or [], depth_map=depth_map
-    )
-    methods = selected_methods(method or [], joint=joint, occlusion=occlusion)
     weight = None if penalty_weight == "auto" else penalty_weight
-    settings = Settings(weight, passes, likelihood, penalty, uncertainty)
-    check_options(selection, methods, settings)
+    selection = select_planes(
+        *(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
+        depth_map=depth_map,
+        methods=selected_methods(method or [], joint=joint, occlusion=occlusion),
+        settings=Settings(weight, passes, likelihood, penalty, uncertainty),
+        pitch_mm=pitch_mm,
+    )
     loaded, out = _open(elemental_set, out, scene, geometry)
-    request = resolve(selection, loaded, out, methods=methods, settings=settings, pitch_mm=pitch_mm)
-    return reconstruct_and_report(loaded, out, request, runner)
+    return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
 
 
 def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:

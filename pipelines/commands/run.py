@@ -9,17 +9,17 @@ from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, CameraPoses
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
-from faintfield.pipelines.formats.results.records import (
-    RECONSTRUCTION_FILE,
-    REPORT_FILE,
-    Method,
-    ReconstructionRecord,
-)
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method, ReconstructionRecord
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.reconstruction.depths import distinct_depths, swept_depths
 from faintfield.pipelines.reconstruction.planes import Settings
-from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, folder_of_method
+from faintfield.pipelines.reconstruction.request import (
+    DEFAULT_METHOD,
+    Request,
+    distinct_depths,
+    folder_of_method,
+    swept_depths,
+)
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
@@ -94,19 +94,17 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
     return [
         Step(
             "noise",
-            (),
-            inputs=lambda: _frames(session, "dark", "flat"),
             results={NOISE_FILE: {}},
-            sidecars=lambda _: [NOISE_MAPS],
             make=measure_noise,
+            inputs=lambda: _frames(session, "dark", "flat"),
+            sidecars=lambda _: [NOISE_MAPS],
         ),
         Step(
             "geometry",
-            (),
-            inputs=lambda: _frames(session, "charuco"),
             results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
-            sidecars=lambda content: msgspec.json.decode(content, type=CameraPoses).files_beside(),
             make=measure_geometry,
+            inputs=lambda: _frames(session, "charuco"),
+            sidecars=lambda content: msgspec.json.decode(content, type=CameraPoses).files_beside(),
         ),
         *_steps_of_request(session, request),
     ]
@@ -115,26 +113,23 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
 def _steps_of_request(session: Path, request: Request) -> list[Step]:
     """Return the steps from a calibrated session to the planes and the report."""
     out = session / RECONSTRUCTIONS
-    folders = {name: folder_of_method(out, name, request.methods) for name in request.methods}
+    folders = {name: folder_of_method(Path(RECONSTRUCTIONS), name, request.methods) for name in request.methods}
     return [
         Step(
             "reconstruct",
-            ("noise", "geometry"),
-            inputs=lambda: files_of_scene(session, "dark_scene"),
             results={
-                str((folder / RECONSTRUCTION_FILE).relative_to(session)): request.options(name, "measured")
-                for name, folder in folders.items()
+                str(folder / RECONSTRUCTION_FILE): request.options(name, "measured") for name, folder in folders.items()
             },
-            sidecars=_plane_files,
             make=lambda: reconstruct_and_report(load_session(session), out, request),
+            needs=("noise", "geometry"),
+            inputs=lambda: files_of_scene(session, "dark_scene"),
+            sidecars=_plane_files,
         ),
         Step(
             "report",
-            ("reconstruct",),
-            inputs=lambda: [],
             results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
-            sidecars=lambda _: [],
             make=lambda: write_report(out),
+            needs=("reconstruct",),
         ),
     ]
 

@@ -16,7 +16,7 @@ from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.firmware import serving
-from faintfield.rig.stages.conformance import Check
+from faintfield.rig.stages.conformance import Check, check_conformance
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
 
@@ -156,7 +156,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     """
     table, checks = Table("", "check", "measured", "limit"), []
     with _connected(connection) as stage:
-        for check in conformance(stage):
+        for check in check_conformance(stage):
             inform(f"tried: {check.name}")
             mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
             table.add_row(mark, check.name, check.measured, check.limit)

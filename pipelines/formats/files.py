@@ -2,11 +2,11 @@
 
 import errno
 import fcntl
-import hashlib
 import os
 import secrets
 import shutil
 import tempfile
+import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
@@ -16,12 +16,18 @@ from typing import Any, BinaryIO
 import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
+from faintfield.rig.session import durable
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
 
 # Suffix of temporary names; a file that keeps it was left by a process that was killed.
 UNFINISHED = ".unfinished"
+
+CACHE_FILE = ".hashes.json"
+
+# In nanoseconds: a file changed this shortly before its hashing could change again with the same time stamp.
+_AT_REST_NS = 2_000_000_000
 
 
 @contextmanager
@@ -48,7 +54,7 @@ def writing(path: Path) -> Iterator[BinaryIO]:
         except BaseException:
             unfinished.unlink(missing_ok=True)
             raise
-        _sync_folder(path.parent)
+        durable.sync_folder(path.parent)
 
 
 def write_whole(path: Path, content: bytes | str) -> None:
@@ -92,17 +98,15 @@ def writing_folder(
             raise OutputExists(f"{out}: holds {path}, which is read; name another folder")
     with translated_write_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-        # Named before it is created, so that an interrupt at any moment can remove it
-        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")
+        building = out.with_name(f".{out.name}.{secrets.token_hex(4)}")  # named first, as in `writing`
         try:
-            building.mkdir(mode=0o700)
+            building.mkdir()
             yield building
-            os.chmod(building, 0o777 & ~_umask())
             _put_in_place(building, out)
         except BaseException:
             shutil.rmtree(building, ignore_errors=True)
             raise
-        _sync_folder(out.parent)
+        durable.sync_folder(out.parent)
 
 
 def _put_in_place(building: Path, out: Path) -> None:
@@ -195,8 +199,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return durable.sha256(path)
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
@@ -221,17 +224,50 @@ def _free_bytes(path: Path) -> int:
     return shutil.disk_usage(existing).free
 
 
-def _umask() -> int:
-    """Return the permission bits that this process withholds from new files."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+class _Known(msgspec.Struct, frozen=True):
+    """A hash, with the size and the time of change of the file at that time."""
+
+    size: int
+    mtime_ns: int
+    sha256: str
 
 
-def _sync_folder(folder: Path) -> None:
-    """Flush a folder's entries, so that a rename survives a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+class Hashes:
+    """SHA-256 of the files of a folder, each computed again only if its size or its time of change differs.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder; the hashes are stored in a hidden file in it, which may be removed at any time.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._known: dict[str, _Known] = {}
+        self._changed = False
+        with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):  # everything is hashed without a whole file
+            self._known = msgspec.json.decode((folder / CACHE_FILE).read_bytes(), type=dict[str, _Known])
+
+    def of(self, name: str) -> str:
+        """Return the SHA-256 of a file, by its name within the folder."""
+        path = self._folder / name
+        state = path.stat()
+        known = self._known.get(name)
+        if known is not None and (known.size, known.mtime_ns) == (state.st_size, state.st_mtime_ns):
+            return known.sha256
+        begun_ns = time.time_ns()
+        digest = sha256(path)
+        self._known.pop(name, None)
+        if state.st_mtime_ns < begun_ns - _AT_REST_NS:
+            self._known[name] = _Known(state.st_size, state.st_mtime_ns, digest)
+        self._changed = True
+        return digest
+
+    def save(self) -> None:
+        """Store the hashes, except of files that had changed just before.
+
+        If the folder cannot be written to, nothing is stored, which costs time only.
+        """
+        if self._changed:
+            with suppress(CannotWrite):
+                write_json(self._folder / CACHE_FILE, self._known)

@@ -1,9 +1,10 @@
-"""Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their mosaic."""
+"""Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their colour mosaic."""
 
 import contextlib
 import logging
 import struct
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,37 @@ _END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 # Masked pixels this close to the active area are not used, px: they catch a little of its light.
 _MASKED_GUARD_PX = 4
+
+
+def mosaic_period(mosaic: Sequence[str] | None) -> tuple[int, int]:
+    """Return rows and columns of the period of a mosaic such as ("RG", "GB"); (1, 1) without filters."""
+    return (1, 1) if mosaic is None else (len(mosaic), len(mosaic[0]))
+
+
+def at_phase(pixels: NDArray[Any], phase: tuple[int, int], period: tuple[int, int]) -> NDArray[Any]:
+    """Return the pixels of a phase, as a view of an array (row, column)."""
+    return pixels[phase[0] :: period[0], phase[1] :: period[1]]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """The detector pixels of one phase of a mosaic; all pixels without colour filters.
+
+    Attributes
+    ----------
+    first, step : (int, int)
+        Row and column of its first pixel, and the distance to its next.
+    shape : (int, int)
+        Rows and columns; an incomplete period at the far edges is left out.
+    """
+
+    first: tuple[int, int]
+    step: tuple[int, int]
+    shape: tuple[int, int]
+
+    def of(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Return the lattice's part of an image (row, column), as a view."""
+        return at_phase(pixels, self.first, self.step)[: self.shape[0], : self.shape[1]]
 
 
 @dataclass(frozen=True)
@@ -139,8 +171,7 @@ def _read_raw(path: Path) -> Frame:
                 raise UnreadableImage(f"{path}: holds demosaiced colour; record raw files with their mosaic")
             pixels = raw.raw_image_visible.copy()
             mosaic = _mosaic_of(raw)
-            period = (1, 1) if mosaic is None else (len(mosaic), len(mosaic[0]))
-            black_dn = _masked_black_dn(raw, period)
+            black_dn = _masked_black_dn(raw, mosaic_period(mosaic))
             saturation_dn = float(raw.white_level)
     except rawpy.LibRawError as failure:
         reason = failure.args[0].decode() if isinstance(failure.args[0], bytes) else str(failure)
@@ -165,9 +196,8 @@ def _masked_black_dn(raw: Any, period: tuple[int, int]) -> NDArray[np.float64]:
     masked[: max(top - _MASKED_GUARD_PX, 0), :] = True
     black_dn = np.empty(period)
     for row, column in np.ndindex(*period):
-        rows = slice((top + row) % period[0], None, period[0])
-        columns = slice((left + column) % period[1], None, period[1])
-        levels = raw.raw_image[rows, columns][masked[rows, columns]].astype(float)
+        phase = ((top + row) % period[0], (left + column) % period[1])
+        levels = at_phase(raw.raw_image, phase, period)[at_phase(masked, phase, period)].astype(float)
         if levels.size < 100:
             black_dn[row, column] = raw.black_level_per_channel[int(raw.raw_colors_visible[row, column])]
             continue

@@ -31,10 +31,6 @@ class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
 
 
-# Provenance whose options are known by their keys only: of any command.
-type AnyProvenance = Provenance[Mapping[str, object]]
-
-
 def provenance[Options](command: str, options: Options, inputs: dict[str, str]) -> Provenance[Options]:
     """Return the provenance of a result that is made now."""
     return Provenance(command=command, options=options, inputs=inputs, versions=versions())
@@ -49,16 +45,23 @@ def versions() -> dict[str, str]:
     return found
 
 
-def first_difference[Options](written: AnyProvenance, now: Provenance[Options]) -> str | None:
+def first_difference[Options](content: bytes, now: Provenance[Options]) -> str | None:
     """Return in words the first difference between the provenance of a result and what it would be now, None if equal.
 
     Parameters
     ----------
-    written : Provenance
-        As read from the result's file.
+    content : bytes
+        The result's JSON file; its provenance is under a key of its own, or among its other keys.
     now : Provenance
         Of the same result, were it made now.
+
+    Raises
+    ------
+    msgspec.MsgspecError, UnicodeDecodeError
+        The file is damaged.
     """
+    record = msgspec.json.decode(content, type=dict[str, object])
+    written = msgspec.convert(record.get("provenance") or record, Provenance[dict[str, object]])
     now_options: dict[str, object] = msgspec.json.decode(msgspec.json.encode(now.options))
     compared: tuple[tuple[str, Mapping[str, object], Mapping[str, object]], ...] = (
         ("input", written.inputs, now.inputs),

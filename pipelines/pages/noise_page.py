@@ -182,11 +182,9 @@ def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
         axes.plot(histogram.value_dn[seen], histogram.count[seen], ".", ms=4, color=colour, label=label)
         axes.plot(histogram.value_dn, np.maximum(histogram.expected, 1e-3), color=_MODEL, lw=1)
     axes.plot([], [], color=_MODEL, lw=1, label="fitted")
-    axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_span(calibration), yscale="log")
+    axes.set(xlabel="$y$ [DN]", ylabel="count", xlim=_value_range(calibration), yscale="log")
     axes.set_ylim(bottom=0.5)
-    axes.set_xlim(*_value_range(calibration))
     axes.locator_params(axis="x", nbins=6)
-    axes.set(xlabel="$y$ [DN]", ylabel="count")
     axes.legend(fontsize=8)
 
 

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec import UNSET
+
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import Overview
@@ -126,13 +128,13 @@ def _thinned(path: Path) -> str | None:
 
 
 def photon_budget(overview: Overview) -> PhotonBudget | None:
-    """Return the photon budget of a set, None without light.
+    """Return the photon budget of a set, None without light, or if its dark level is not recorded.
 
     Light is in electrons, and in photons too if the quantum efficiency is known.
     """
     light, exposure_s, dark_e = overview.brightness, overview.exposure_s, overview.dark_e
     signal_e = light.mean_signal_e
-    if signal_e <= 0:
+    if dark_e is UNSET or signal_e <= 0:
         return None
     by_formula = (
         ("the paper’s linear formula, eq. (7)", light.electrons_linear),

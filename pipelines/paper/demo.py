@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.formats.exchange.imported_set import relative
-from faintfield.pipelines.formats.results.geometry import read_geometry
+from faintfield.pipelines.formats.results.geometry import CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, read_noise
 from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import GeometryErrors, KnownValue, Method, Metrics

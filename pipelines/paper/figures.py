@@ -147,7 +147,9 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
     outcome = _reconstruct(out / _SCENE, out / _DARK, OURS)
     metrics = outcome.metrics
     assert metrics is not None
+    assert metrics.snr
     assert metrics.snr.measured is not None
+    assert metrics.photons_per_px
     rows = [
         DarkPlaneRow(
             *(errors.depth_mm, errors.object, errors.method, errors.mse_bright, errors.mse_texture, errors.psnr_db),

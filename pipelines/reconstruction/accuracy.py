@@ -11,11 +11,9 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import Method, Metrics, PhotonsRecord, PlaneErrors, Poses, SnrRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.ground_truth import Truth, read_truth, texture_and_region, true_plane
-from faintfield.pipelines.reconstruction.brightness import brightness
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.grids import plane_grid
-from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
 from faintfield.recon.metrics import mean_square_error, peak_snr_db
 from faintfield.recon.solver.initialization import back_projection
 

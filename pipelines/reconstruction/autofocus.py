@@ -79,9 +79,13 @@ def _narrowed(
     loaded: ElementalSet, out: Path, range_mm: tuple[float, float]
 ) -> tuple[list[tuple[float, float]], Compared, DepthEstimate]:
     """Search a range, then the part of it in which anything was found; return all ranges, and the last comparison."""
+    moved_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:5], axis=1).max())
     ranges = [range_mm]
     for _ in range(_SEARCHES):
-        compared = _searched(loaded, out, *ranges[-1])
+        near_mm, far_mm = ranges[-1]
+        step_px = loaded.settings.camera.fx_px * moved_mm * (1 / near_mm - 1 / far_mm) / (_DEPTHS - 1)
+        depths = (1 / np.linspace(1 / near_mm, 1 / far_mm, _DEPTHS)).tolist()
+        compared = compared_depths(loaded, depths, out, min_bins_px=int(np.ceil(step_px / _MAX_BINS_PER_STEP)))
         found = compared.depth_map()
         sure = found.confidence >= SURE
         if np.count_nonzero(sure) < MIN_SAMPLES:
@@ -131,14 +135,6 @@ def _overlap(loaded: ElementalSet, depth_mm: float) -> float:
     ]
     inside = np.all((np.array(seen) > -0.5) & (np.array(seen) < np.array(camera.size_px) - 0.5), axis=2)
     return float(inside.mean())
-
-
-def _searched(loaded: ElementalSet, out: Path, near_mm: float, far_mm: float) -> Compared:
-    """Compare the views at the depths of one search."""
-    depths = (1 / np.linspace(1 / near_mm, 1 / far_mm, _DEPTHS)).tolist()
-    moved_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:5], axis=1).max())
-    step_px = loaded.settings.camera.fx_px * moved_mm * (1 / near_mm - 1 / far_mm) / (_DEPTHS - 1)
-    return compared_depths(loaded, depths, out, min_bins_px=int(np.ceil(step_px / _MAX_BINS_PER_STEP)))
 
 
 def _refined(loaded: ElementalSet, out: Path, compared: Compared, place: NDArray[np.bool_], index: float) -> float:

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
-from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period, read_frame
 from faintfield.pipelines.formats.large_arrays import Allocate
-from faintfield.pipelines.formats.mosaic import Lattice, mosaic_period
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.recon.likelihood.images import ElementalImages
 

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.sweep import Channel, PlaneTask, Runner, run_serially
-from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.likelihood.images import ElementalImages
 
 _LOST = "run the same command again, and only what is missing is done; the logs of the workers say more"
 
@@ -131,59 +131,34 @@ def _as_done(
             client.run(_opened.cache_clear)
 
 
-@dataclass(frozen=True)
-class _SharedChannel:
-    """A colour of a set as workers get it: paths of the files with its pixels, and small values."""
-
-    loaded: ElementalSet
-    layout: ChannelLayout
-    shape: tuple[int, ...]
-    electrons: Path
-    valid: Path | None
-    background_e: float | Image
-    read_variance_e2: float | Image
-
-    def opened(self) -> Channel:
-        """Return the colour, with its pixels memory-mapped."""
-        images = ElementalImages(
-            np.asarray(np.memmap(self.electrons, np.float32, "r", shape=self.shape)),
-            self.background_e,
-            self.read_variance_e2,
-            None if self.valid is None else np.asarray(np.memmap(self.valid, np.bool_, "r", shape=self.shape)),
-        )
-        return Channel(self.loaded, self.layout, images)
-
-
 def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> Path:
-    """Read a colour into files, and return the path of the pickled `_SharedChannel` that names them."""
-
-    def path_of(dtype: DTypeLike) -> Path:
-        return shared / f"{layout.name}.{np.dtype(dtype).name}"
+    """Read a colour into files, one for its electrons and one for its valid pixels, and return the path of the rest."""
+    path = shared / layout.name
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        with translated_write_errors(shared.parent), path_of(dtype).open("wb+") as file:
+        with translated_write_errors(shared.parent), _pixels_of(path, dtype).open("wb+") as file:
             return mapped(file, shape, dtype)
 
     images = load_channel(loaded, layout, allocate)
-    shared_channel = _SharedChannel(
-        loaded,
-        layout,
-        images.electrons.shape,
-        path_of(np.float32),
-        None if images.valid is None else path_of(np.bool_),
-        images.background_e,
-        images.read_variance_e2,
+    path.write_bytes(
+        pickle.dumps((loaded, layout, images.electrons.shape, images.background_e, images.read_variance_e2))
     )
-    path = shared / layout.name
-    path.write_bytes(pickle.dumps(shared_channel))
     return path
+
+
+def _pixels_of(path: Path, dtype: DTypeLike) -> Path:
+    """Return the path of a colour's pixels of a data type: float32 electrons, or whether each is valid."""
+    return path.with_suffix(f".{np.dtype(dtype).name}")
 
 
 @lru_cache(maxsize=1)
 def _opened(path: Path) -> Channel:
     """Return the colour of a file of `_share`; a worker keeps the last one."""
-    shared: _SharedChannel = pickle.loads(path.read_bytes())
-    return shared.opened()
+    loaded, layout, shape, background_e, read_variance_e2 = pickle.loads(path.read_bytes())
+    electrons = np.asarray(np.memmap(_pixels_of(path, np.float32), np.float32, "r", shape=shape))
+    mask = _pixels_of(path, np.bool_)
+    valid = np.asarray(np.memmap(mask, np.bool_, "r", shape=shape)) if mask.is_file() else None
+    return Channel(loaded, layout, ElementalImages(electrons, background_e, read_variance_e2, valid))
 
 
 def _do(path: Path, task: PlaneTask) -> list[str]:

@@ -4,7 +4,6 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import msgspec
@@ -12,22 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
+from faintfield.pipelines.formats.image_files import encoded, grey_levels, white_level, write_plane
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.grids import plane_grid
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.focus import SURE
-
-# Fewer depths leave nothing to interpolate between.
-MIN_DEPTHS = 5
 
 # Fewest bins across the detector: limits the size of a bin.
 _MIN_BINS_ACROSS = 8
@@ -39,15 +33,6 @@ _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 
 # Widths in inches of the preview and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
-
-
-def check_sweep(depths: Sequence[float]) -> None:
-    """Refuse a depth map from too few depths (WrongUsage)."""
-    if len(depths) < MIN_DEPTHS:
-        raise WrongUsage(
-            f"--depth-map compares depths, and {len(depths)} are given; give at least {MIN_DEPTHS}, by --sweep-mm "
-            "or --sweep-px"
-        )
 
 
 @dataclass(frozen=True)
@@ -114,40 +99,21 @@ class _Map:
 
     Attributes
     ----------
-    unit : str
-        "mm" of depth, or "px" of disparity.
+    record : DepthMapRecord
+        What reconstruction.json records of it.
     scale : list of float
-        Depth or disparity of each plane.
+        Depth in mm, or disparity in px, of each plane.
     index : float array (row, column)
         Between which planes each sample is sharp.
     values, confidence : float array (row, column)
-        In the unit, NaN where not known; and the probability that this is right.
+        In the unit of the scale, NaN where not known; and the probability that this is right.
     """
 
-    unit: Literal["mm", "px"]
+    record: DepthMapRecord
     scale: list[float]
     index: NDArray[np.float64]
     values: NDArray[np.float64]
     confidence: NDArray[np.float64]
-
-    @property
-    def name(self) -> str:
-        """Name of the file of the values, without suffix."""
-        return "depth_mm" if self.unit == "mm" else "disparity_px"
-
-    def record(self, bins_px: int) -> DepthMapRecord:
-        """Return what reconstruction.json records of the map."""
-        known = np.isfinite(self.values)
-        return DepthMapRecord(
-            file=f"{self.name}.tiff",
-            confidence=f"{CONFIDENCE}.tiff",
-            all_in_focus=f"{ALL_IN_FOCUS}.tiff",
-            unit=self.unit,
-            bins_px=bins_px,
-            sure_above=SURE,
-            sure_share=float(known.mean()),
-            median=float(np.median(self.values[known])) if known.any() else None,
-        )
 
 
 def write_depth_map(
@@ -181,14 +147,13 @@ def write_depth_map(
     depths = sorted({depth for _, depth in planes})
     compared = compared_depths(loaded, depths, out)
     found = _map_of(loaded, compared, disparities_px)
-    record = found.record(compared.bins_px)
     for method, folder in folders.items():
         remove(folder / DEPTH_MAP_FILE)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
         hashes = _write_maps(folder, found, sharp)
-        vouching = DepthMapFileRecord(1, record, hashes, **msgspec.structs.asdict(origins[method]))
+        vouching = DepthMapFileRecord(1, found.record, hashes, **msgspec.structs.asdict(origins[method]))
         write_json(folder / DEPTH_MAP_FILE, vouching)
-    return record
+    return found.record
 
 
 def _map_of(loaded: ElementalSet, compared: Compared, disparities_px: Mapping[float, float]) -> _Map:
@@ -200,20 +165,34 @@ def _map_of(loaded: ElementalSet, compared: Compared, disparities_px: Mapping[fl
     index, confidence = (_enlarged(part, shape, compared.bins_px) for part in (found.index, found.confidence))
     values = np.interp(index, np.arange(len(depths)), scale)
     values[confidence < SURE] = np.nan
-    return _Map("px" if disparities_px else "mm", scale, index, values, confidence)
+    known = np.isfinite(values)
+    record = DepthMapRecord(
+        file="disparity_px.tiff" if disparities_px else "depth_mm.tiff",
+        confidence=f"{CONFIDENCE}.tiff",
+        all_in_focus=f"{ALL_IN_FOCUS}.tiff",
+        unit="px" if disparities_px else "mm",
+        bins_px=compared.bins_px,
+        sure_above=SURE,
+        sure_share=float(known.mean()),
+        median=float(np.median(values[known])) if known.any() else None,
+    )
+    return _Map(record, scale, index, values, confidence)
 
 
 def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
     """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
-    label = "disparity (px)" if found.unit == "px" else "depth (mm)"
-    write_plane(folder / f"{found.name}.tiff", found.values, 1.0)
-    write_plane(folder / f"{CONFIDENCE}.tiff", found.confidence, 1.0)
-    write_whole(folder / f"{found.name}.png", _picture(found.values, label, min(found.scale), max(found.scale)))
-    write_whole(folder / f"{CONFIDENCE}.png", _picture(found.confidence, "probability of the depth", 0.0, 1.0))
-    write_plane(folder / f"{ALL_IN_FOCUS}.tiff", sharp, 1.0)
-    write_png(folder / f"{ALL_IN_FOCUS}.png", grey_levels(sharp, white_level(sharp)))
-    files = [f"{stem}.{suffix}" for stem in (found.name, CONFIDENCE, ALL_IN_FOCUS) for suffix in ("tiff", "png")]
-    return {file: sha256(folder / file) for file in files}
+    record = found.record
+    label = "disparity (px)" if record.unit == "px" else "depth (mm)"
+    pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
+        record.file: (found.values, _picture(found.values, label, min(found.scale), max(found.scale))),
+        record.confidence: (found.confidence, _picture(found.confidence, "probability of the depth", 0.0, 1.0)),
+        record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
+    }
+    for name, (values, picture) in pictures.items():
+        write_plane(folder / name, values, 1.0)
+        write_whole((folder / name).with_suffix(".png"), picture)
+    files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
+    return {path.name: sha256(path) for path in files}
 
 
 def _picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:

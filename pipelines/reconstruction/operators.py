@@ -1,4 +1,4 @@
-"""The operator H of a plane, or of several, from the poses, the lens and the response of an elemental set."""
+"""The samples of planes, and the operator H of a plane or of several, from the poses, lens and response of a set."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from faintfield.pipelines.formats.mosaic import Lattice
+from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
@@ -16,6 +16,98 @@ from faintfield.recon.likelihood.images import ElementalImages, binned
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+
+# Limit of the samples of a plane: one seen at a grazing angle would have most of its samples far away.
+_MAX_SAMPLES_PER_PIXEL = 16
+
+
+def check_in_front(depth_mm: float) -> None:
+    """Refuse a plane that is not in front of the reference camera (GeometryMismatch)."""
+    if not (np.isfinite(depth_mm) and depth_mm > 0):
+        raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
+
+
+def default_pitch_px(loaded: ElementalSet, layouts: list[ChannelLayout]) -> int:
+    """Return the default distance of a plane's samples in detector pixels: 1 if the views can fill that.
+
+    A view sees only some pixels in each colour of a mosaic; with fewer views than it takes to fill the gaps, the
+    samples are a period of the mosaic apart.
+    """
+    views = len(loaded.settings.view)
+    step = layouts[0].lattices[0].step
+    fewest_per_sample = min(views * len(layout.lattices) / (step[0] * step[1]) for layout in layouts)
+    return 1 if fewest_per_sample >= 1 else max(step)
+
+
+def plane_grid(loaded: ElementalSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
+    """Return the samples of the plane at a depth, one per pixel of the reference view by default.
+
+    Raises
+    ------
+    GeometryMismatch
+        The plane is not in front of the camera, or the pitch leaves it without samples.
+    """
+    check_in_front(depth_mm)
+    camera = loaded.settings.camera
+    cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
+    width, height = camera.size_px
+    mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
+    try:
+        return PlaneGrid.covering(
+            left_mm=(-0.5 - cx_px) * mm_per_px_x,
+            top_mm=(-0.5 - cy_px) * mm_per_px_y,
+            right_mm=(width - 0.5 - cx_px) * mm_per_px_x,
+            bottom_mm=(height - 0.5 - cy_px) * mm_per_px_y,
+            pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
+        )
+    except ValueError as failure:
+        raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
+
+
+def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:
+    """Return the samples of a plane of any pose: of its stated size, or what the reference view sees of it.
+
+    Raises
+    ------
+    GeometryMismatch
+        A part of the reference view does not meet the plane in front of the camera, or only very far away.
+    """
+    width, height = loaded.settings.camera.size_px
+    if not plane.depth_mm > 0:
+        raise GeometryMismatch(
+            f"plane '{plane.name}': lies behind the camera, at {plane.depth_mm:g} mm along its axis; z points forward: "
+            "correct its pose"
+        )
+    low, high = _covered_part(loaded, plane)
+    samples, max_samples = float(np.prod((high - low) / pitch_mm)), _MAX_SAMPLES_PER_PIXEL * width * height
+    if samples > max_samples:
+        raise GeometryMismatch(
+            f"plane '{plane.name}': has {samples:.3g} samples, and at most {max_samples:.3g} make sense, "
+            f"{_MAX_SAMPLES_PER_PIXEL} per detector pixel; give it a size_mm, or a larger --pitch-mm"
+        )
+    try:
+        return PlaneGrid.covering(float(low[0]), float(low[1]), float(high[0]), float(high[1]), pitch_mm)
+    except ValueError as failure:
+        raise GeometryMismatch(f"plane '{plane.name}': {failure}") from failure
+
+
+def _covered_part(loaded: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the lowest and highest x, y in mm of a plane: of its stated size, or what the reference view sees."""
+    if plane.size_mm is not None:
+        half = np.array(plane.size_mm) / 2
+        return -half, half
+    camera = loaded.settings.camera
+    width, height = camera.size_px
+    columns, rows = np.meshgrid(np.linspace(-0.5, width - 0.5, 3), np.linspace(-0.5, height - 0.5, 3))
+    shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()[loaded.reference_view]
+    rays = loaded.lens.rays_at(np.column_stack([columns.ravel(), rows.ravel()]) + shift_px)
+    points = plane.on_plane(np.column_stack([rays, np.ones(len(rays))]))
+    if np.isnan(points).any():
+        raise GeometryMismatch(
+            f"plane '{plane.name}': a part of the reference view does not meet it in front of the camera; "
+            "give it a size_mm, or correct its pose"
+        )
+    return points.min(axis=0), points.max(axis=0)
 
 
 class OperatorFactory:
@@ -29,7 +121,9 @@ class OperatorFactory:
         self._images = images
         self._phases = len(layout.lattices)
         lattices = layout.lattices
-        rays = np.stack([_cropped_rays(loaded, lattice) for lattice in lattices])
+        rays = np.stack(
+            [loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]].astype(np.float32) for at in lattices]
+        )
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
         response = np.stack([_response(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
@@ -59,9 +153,10 @@ class OperatorFactory:
 
     def _homographies(self, place: Place) -> NDArray[np.float64]:
         """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""
-        rt_ref_plane = (
-            np.array(place.rt_ref_plane) if isinstance(place, TiltedPlane) else fronto_parallel_rt_ref_plane(place)
-        )
+        if isinstance(place, TiltedPlane):
+            rt_ref_plane = np.array(place.rt_ref_plane)
+        else:
+            rt_ref_plane = fronto_parallel_rt_ref_plane(place)
         homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
         return np.repeat(homographies, self._phases, axis=0)
 
@@ -70,12 +165,6 @@ class OperatorFactory:
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
         return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
-
-
-def _cropped_rays(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
-    """Return the rays of a lattice (row, column, 2); an incomplete period at the far edges is left out."""
-    rays = loaded.lens.rays(lattice.first, lattice.step)
-    return rays[: lattice.shape[0], : lattice.shape[1]].astype(np.float32)
 
 
 def _response(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""A set at a glance, beside its reconstruction: all views small, one view large, and how dark it is."""
+"""A set at a glance: how dark it is, where its objects are, and its views as pictures."""
 
 from pathlib import Path
 from typing import Any
@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import Picture, contact_sheet, grey_levels, white_level, write_png
+from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, white_level, write_png
 from faintfield.pipelines.formats.results.records import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.brightness import brightness_within
-from faintfield.pipelines.reconstruction.object_region import Region, bright_electrons, object_region
+from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
+
+# Mask of the objects in the reference view, beside a set's images if it is known.
+OBJECT_REGION = "object_region.png"
 
 INTEGRAL_IMAGE = "integral_image.png"
 REFERENCE_VIEW = "reference_view.png"
@@ -27,31 +30,130 @@ _SHEET_WIDTH_PX = 1260
 # Visible on white, grey and black.
 _OUTLINE_RGB = (240, 120, 0)
 
+type Region = NDArray[np.bool_]
+
+
+def object_region(loaded: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
+    """Return the object region (row, column) of the reference view, None if it is not known, and its name.
+
+    Parameters
+    ----------
+    loaded : ElementalSet
+        The set.
+    path : Path, optional
+        Mask to use instead of the set's own.
+    """
+    path = path or loaded.folder / OBJECT_REGION
+    if path.is_file():
+        return read_frame(path).pixels_dn > 127, "object region"
+    light_e = bright_electrons(loaded)
+    region = None if light_e is None else segmented(light_e, ~loaded.unusable)
+    return (None, "whole view") if region is None else (region, "object region of the bright view")
+
+
+def bright_electrons(loaded: ElementalSet) -> NDArray[np.float32] | None:
+    """Return the electrons of the reference view in plenty of light (row, column), above dark; None if there is none.
+
+    A colour camera gives the mean of the colours around each pixel, enough to tell where objects are.
+    """
+    if loaded.bright_view is None:
+        return None
+    path, exposure_s = loaded.bright_view
+    frame = read_frame(path)
+    pixels = frame.pixels_dn if frame.pixels_dn.ndim == 2 else frame.pixels_dn.mean(axis=2)
+    light_e = loaded.noise.electrons(pixels) - np.asarray(loaded.noise.background_e(exposure_s), np.float32)
+    mosaic = loaded.settings.camera.mosaic or frame.mosaic
+    return np.asarray(light_e if mosaic is None else cv2.blur(light_e, (len(mosaic[0]), len(mosaic))), np.float32)
+
+
+def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
+    """Return the object region (row, column): above Li's threshold; None if the brightness is uniform.
+
+    Li's threshold minimises the cross entropy between an image and its two levels, which weights a difference relative
+    to the brightness, as suits photon counts. Otsu's weights its square, and misses the darker parts of objects.
+    """
+    from skimage.filters import threshold_li  # loading it takes a while
+
+    level = light_e[usable]
+    if not level.size or not np.ptp(level):
+        return None
+    region: Region = (light_e > threshold_li(level)) & usable
+    return region if region.any() else None
+
+
+def brightness(loaded: ElementalSet, region_path: Path | None = None) -> Brightness:
+    """Measure the reference view of a set, all colours together; over the set's own object region by default."""
+    return brightness_within(loaded, *object_region(loaded, region_path))
+
+
+def brightness_within(loaded: ElementalSet, region: Region | None, name: str) -> Brightness:
+    """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
+    has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
+    signal, reference = [], []
+    for layout in channel_layouts(loaded):
+        images = view_electrons(loaded, layout, loaded.frame_paths(loaded.reference_view))
+        no_light = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
+        for index, lattice in enumerate(layout.lattices):
+            where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
+            signal.append(images[index][0][where])
+            if has_reference:
+                reference.append(no_light[index][0].ravel())
+            else:
+                noise = lattice_noise(loaded, lattice, None)
+                dark_e = loaded.background_e(noise)
+                power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
+                reference.append(np.sqrt(power).ravel())
+    noise_from = "noise reference" if has_reference else "noise model"
+    return _figures(loaded, name, noise_from, np.concatenate(signal), np.concatenate(reference))
+
+
+def _figures(
+    loaded: ElementalSet, region: str, noise_from: str, signal_e: NDArray[Any], reference_e: NDArray[Any]
+) -> Brightness:
+    """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
+    noise = loaded.noise
+    read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
+    snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
+    dark_e = float(np.mean(loaded.background_e(noise)))
+    linear_e = moments_e = None
+    if snr and snr > 0:
+        # With a quantum efficiency of 1 the formulas for photons give electrons
+        counting = {"quantum_efficiency": 1.0, "read_noise_e": read_noise_e}
+        linear_e = photons_from_linear_snr(snr, **counting)
+        moments_e = photons_from_moments(snr, dark_e=dark_e, **counting)
+    efficiency = noise.quantum_efficiency
+    return Brightness(
+        region=region,
+        noise_from=noise_from,
+        snr=snr,
+        electrons_linear=linear_e,
+        electrons_from_moments=moments_e,
+        mean_signal_e=float(np.mean(signal_e, dtype=np.float64)) - dark_e,
+        photons_linear=linear_e / efficiency if efficiency and linear_e else None,
+        photons_from_moments=moments_e / efficiency if efficiency and moments_e else None,
+    )
+
 
 def write_overview(loaded: ElementalSet, out: Path) -> None:
     """Write the pictures of a set and `overview.json` into `out`; all views share one grey scale."""
     reference = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
     black, white = grey_scale_dn(reference)
-    columns = _columns(loaded)
+    grid = _grid(loaded)
+    columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
-    small = [_as_seen(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
+    small = [grey_levels(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
     write_png(out / INTEGRAL_IMAGE, contact_sheet(small, columns))
-    write_png(out / REFERENCE_VIEW, _as_seen(reference, white, black))
+    write_png(out / REFERENCE_VIEW, grey_levels(reference, white, black))
     if loaded.noise_reference:
         no_light = read_frame(loaded.noise_reference[0]).pixels_dn
-        write_png(out / NOISE_REFERENCE_VIEW, _as_seen(no_light, white, black))
+        write_png(out / NOISE_REFERENCE_VIEW, grey_levels(no_light, white, black))
     region, name = object_region(loaded)
     _write_bright_view(loaded, region, out)
-    write_json(out / OVERVIEW_FILE, _overview(loaded, (black, white), brightness_within(loaded, region, name)))
-
-
-def _overview(loaded: ElementalSet, grey_scale_dn: tuple[float, float], brightness: Brightness) -> Overview:
-    """Return what overview.json records of a set."""
     noise, exposure_s = loaded.noise, loaded.settings.exposure_s
-    return Overview(
+    record = Overview(
         set=loaded.folder.resolve().name,
         views=len(loaded.settings.view),
-        grid=_grid(loaded),
+        grid=grid,
         poses=loaded.poses,
         size_px=loaded.settings.camera.size_px,
         exposure_s=exposure_s,
@@ -60,9 +162,10 @@ def _overview(loaded: ElementalSet, grey_scale_dn: tuple[float, float], brightne
         has_noise_reference=bool(loaded.noise_reference),
         quantum_efficiency=noise.quantum_efficiency,
         dark_e=float(np.mean(noise.background_e(exposure_s))),
-        grey_scale_dn=grey_scale_dn,
-        brightness=brightness,
+        grey_scale_dn=(black, white),
+        brightness=brightness_within(loaded, region, name),
     )
+    write_json(out / OVERVIEW_FILE, record)
 
 
 def _write_bright_view(loaded: ElementalSet, region: Region | None, out: Path) -> None:
@@ -89,17 +192,6 @@ def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
     """Return a frame reduced to about a width by leaving pixels out: averaging would reduce the noise."""
     step = max(round(pixels.shape[1] / width_px), 1)
     return pixels[step // 2 :: step, step // 2 :: step]
-
-
-def _as_seen(pixels_dn: NDArray[Any], white: float, black: float) -> Picture:
-    """Return a frame as 8-bit levels."""
-    return grey_levels(pixels_dn, white=white, black=black)
-
-
-def _columns(loaded: ElementalSet) -> int:
-    """Return the number of views in a row of the sheet: the columns of the grid if the nodes are stated."""
-    grid = _grid(loaded)
-    return int(np.ceil(np.sqrt(len(loaded.settings.view)))) if grid is None else grid[1]
 
 
 def _grid(loaded: ElementalSet) -> tuple[int, int] | None:

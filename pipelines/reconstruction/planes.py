@@ -183,15 +183,11 @@ def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
     )
     planes = posed.operator.planes_of(iterate.plane)
     solutions = [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
-    if not settings.uncertainty:
-        return solutions
-    generator = np.random.default_rng(_SEED)
-    metrics = posed.fit(level_e).metric_of_each(iterate.plane)
-    sigmas = [
-        standard_deviation(p, metric, choice.weight, penalty, generator)
-        for p, metric in zip(planes, metrics, strict=True)
-    ]
-    return [replace(one, sidecars={"sigma": sigma}) for one, sigma in zip(solutions, sigmas, strict=True)]
+    if settings.uncertainty:
+        generator = np.random.default_rng(_SEED)
+        for one, metric in zip(solutions, posed.fit(level_e).metric_of_each(iterate.plane), strict=True):
+            one.sidecars["sigma"] = standard_deviation(one.plane, metric, choice.weight, penalty, generator)
+    return solutions
 
 
 def _certificate(iterate: PmlemIterate) -> Certificate:

@@ -1,12 +1,16 @@
 """What `reconstruct` is asked for: its options select planes, are checked, and are resolved for a set."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, read_plane_poses
+from faintfield.pipelines.formats.results.plane_files import plane_name
 from faintfield.pipelines.formats.results.records import (
     JOINT_METHODS,
     BestFocusRecord,
@@ -16,16 +20,46 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.autofocus import best_focus
-from faintfield.pipelines.reconstruction.depth_map import check_sweep
-from faintfield.pipelines.reconstruction.depths import (
-    depths_by_disparity,
-    distinct_depths,
-    swept_depths,
-    swept_disparities,
-)
+from faintfield.pipelines.reconstruction.operators import check_in_front
 from faintfield.pipelines.reconstruction.planes import Settings
 
 DEFAULT_METHOD: Method = "pmlem"
+
+# Largest sweep: more planes are a typing error, and would fill any disk.
+_MAX_PLANES = 10_000
+
+# Fewer depths leave nothing to interpolate between.
+_MIN_DEPTHS_OF_A_MAP = 5
+
+
+def distinct_depths(depths: list[float]) -> list[float]:
+    """Return each depth once; refuse those behind the camera, and two different ones that would share a file name."""
+    by_name: dict[str, float] = {}
+    for depth in depths:
+        check_in_front(depth)
+        other = by_name.setdefault(plane_name(depth), depth)
+        if other != depth:
+            raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
+    return list(by_name.values())
+
+
+def swept_depths(sweep_mm: str) -> list[float]:
+    """Return the depths of FIRST:LAST:COUNT."""
+    depths = _swept("--sweep-mm", sweep_mm, "400:900:64")
+    if min(depths) <= 0:
+        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths")
+    return depths
+
+
+def _swept(option: str, given: str, example: str) -> list[float]:
+    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
+    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", given)
+    if parts is None:
+        raise WrongUsage(f"{option} {given}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
+    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
+    if first == last or not 2 <= count <= _MAX_PLANES:
+        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
+    return [round(float(value), 6) for value in np.linspace(first, last, count)]
 
 
 @dataclass(frozen=True)
@@ -93,7 +127,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Selection:
-    """Planes as the options select them, before the set is known.
+    """Planes as the options select them, and how to reconstruct them, before the set is known.
 
     Attributes
     ----------
@@ -107,6 +141,8 @@ class Selection:
         Search for the depths, within a sweep's range if there is one.
     depth_map : bool
         Make a depth map of the sweep.
+    methods, settings, pitch_mm : list of Method, Settings, float, optional
+        As in `Request`.
     """
 
     depths_mm: list[float]
@@ -116,6 +152,9 @@ class Selection:
     tilted: list[TiltedPlane]
     auto: bool
     depth_map: bool
+    methods: list[Method]
+    settings: Settings
+    pitch_mm: float | None
 
 
 def select_planes(
@@ -126,13 +165,16 @@ def select_planes(
     plane_pose: Sequence[Path],
     *,
     depth_map: bool,
+    methods: list[Method],
+    settings: Settings,
+    pitch_mm: float | None,
 ) -> Selection:
     """Return the planes that the options of `reconstruct` select.
 
     Raises
     ------
     WrongUsage, InputError
-        They select none, contradict one another, or name a file that cannot be read.
+        They select none, contradict one another, would have no effect, or name a file that cannot be read.
     """
     if not (depth_mm or sweep_mm or disparity_px or sweep_px or plane_pose):
         raise WrongUsage(
@@ -143,15 +185,20 @@ def select_planes(
         raise WrongUsage(
             "--depth-map compares depths of a sweep, and --depth-mm auto leaves few; give --sweep-mm alone"
         )
-    return Selection(
+    selection = Selection(
         depths_mm=[depth for depth in depth_mm if depth != "auto"],
         swept_mm=swept_depths(sweep_mm) if sweep_mm else [],
         disparities_px=list(disparity_px),
-        swept_px=swept_disparities(sweep_px) if sweep_px else [],
+        swept_px=_swept("--sweep-px", sweep_px, "-3.5:0.8:40") if sweep_px else [],
         tilted=read_plane_poses(plane_pose),
         auto="auto" in depth_mm,
         depth_map=depth_map,
+        methods=methods,
+        settings=settings,
+        pitch_mm=pitch_mm,
     )
+    _check_methods(selection, methods, settings)
+    return selection
 
 
 def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> list[Method]:
@@ -160,10 +207,12 @@ def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> li
     return [*given, *(name for name, wanted in by_option.items() if wanted)] or [DEFAULT_METHOD]
 
 
-def check_options(selection: Selection, methods: list[Method], settings: Settings) -> None:
+def _check_methods(selection: Selection, methods: list[Method], settings: Settings) -> None:
     """Refuse options that contradict one another or would have no effect (WrongUsage)."""
     if selection.tilted and "occlusion" in methods:
-        raise WrongUsage("occlusion asks which plane is nearer, which planes of any pose do not say; use joint")
+        raise WrongUsage(
+            "occlusion needs to know which plane is nearer, which is undefined for planes given by a pose; use joint"
+        )
     if settings.likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
     if (settings.uncertainty or settings.penalty != "tv") and not {"pmlem", *JOINT_METHODS} & set(methods):
@@ -171,15 +220,7 @@ def check_options(selection: Selection, methods: list[Method], settings: Setting
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
 
 
-def resolve(
-    selection: Selection,
-    loaded: ElementalSet,
-    out: Path,
-    *,
-    methods: list[Method],
-    settings: Settings,
-    pitch_mm: float | None = None,
-) -> Request:
+def resolve(selection: Selection, loaded: ElementalSet, out: Path) -> Request:
     """Return the request for a set: disparities become depths, and `auto` the depths that are found.
 
     `out` is for a temporary file while depths are searched.
@@ -189,33 +230,33 @@ def resolve(
     WrongUsage, BadValue, NothingInFocus
         The depths do not suit the options, a disparity has no depth, or the search finds none.
     """
-    swept_of_px = depths_by_disparity(loaded, selection.swept_px)
-    of_disparity = depths_by_disparity(loaded, selection.disparities_px) | swept_of_px
+    disparities_px = [*selection.disparities_px, *selection.swept_px]
+    of_disparity = {loaded.depth_of_disparity(disparity_px): disparity_px for disparity_px in disparities_px}
     depths = [*selection.depths_mm, *selection.swept_mm, *of_disparity]
     found = None
     if selection.auto:
-        found = _found(selection, loaded, out, [*selection.swept_mm, *swept_of_px])
+        if selection.depths_mm or selection.disparities_px:
+            raise WrongUsage(
+                "--depth-mm auto finds all depths; give others in a call of their own, with the same --out"
+            )
+        found = best_focus(loaded, out, (min(depths), max(depths)) if depths else None)
         depths, of_disparity = found.depth_mm, {}
-    if selection.depth_map:
-        check_sweep(distinct_depths(depths))
+    if selection.depth_map and (count := len(distinct_depths(depths))) < _MIN_DEPTHS_OF_A_MAP:
+        raise WrongUsage(
+            f"--depth-map compares depths, and {count} are given; give at least {_MIN_DEPTHS_OF_A_MAP}, by --sweep-mm "
+            "or --sweep-px"
+        )
     return Request(
         depths,
-        methods,
-        settings,
-        pitch_mm,
+        selection.methods,
+        selection.settings,
+        selection.pitch_mm,
         with_focus=bool(selection.swept_mm or selection.swept_px) and found is None,
         with_depth_map=selection.depth_map,
         disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
         tilted=selection.tilted,
         found=found,
     )
-
-
-def _found(selection: Selection, loaded: ElementalSet, out: Path, swept_mm: list[float]) -> BestFocusRecord:
-    """Return the planes of best focus, within the range of a sweep if there is one."""
-    if selection.depths_mm or selection.disparities_px:
-        raise WrongUsage("--depth-mm auto finds all depths; give others in a call of their own, with the same --out")
-    return best_focus(loaded, out, (min(swept_mm), max(swept_mm)) if swept_mm else None)
 
 
 def folder_of_method(out: Path, method: Method, methods: Sequence[Method]) -> Path:

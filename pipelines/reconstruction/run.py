@@ -15,7 +15,6 @@ from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
 from faintfield.pipelines.formats.results.records import (
-    JOINT_METHODS,
     METRICS_FILE,
     RECONSTRUCTION_FILE,
     REPORT_FILE,
@@ -32,10 +31,9 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
 from faintfield.pipelines.reconstruction.depth_map import write_depth_map
-from faintfield.pipelines.reconstruction.depths import distinct_depths
-from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid, tilted_grid
+from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import write_overview
-from faintfield.pipelines.reconstruction.request import Request, folder_of_method
+from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
 from faintfield.pipelines.reconstruction.sweep import Runner, Sweep, run_serially
 from faintfield.recon.operator.grid import PlaneGrid
 
@@ -79,12 +77,11 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     focus, records = sweep.focus(), sweep.records
     for name, folder in folders.items():
         result = ReconstructionRecord(
-            1,
-            [record for record in records if record.method == name],
-            focus,
-            request.found,
-            depth_map,
-            time.monotonic() - started,
+            planes=[record for record in records if record.method == name],
+            focus=focus,
+            best_focus=request.found,
+            depth_map=depth_map,
+            wall_time_s=time.monotonic() - started,
             **msgspec.structs.asdict(sweep.origins[name]),
         )
         write_json(folder / RECONSTRUCTION_FILE, result)
@@ -130,48 +127,30 @@ def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) 
             options = request.of_plane(name, place).options(name, loaded.poses)
             origin = msgspec.structs.replace(all_planes[name], options=options)
             files.append(PlaneFiles(folder, name, place, channels, origin))
-    return Sweep(loaded, grids, files, all_planes, request.settings, with_focus=request.with_focus)
+    return Sweep(loaded, layouts, grids, files, all_planes, request.settings, request.with_focus)
 
 
 def _warn(records: list[PlaneRecord]) -> None:
-    """Inform the user of planes that may be wrong."""
-    for message in (_unsettled(records), _not_converged(records), _black(records)):
-        if message:
-            inform(message)
-
-
-def _unsettled(records: list[PlaneRecord]) -> str | None:
-    """Return a message on planes whose one-step-late iteration oscillates."""
+    """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
     certificates = [one.certificate for one in records if one.certificate and one.certificate.oscillates is not UNSET]
     swings = [one.relative_change for one in certificates if one.oscillates and one.relative_change is not UNSET]
-    if not swings:
-        return None
-    return (
-        f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
-        f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
-        "--penalty-weight calms it, and leaves more noise."
-    )
-
-
-def _not_converged(records: list[PlaneRecord]) -> str | None:
-    """Return a message on planes whose certificate is above the tolerance."""
-    certificates = [one.certificate for one in records if one.certificate and one.method in ("pmlem", *JOINT_METHODS)]
+    if swings:
+        inform(
+            f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
+            f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
+            "--penalty-weight calms it, and leaves more noise."
+        )
+    certificates = [one.certificate for one in records if one.certificate and one.certificate.is_bound]
     missed = [one.value for one in certificates if not one.reached and one.value is not UNSET]
-    if not missed:
-        return None
-    return (
-        f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
-        f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
-    )
-
-
-def _black(records: list[PlaneRecord]) -> str | None:
-    """Return a message on planes without light, which are right only if there is none."""
+    if missed:
+        inform(
+            f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
+            f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
+        )
     black = [record for record in records if record.mean_e <= _BLACK_E]
-    if not black:
-        return None
-    return (
-        f"{len(black)} of {len(records)} planes are black ({black[0].method}, {black[0].depth_mm:g} mm for "
-        "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
-        "with dark frames of the same exposure"
-    )
+    if black:
+        inform(
+            f"{len(black)} of {len(records)} planes are black ({black[0].method}, {black[0].depth_mm:g} mm for "
+            "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
+            "with dark frames of the same exposure"
+        )

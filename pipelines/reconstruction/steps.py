@@ -3,14 +3,13 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile
-from faintfield.pipelines.formats.hashes import Hashes
-from faintfield.pipelines.formats.provenance import Provenance, first_difference, provenance
+from faintfield.pipelines.formats.files import Hashes
+from faintfield.pipelines.formats.provenance import first_difference, provenance
 from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.rig.session.session import taken_frames
@@ -24,24 +23,24 @@ class Step:
     ----------
     name : str
         Name of the command that does it alone.
+    results : dict of str to mapping or msgspec.Struct
+        The options of each result file, if it is up to date; None if it is enough that the file exists.
+    make : callable
+        Does it.
     needs : tuple of str
         Names of the steps whose results it reads.
     inputs : callable
         Returns the names of all files that it reads.
-    results : dict of str to mapping or msgspec.Struct
-        The options of each result file, if it is up to date; None if it is enough that the file exists.
     sidecars : callable
         Takes a result file's content; returns the names of the files that belong to it, in the same folder.
-    make : callable
-        Does it.
     """
 
     name: str
-    needs: tuple[str, ...]
-    inputs: Callable[[], Sequence[str]]
     results: Mapping[str, object | None]
-    sidecars: Callable[[bytes], Sequence[str]]
     make: Callable[[], object]
+    needs: tuple[str, ...] = ()
+    inputs: Callable[[], Sequence[str]] = tuple
+    sidecars: Callable[[bytes], Sequence[str]] = lambda _: ()
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
@@ -76,7 +75,7 @@ def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
     for step in steps:
         if missing := [name for name in step.needs if name in failed]:
             failed[step.name] = failed[missing[0]]
-            inform(f"{step.name}: left as it is, for it needs {missing[0]}")
+            inform(f"{step.name}: skipped, because it needs {missing[0]}")
             continue
         try:
             reason = _out_of_date(session, step, hashes)
@@ -119,12 +118,12 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         inputs[name] = hashes.of(name)
     for file, options in step.results.items():
         if not (session / file).is_file():
-            return f"{file} is not there yet"
+            return f"{file} does not exist yet"
         if options is None:
             continue
         try:
             content = (session / file).read_bytes()
-            if difference := first_difference(_provenance_in(content), provenance(step.name, options, inputs)):
+            if difference := first_difference(content, provenance(step.name, options, inputs)):
                 return f"{file} was made with another {difference}"
             sidecars = [(session / file).parent / name for name in step.sidecars(content)]
         except (msgspec.MsgspecError, UnicodeDecodeError, LookupError, TypeError):
@@ -132,15 +131,3 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         if missing := [path for path in sidecars if not path.is_file()]:
             return f"{missing[0].relative_to(session)} is missing"
     return None
-
-
-class _Holder(msgspec.Struct):
-    """A result whose provenance is under a key of its own."""
-
-    provenance: Provenance[dict[str, Any]] | None = None
-
-
-def _provenance_in(content: bytes) -> Provenance[dict[str, Any]]:
-    """Return the provenance of a result file: under a key of its own, or among its other keys."""
-    own = msgspec.json.decode(content, type=_Holder).provenance
-    return own or msgspec.json.decode(content, type=Provenance[dict[str, Any]])

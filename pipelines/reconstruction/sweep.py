@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from faintfield.pipelines.formats.results.records import (
     PlaneRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.joint import solve_together
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.planes import Settings, Solution, solve
@@ -80,7 +80,10 @@ class Channel:
         messages: list[str] = []
         focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
         for place, grid in task.grids.items():
-            operator = self._operator(place, grid)
+            try:
+                operator = self._factory.at(place, grid)
+            except GeometryMismatch as failure:
+                raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
             messages += self._blind_views(operator, place)
             if task.with_focus:
                 focus[place] = FocusPoint(*focus_measure(operator, self._images, self._halves()))
@@ -94,16 +97,12 @@ class Channel:
                 self._save(task, files, solved[files.method][files.place], focus[files.place])
         return messages
 
-    def _operator(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
-        try:
-            return self._factory.at(place, grid)
-        except GeometryMismatch as failure:
-            raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
-
     def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
         """Save one plane of this colour with its record."""
         place, grid = files.place, task.grids[files.place]
         tilted = place if isinstance(place, TiltedPlane) else None
+        px_per_sample = grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)  # on the axis
+        cosine = abs(float(tilted.normal[2])) if tilted else 1.0
         record = PlaneRecord(
             name=tilted.name if tilted else UNSET,
             depth_mm=depth_of(place),
@@ -115,14 +114,9 @@ class Channel:
             pitch_mm=grid.pitch_mm,
             origin_mm=grid.origin_mm,
             **structs.asdict(solution.record),
-            flux_e=float(solution.plane.sum(dtype=np.float64)) * self._samples_per_px(place, grid),
+            flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
         )
         files.save_part(task.layout.name, {"plane": solution.plane, **solution.sidecars}, record, focus)
-
-    def _samples_per_px(self, place: Place, grid: PlaneGrid) -> float:
-        """Return how many pixels of the reference view a sample covers, on the axis."""
-        cosine = abs(place.normal[2]) if isinstance(place, TiltedPlane) else 1.0
-        return float((grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)) ** 2 * cosine)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
@@ -158,13 +152,16 @@ def run_serially(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) ->
         yield task, channel.do(task)
 
 
+@dataclass(frozen=True)
 class Sweep:
     """The planes of one call: those missing are made, and each is written as soon as all its colours are there.
 
-    Parameters
+    Attributes
     ----------
     loaded : ElementalSet
         The set.
+    layouts : list of ChannelLayout
+        Its colours.
     grids : dict of Place to PlaneGrid
         The samples of each plane.
     files : sequence of PlaneFiles
@@ -175,43 +172,37 @@ class Sweep:
         Settings of the methods.
     with_focus : bool
         Make a curve of focus against depth.
+    finished : dict of (Method, Place) to PlaneFileRecord
+        The planes that are there.
     """
 
-    def __init__(
-        self,
-        loaded: ElementalSet,
-        grids: dict[Place, PlaneGrid],
-        files: Sequence[PlaneFiles],
-        origins: dict[Method, Origin],
-        settings: Settings,
-        *,
-        with_focus: bool,
-    ) -> None:
-        self._loaded = loaded
-        self._layouts = channel_layouts(loaded)
-        self._grids = grids
-        self._files = files
-        self.origins = origins
-        self._settings = settings
-        self._with_focus = with_focus
-        self._finished: dict[tuple[Method, Place], PlaneFileRecord] = {}
+    loaded: ElementalSet
+    layouts: list[ChannelLayout]
+    grids: dict[Place, PlaneGrid]
+    files: Sequence[PlaneFiles]
+    origins: dict[Method, Origin]
+    settings: Settings
+    with_focus: bool
+    finished: dict[tuple[Method, Place], PlaneFileRecord] = field(default_factory=dict)
 
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
-        samples = sum(grid.shape[0] * grid.shape[1] for grid in self._grids.values()) * len(self._layouts)
-        files = len(self.origins) * (2 if self._settings.uncertainty else 1) + ("occlusion" in self.origins)
+        samples = sum(grid.shape[0] * grid.shape[1] for grid in self.grids.values()) * len(self.layouts)
+        files = len(self.origins) * (2 if self.settings.uncertainty else 1) + ("occlusion" in self.origins)
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, runner: Runner, out: Path) -> None:
         """Run the missing tasks, and write each plane at once."""
-        for files in self._files:
+        for files in self.files:
             if record := files.finished():
-                self._finished[files.method, files.place] = record
-        if self._finished:
-            inform(f"{len(self._finished)} of {len(self._files)} planes are there, made of the same; they stay")
+                self.finished[files.method, files.place] = record
+        if self.finished:
+            inform(
+                f"{len(self.finished)} of {len(self.files)} planes are there, made from the same inputs; they are kept"
+            )
         tasks = self._tasks()
-        self._write_complete(self._files)
-        with closing(runner(self._loaded, out, tasks)) as done:
+        self._write_complete(self.files)
+        with closing(runner(self.loaded, out, tasks)) as done:
             for task, messages in progress(done, "reconstructing planes", len(tasks)):
                 for message in messages:
                     inform(message)
@@ -219,34 +210,34 @@ class Sweep:
 
     def _tasks(self) -> list[PlaneTask]:
         """Return the missing tasks, one channel after the other."""
-        wanted = [files for files in self._files if (files.method, files.place) not in self._finished]
+        wanted = [files for files in self.files if (files.method, files.place) not in self.finished]
         missing = [files.missing() for files in wanted]
         tasks = []
-        for layout in self._layouts:
+        for layout in self.layouts:
             left = [files for files, channels in zip(wanted, missing, strict=True) if layout.name in channels]
             single = [files for files in left if files.method not in JOINT_METHODS]
-            for place, grid in self._grids.items():
+            for place, grid in self.grids.items():
                 of_plane = tuple(files for files in single if files.place == place)
-                tasks.append(PlaneTask(layout, {place: grid}, of_plane, self._settings, self._with_focus))
+                tasks.append(PlaneTask(layout, {place: grid}, of_plane, self.settings, self.with_focus))
             joint = tuple(files for files in left if files.method in JOINT_METHODS)
-            tasks.append(PlaneTask(layout, self._grids, joint, self._settings, self._with_focus))
+            tasks.append(PlaneTask(layout, self.grids, joint, self.settings, self.with_focus))
         return [task for task in tasks if task.files]
 
     def _write_complete(self, candidates: Sequence[PlaneFiles]) -> None:
         """Write the planes whose colours are complete."""
         for files in candidates:
             key = (files.method, files.place)
-            if key not in self._finished and not files.missing():
-                self._finished[key] = files.finish(self._grids[files.place].pitch_mm)
+            if key not in self.finished and not files.missing():
+                self.finished[key] = files.finish(self.grids[files.place].pitch_mm)
 
     @property
     def records(self) -> list[PlaneRecord]:
         """The records of all planes: by channel, plane, method."""
-        methods = list(dict.fromkeys(files.method for files in self._files))
+        methods = list(dict.fromkeys(files.method for files in self.files))
         return [
-            self._finished[method, place].planes[index]
-            for index in range(len(self._layouts))
-            for place in self._grids
+            self.finished[method, place].planes[index]
+            for index in range(len(self.layouts))
+            for place in self.grids
             for method in methods
         ]
 
@@ -254,16 +245,16 @@ class Sweep:
     def written(self) -> dict[tuple[Method, float], Path]:
         """The files of the planes of constant depth."""
         return {
-            (files.method, files.place): files.path for files in self._files if not isinstance(files.place, TiltedPlane)
+            (files.method, files.place): files.path for files in self.files if not isinstance(files.place, TiltedPlane)
         }
 
     def focus(self) -> FocusCurve | None:
         """Return the focus curve of a sweep and the depths of its peaks, None if not asked for."""
-        if not self._with_focus:
+        if not self.with_focus:
             return None
-        method = self._files[0].method
-        depths = [place for place in self._grids if not isinstance(place, TiltedPlane)]
-        curve = [_sum(self._finished[method, depth].focus) for depth in depths]
+        method = self.files[0].method
+        depths = [place for place in self.grids if not isinstance(place, TiltedPlane)]
+        curve = [_sum(self.finished[method, depth].focus) for depth in depths]
         return FocusCurve(
             depth_mm=depths,
             detail_e2=[point.detail_e2 for point in curve],

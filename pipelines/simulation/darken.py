@@ -15,9 +15,8 @@ from faintfield.pipelines.formats.image_files import mask_picture, write_plane, 
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
-from faintfield.pipelines.reconstruction.brightness import brightness
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
-from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
+from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
 from faintfield.pipelines.simulation.synthetic_set import stated_noise, write_exposures
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
 from faintfield.rig.simulation.optics import SimulatedSensor

@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
-from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION
+from faintfield.pipelines.reconstruction.overview import OBJECT_REGION
 from faintfield.recon.metrics import (
     expected_snr_from_powers,
     photons_from_linear_snr,

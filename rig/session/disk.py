@@ -1,7 +1,6 @@
 """Write the files of a session whole or not at all, never overwrite or delete one, and lock the session's folder."""
 
 import fcntl
-import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ import tifffile
 
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionBusy, SessionUnwritable
+from faintfield.rig.session.durable import sync_folder
 
 PART = ".part"
 
@@ -54,21 +54,6 @@ def set_aside(path: Path, folder: Path) -> Path:
         sync_folder(folder)
         sync_folder(path.parent)
     return target
-
-
-def sync_folder(folder: Path) -> None:
-    """Flush the entries of a folder, so that a rename survives a power cut."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def encode_exposure(exposure: Exposure) -> bytes | memoryview:

@@ -10,7 +10,8 @@ from msgspec import Struct
 
 from faintfield.rig.errors import PlanRefused, SessionCorrupt
 from faintfield.rig.plan import PlannedFrame, planned_frames
-from faintfield.rig.session.disk import PART, lock_session, set_aside, sha256, sync_folder, translate_errors, write_new
+from faintfield.rig.session.disk import PART, lock_session, set_aside, translate_errors, write_new
+from faintfield.rig.session.durable import sha256, sync_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal, Sealed, Suspect
 from faintfield.rig.session.session import (
     ASIDE,

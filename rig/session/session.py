@@ -11,7 +11,8 @@ from msgspec import Struct
 from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
-from faintfield.rig.session.disk import encode_exposure, sha256, write_new
+from faintfield.rig.session.disk import encode_exposure, write_new
+from faintfield.rig.session.durable import sha256
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
 from faintfield.rig.settings import RigSettings
 

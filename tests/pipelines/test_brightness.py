@@ -11,7 +11,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.brightness import brightness
+from faintfield.pipelines.reconstruction.overview import brightness
 
 type SetMaker = Callable[..., Path]
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import BadValue, InputError, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.grids import default_pitch_px, plane_grid
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, default_pitch_px, plane_grid
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.solver.initialization import back_projection

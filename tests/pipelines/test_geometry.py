@@ -32,9 +32,8 @@ from faintfield.pipelines.formats.results.geometry import (
     read_geometry,
 )
 from faintfield.pipelines.formats.sets.board_set import load_board_set
-from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
-from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.simulated_boards import simulate_board_set
 

@@ -79,7 +79,7 @@ def test_a_result_that_is_read_and_written_again_is_the_same_byte_for_byte(
 
 
 def test_every_golden_file_has_a_kind_here_or_in_a_test_of_its_own() -> None:
-    others = {"noise.json", "geometry.json"}
+    others = {"noise.json", "noise_of_a_mosaic.json", "geometry.json"}
     assert {path.name for path in GOLDEN.iterdir()} - others == {path.name for path, _ in _kinds_of_files()}
 
 

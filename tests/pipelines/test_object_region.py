@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.image_files import mask_picture, write_png
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.brightness import brightness
-from faintfield.pipelines.reconstruction.object_region import OBJECT_REGION, object_region, segmented
+from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness, object_region, segmented
 
 type SetMaker = Callable[..., Path]
 

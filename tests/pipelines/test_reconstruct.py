@@ -16,8 +16,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.grids import plane_grid
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.solver.penalties import total_variation
 
 type Command = Callable[..., CompletedProcess[str]]

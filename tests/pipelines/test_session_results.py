@@ -170,7 +170,7 @@ class TestRun:
         with pytest.raises(MissingFile, match=r"run `faintfield run .*still to be done: geometry, reconstruct, report"):
             self.ran(session)
         assert (session / "noise.json").is_file()
-        assert "reconstruct: left as it is, for it needs geometry" in capsys.readouterr().err
+        assert "reconstruct: skipped, because it needs geometry" in capsys.readouterr().err
         for path, content in frames.items():
             path.write_bytes(content)
         assert self.ran(session) == ["geometry", "reconstruct"]

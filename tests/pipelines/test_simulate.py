@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.reconstruction.brightness import brightness
+from faintfield.pipelines.reconstruction.overview import brightness
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import render

@@ -14,7 +14,7 @@ from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import remove, sha256, write_json, writing
 from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
-from faintfield.pipelines.formats.provenance import AnyProvenance, Provenance, first_difference
+from faintfield.pipelines.formats.provenance import Provenance, first_difference
 from faintfield.pipelines.formats.results.records import (
     DepthMapFileRecord,
     FocusPoint,
@@ -38,17 +38,11 @@ def plane_name(place: Place) -> str:
     return f"plane_{place.name}" if isinstance(place, TiltedPlane) else f"plane_{place:07.1f}"
 
 
-class _Entry(msgspec.Struct, frozen=True):
-    """What one colour adds to the plane's record."""
+class _Part(Provenance[ReconstructionOptions], frozen=True):
+    """What is stored with the arrays of one colour: what it adds to the plane's record."""
 
     record: PlaneRecord
     focus: FocusPoint | None
-
-
-class _Part(Provenance[ReconstructionOptions], frozen=True):
-    """What is stored with the arrays of one colour."""
-
-    entry: _Entry
 
 
 @dataclass(frozen=True)
@@ -80,10 +74,6 @@ class PlaneFiles:
         """Path of the plane itself."""
         return self.folder / f"{plane_name(self.place)}.tiff"
 
-    def sidecar_path(self, name: str) -> Path:
-        """Return the path of the standard deviation or the opacity of each sample."""
-        return self.folder / f"{plane_name(self.place)}_{name}.tiff"
-
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
         return read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
@@ -106,7 +96,7 @@ class PlaneFiles:
         record, focus : PlaneRecord, FocusPoint
             What this colour adds to the plane's record.
         """
-        part = _Part(_Entry(record, focus), **msgspec.structs.asdict(self.origin))
+        part = _Part(record, focus, **msgspec.structs.asdict(self.origin))
         content = np.frombuffer(msgspec.json.encode(part), np.uint8)
         with writing(self._part(channel)) as file:
             np.savez(file, allow_pickle=False, content=content, **arrays)
@@ -117,7 +107,7 @@ class PlaneFiles:
         for channel in self.channels:
             with np.load(self._part(channel), allow_pickle=False) as part:
                 parts.append(dict(part))
-        entries = [msgspec.json.decode(part["content"].tobytes(), type=_Part).entry for part in parts]
+        entries = [msgspec.json.decode(part["content"].tobytes(), type=_Part) for part in parts]
         plane = _joined(parts, "plane")
         write_plane(self.path, plane, pitch_mm)
         preview = self.path.with_suffix(".png")
@@ -141,7 +131,7 @@ class PlaneFiles:
         """Write what else is known of the samples, remove the files of an earlier plane, return the paths."""
         written = {}
         for name in _SIDECARS:
-            path = self.sidecar_path(name)
+            path = self.folder / f"{plane_name(self.place)}_{name}.tiff"
             if all(name in part for part in parts):
                 write_plane(path, _joined(parts, name), pitch_mm)
                 written[name] = path
@@ -158,7 +148,7 @@ class PlaneFiles:
             with np.load(self._part(channel), allow_pickle=False) as part:
                 content = part["content"].tobytes()
             msgspec.json.decode(content, type=_Part)
-            return _is_current(content, self.origin)
+            return first_difference(content, self.origin) is None
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # msgspec's errors are ValueErrors
             return False
 
@@ -169,19 +159,13 @@ def read_current[Record: (PlaneFileRecord, DepthMapFileRecord)](
     """Return a record whose files, in the same folder, are whole and of this origin; None for any other."""
     try:
         content = path.read_bytes()
-        if not _is_current(content, origin):
+        if first_difference(content, origin) is not None:
             return None
         record = msgspec.json.decode(content, type=kind)
         whole = all(sha256(path.parent / name) == known for name, known in record.sha256.items())
     except (OSError, MissingFile, ValueError):
         return None  # there is none, or it cannot be read
     return record if whole else None
-
-
-def _is_current(content: bytes, origin: Origin) -> bool:
-    """Return whether a record, as JSON, is of an origin."""
-    written: AnyProvenance = msgspec.json.decode(content, type=Provenance[dict[str, Any]])
-    return first_difference(written, origin) is None
 
 
 def _joined(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:

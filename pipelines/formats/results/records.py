@@ -1,8 +1,10 @@
 """The records of planes and reconstructions: one type per JSON file, for its writer, its readers and its tests.
 
-Keys stand in a file in the order of the fields; a field that is UNSET is left out.
+Keys stand in a file in the order of the fields; a field that is UNSET is left out. Fields that reports, views and
+exports can do without have defaults, so that results of earlier versions and those made by hand can be read.
 """
 
+import math
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -31,7 +33,7 @@ class Certificate(Struct, frozen=True, kw_only=True):
     parts), and `reached` says whether it is below `tolerance`. One-step-late: `relative_change` of the last pass.
     """
 
-    kind: str
+    kind: str = ""
     value: float | UnsetType = UNSET
     stationarity: float | UnsetType = UNSET
     slack: float | UnsetType = UNSET
@@ -94,16 +96,16 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     method: Method
     channel: str
     file: str
-    shape: tuple[int, int]
+    shape: tuple[int, int] = (0, 0)
     pitch_mm: float
-    origin_mm: tuple[float, float]
+    origin_mm: tuple[float, float] = (0.0, 0.0)
     penalty_weight: float | None
     penalty_weight_chosen: str
-    epsilon_e2: float | None
+    epsilon_e2: float | None = None
     passes: int
-    objective: float | None
+    objective: float | None = None
     certificate: Certificate | None
-    mean_e: float
+    mean_e: float = math.nan
     passes_before: float | UnsetType = UNSET
     penalty_weight_curve: list[WeightScore] | UnsetType | None = UNSET
     penalty: PenaltyRecord | UnsetType = UNSET
@@ -122,12 +124,12 @@ class FocusPoint(Struct, frozen=True):
     sigma_e2: float
 
 
-class FocusCurve(Struct, frozen=True):
+class FocusCurve(Struct, frozen=True, kw_only=True):
     """Focus against depth, and the depths at which it peaks."""
 
     depth_mm: list[float]
     detail_e2: list[float]
-    sigma_e2: list[float]
+    sigma_e2: list[float] | UnsetType = UNSET
     sharp_mm: list[float]
 
 
@@ -151,24 +153,24 @@ class DepthMapRecord(Struct, frozen=True):
     bins_px: int
     sure_above: float
     sure_share: float
-    median: float | None
+    median: float | None = None
 
 
 class ReconstructionOptions(Struct, frozen=True):
     """The options of `faintfield reconstruct` as they took effect."""
 
-    method: Method
-    depth_mm: list[float]
-    penalty_weight: float | Literal["auto"]
-    penalty: str
-    likelihood: str
-    uncertainty: bool
-    passes: int | None
-    pitch_mm: float | None
-    focus: bool
-    depth_map: Literal["mm", "px"] | None
-    plane_pose: dict[str, list[float]]
-    poses: Poses
+    method: Method | UnsetType = UNSET
+    depth_mm: list[float] | UnsetType = UNSET
+    penalty_weight: float | Literal["auto"] | UnsetType = UNSET
+    penalty: str | UnsetType = UNSET
+    likelihood: str | UnsetType = UNSET
+    uncertainty: bool | UnsetType = UNSET
+    passes: int | UnsetType | None = UNSET
+    pitch_mm: float | UnsetType | None = UNSET
+    focus: bool | UnsetType = UNSET
+    depth_map: Literal["mm", "px"] | UnsetType | None = UNSET
+    plane_pose: dict[str, list[float]] | UnsetType = UNSET
+    poses: Poses = "stated"
 
 
 class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
@@ -188,18 +190,22 @@ class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
     sha256: dict[str, str]
 
 
-class ReconstructionRecord(Provenance[ReconstructionOptions], frozen=True):
-    """`reconstruction.json`: all planes of one method, and how they were made."""
+class ReconstructionRecord(Struct, frozen=True, kw_only=True):
+    """`reconstruction.json`: all planes of one method, and their `Provenance`."""
 
-    format: Literal[1]
+    format: Literal[1] = 1
     planes: Annotated[list[PlaneRecord], Meta(min_length=1)]
-    focus: FocusCurve | None
-    best_focus: BestFocusRecord | None
-    depth_map: DepthMapRecord | None
+    focus: FocusCurve | None = None
+    best_focus: BestFocusRecord | None = None
+    depth_map: DepthMapRecord | None = None
     wall_time_s: float
+    command: str = "reconstruct"
+    options: ReconstructionOptions
+    inputs: dict[str, str]
+    versions: dict[str, str]
 
 
-class PlaneErrors(Struct, frozen=True):
+class PlaneErrors(Struct, frozen=True, kw_only=True):
     """The errors of one plane against the truth, the object scaled to 0…1."""
 
     depth_mm: float
@@ -208,7 +214,7 @@ class PlaneErrors(Struct, frozen=True):
     object: str
     mse_bright: float
     mse_texture: float
-    mse_plane: float
+    mse_plane: float | None = None
     psnr_db: float | None
 
 
@@ -250,8 +256,8 @@ class Metrics(Struct, frozen=True, kw_only=True):
     geometry: GeometryErrors | UnsetType = UNSET
     noise: dict[str, KnownValue] | UnsetType = UNSET
     planes: list[PlaneErrors]
-    snr: SnrRecord
-    photons_per_px: PhotonsRecord
+    snr: SnrRecord | UnsetType = UNSET
+    photons_per_px: PhotonsRecord | UnsetType = UNSET
 
 
 class Brightness(Struct, frozen=True):
@@ -277,23 +283,23 @@ class Brightness(Struct, frozen=True):
     electrons_linear: float | None
     electrons_from_moments: float | None
     mean_signal_e: float
-    photons_linear: float | None
-    photons_from_moments: float | None
+    photons_linear: float | None = None
+    photons_from_moments: float | None = None
 
 
-class Overview(Struct, frozen=True):
+class Overview(Struct, frozen=True, kw_only=True):
     """`overview.json`: a set at a glance, beside its pictures."""
 
     set: str
     views: int
-    grid: tuple[int, int] | None
-    poses: Poses
+    grid: tuple[int, int] | UnsetType | None = UNSET
+    poses: Poses = "stated"
     size_px: tuple[int, int]
     exposure_s: float
-    frames_per_view: int
+    frames_per_view: int = 1
     read_noise_e: float
-    has_noise_reference: bool
-    quantum_efficiency: float | None
-    dark_e: float
-    grey_scale_dn: tuple[float, float]
+    has_noise_reference: bool = False
+    quantum_efficiency: float | None = None
+    dark_e: float | UnsetType = UNSET
+    grey_scale_dn: tuple[float, float] | UnsetType = UNSET
     brightness: Brightness

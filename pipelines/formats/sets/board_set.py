@@ -7,15 +7,13 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import Node
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
-from faintfield.pipelines.formats.files import sha256, write_whole
-from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.mosaic import at_phase, mosaic_period
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.frames import at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.rig.plan import centre_node
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
@@ -184,12 +182,6 @@ def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None
         low, high = np.quantile(filtered, ends)
         at_phase(grey, phase, period)[...] = black + (filtered - low) * ((white - black) / max(high - low, 1.0))
     return grey
-
-
-def write_board_set(folder: Path, settings: BoardSetFile) -> None:
-    """Write `charuco.toml`; the images come first, so that a folder with this file is whole."""
-    content = {name: value for name, value in msgspec.to_builtins(settings).items() if value is not None}
-    write_whole(folder / FILE_NAME, tomli_w.dumps(content))
 
 
 def _boards(path: Path, entries: Sequence[BoardEntry]) -> dict[str, Board]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -14,6 +14,7 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import (
@@ -139,18 +140,14 @@ class ElementalSet:
         moved_px = self.poses_rt_cam_ref[:, 3:5] * [camera.fx_px, camera.fy_px]
         inverse_depth = np.sum((disparity_px * steps - shift_px) * moved_px) / max(float(np.sum(moved_px**2)), 1e-30)
         if not inverse_depth > 0:
+            at_infinity_px = np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30)
             raise BadValue(
                 f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
-                f"give a number below {self._disparity_at_infinity_px(steps, shift_px):.3g} px, that of infinitely far "
+                f"give a number below {at_infinity_px:.3g} px, that of infinitely far "
                 "points (cameras that move right see near points move left, by a negative number), or import pictures "
                 "that were aligned on a plane again, with its --disparity-px"
             )
         return float(1 / inverse_depth)
-
-    @staticmethod
-    def _disparity_at_infinity_px(steps: NDArray[np.float64], shift_px: NDArray[np.float64]) -> float:
-        """Return the movement of infinitely far points between neighbouring nodes."""
-        return float(np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30))
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
@@ -221,3 +218,48 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
             f"got {flat.shape[::-1]}, least {np.nanmin(flat)}"
         )
     return flat
+
+
+def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
+    """Return a set with the lens of a geometry.json and each view at its node's measured pose.
+
+    Raises
+    ------
+    BadValue
+        A view has no node, a node was not measured, the reference is another, or the image has another size.
+    """
+    path = path / GEOMETRY_FILE if path.is_dir() else path
+    geometry, settings = read_geometry(path, CameraPoses), loaded.settings
+    poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
+    _check_match(path, geometry, loaded)
+    lens = geometry.camera_lens()
+    stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
+    camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
+    views = [
+        msgspec.structs.replace(view, rt_cam_ref=poses[view.node], cx_px=None, cy_px=None)
+        for view in settings.view
+        if view.node is not None
+    ]
+    measured = msgspec.structs.replace(settings, camera=camera, view=views)
+    return replace(loaded, settings=measured, lens=lens, measured_in=path, poses="measured")
+
+
+def _check_match(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> None:
+    """Refuse a geometry of images of another size, of other nodes, or with another reference than the set."""
+    settings, nodes = loaded.settings, {entry.node for entry in geometry.nodes}
+    if geometry.size_px != settings.camera.size_px:
+        raise BadValue(
+            f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"
+        )
+    missing = [view.image for view in settings.view if view.node not in nodes]
+    if missing:
+        raise BadValue(
+            f"{path}: has no pose for {len(missing)} of {len(settings.view)} views ({missing[0]} is the first); "
+            "state the node of every view, and show a board at every node"
+        )
+    reference = settings.view[settings.reference_view].node
+    if reference != geometry.reference_node:
+        raise BadValue(
+            f"{path}: its reference is node {list(geometry.reference_node)}, the set's is {reference}; "
+            "set reference_view to the view of that node"
+        )

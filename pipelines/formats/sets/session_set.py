@@ -12,8 +12,7 @@ from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
-from faintfield.pipelines.formats.sets.measured_poses import with_measured_geometry
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
@@ -21,7 +20,7 @@ RECONSTRUCTIONS = "reconstructions"
 
 type SceneKind = Literal["dark_scene", "bright"]
 
-_CALLED: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
+_NAMES: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 
 
 def load_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path | None = None) -> ElementalSet:
@@ -101,11 +100,11 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
     whole = [taken[node] for node in sorted(taken) if len(taken[node][1]) == len(at_centre)]
     if not at_centre or plan.centre not in [stop for stop, _ in whole]:
         raise BadValue(
-            f"{folder}: has no {_CALLED[kind]} frame of the centre node {list(plan.centre.node)}, whose camera is the "
+            f"{folder}: has no {_NAMES[kind]} frame of the centre node {list(plan.centre.node)}, whose camera is the "
             f"reference; take it by a {kind} step of the rig.toml"
         )
     if lacking := len({frame.stop.node for frame in planned}) - len(whole):
-        inform(f"{folder}: {lacking} nodes are left out, which miss {_CALLED[kind]} frames; capture again to take them")
+        inform(f"{folder}: {lacking} nodes lack {_NAMES[kind]} frames and are left out; capture again to take them")
     return sum(at_centre), whole
 
 
