@@ -17,7 +17,7 @@ from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
 from faintfield.recon.solver.pmlem import pmlem
-from faintfield.rig.simulation.experiment import shaded_ball, star_chart, toy_airplane, toy_truck
+from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
 
 _VIEWS, _SIZE_PX, _SNR, _READ_VARIANCE_E2, _DARK_E = 49, 192, 0.16, 12.0, 0.02
 _PENALTIES: tuple[PenaltyName, ...] = ("tv", "huber-tv", "quadratic")

@@ -7,7 +7,7 @@ import msgspec
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.rig.errors import SessionCorrupt
-from faintfield.rig.session.resume import verify as verify_session
+from faintfield.rig.session.verify import verify as verify_session
 
 # Problems printed one by one; the failure gives their number.
 _MAX_SHOWN = 10

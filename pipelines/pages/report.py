@@ -11,8 +11,8 @@ from msgspec import UNSET
 from faintfield.pipelines.formats.files import write_whole
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
+from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.records import (
-    OVERVIEW_FILE,
     RECONSTRUCTION_FILE,
     REPORT_FILE,
     GeometryErrors,
@@ -29,7 +29,8 @@ from faintfield.pipelines.pages.report_calibration import (
     geometry_section,
     noise_section,
 )
-from faintfield.pipelines.pages.report_pictures import depth_sections, plane_sections
+from faintfield.pipelines.pages.report_depth import depth_sections
+from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 

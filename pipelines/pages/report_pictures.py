@@ -1,8 +1,7 @@
-"""The pictures of a report: planes on one grey scale (side by side, on sliders), their sigmas, and depth maps."""
+"""The pictures of a report: planes on one grey scale (side by side, on sliders), and their sigmas."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypedDict
 
 import numpy as np
@@ -12,7 +11,6 @@ from faintfield.pipelines.formats.image_files import encoded, grey_levels, shrun
 from faintfield.pipelines.formats.results.records import (
     JOINT_METHODS,
     Certificate,
-    DepthMapRecord,
     FocusCurve,
     ReconstructionRecord,
 )
@@ -107,17 +105,6 @@ class PlaneSections:
     white: float
     focus_curve: str | None
     sharp_mm: list[float]
-
-
-@dataclass(frozen=True)
-class DepthSection:
-    """A depth map with its pictures as data URIs; None if the file is missing."""
-
-    title: str
-    record: DepthMapRecord
-    all_in_focus: str | None
-    map: str | None
-    confidence: str | None
 
 
 def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
@@ -237,24 +224,3 @@ def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:
 
 def _picture(pixels: NDArray[Any], white: float, width_px: int, suffix: str) -> str:
     return data_uri(encoded(shrunk(grey_levels(pixels, white), width_px), suffix), suffix)
-
-
-def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -> list[DepthSection]:
-    """Return what the page shows of each depth map."""
-    return [
-        DepthSection(
-            folder.relative_to(directory).as_posix(),
-            found,
-            all_in_focus=_preview(folder / Path(found.all_in_focus).name),
-            map=_preview(folder / Path(found.file).name),
-            confidence=_preview(folder / Path(found.confidence).name),
-        )
-        for folder, result in results.items()
-        if (found := result.depth_map)
-    ]
-
-
-def _preview(path: Path) -> str | None:
-    """Return the preview of a map."""
-    preview = path.with_suffix(".png")
-    return data_uri(preview.read_bytes(), ".png") if preview.is_file() else None

@@ -7,7 +7,7 @@ from msgspec import UNSET
 
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.formats.results.records import Overview
+from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.result_files import read_result
 from faintfield.pipelines.pages.page import data_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES

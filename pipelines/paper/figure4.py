@@ -17,14 +17,8 @@ from faintfield.recon.metrics import mean_square_error, signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
-from faintfield.rig.simulation.experiment import (
-    SimulatedExperiment,
-    paper_experiment,
-    sailing_boat,
-    shaded_ball,
-    toy_airplane,
-    toy_truck,
-)
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.objects import sailing_boat, shaded_ball, toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane, render
 
 SNRS = tuple(round(0.16 + 0.01 * step, 2) for step in range(8))

@@ -7,7 +7,6 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from faintfield.pipelines.errors import MissingPackage
 from faintfield.pipelines.formats.results.records import Method
 from faintfield.pipelines.reconstruction.planes import Settings, solve
 from faintfield.recon.likelihood.images import ElementalImages, Image
@@ -51,30 +50,13 @@ def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
     return _solved("pmlem-osl", operator, replace(images, electrons=floor, read_variance_e2=0.0))
 
 
-def tv_denoiser() -> Callable[..., Image]:
-    """Return scikit-image's denoising by total variation (Chambolle 2004).
-
-    Raises
-    ------
-    MissingPackage
-        scikit-image is not installed.
-    """
-    try:
-        from skimage.restoration import denoise_tv_chambolle  # slow to load
-    except ImportError as failure:
-        raise MissingPackage(
-            "scikit-image is not installed, and figure 4 needs it to compare with; it is an extra: "
-            "pip install 'faintfield[figures]'"
-        ) from failure
-    denoiser: Callable[..., Image] = denoise_tv_chambolle
-    return denoiser
-
-
 def _tv_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:
-    """Return the back-projection, denoised by total variation."""
+    """Return the back-projection, denoised by total variation (Chambolle 2004)."""
+    from skimage.restoration import denoise_tv_chambolle  # slow to load
+
     plane = back_projection(operator, images)
     # At the default tolerance it stops too early to compare weights
-    return np.asarray(tv_denoiser()(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
+    return np.asarray(denoise_tv_chambolle(plane, weight=weight, eps=1e-5, max_num_iter=200), np.float32)
 
 
 def _bm3d_denoised(operator: PlaneOperator, images: ElementalImages, weight: float) -> Image:

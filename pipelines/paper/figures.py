@@ -21,7 +21,7 @@ from faintfield.pipelines.pages.page import data_uri, template
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.paper.figure4 import PAPERS_AXIS, is_monotone, mean_curves, measure_errors, over_best
 from faintfield.pipelines.paper.figure_drawings import ShownPlane, draw_figure2, draw_figure3, draw_figure4
-from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, tv_denoiser
+from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS
 from faintfield.pipelines.paper.figure_records import (
     DarkPlaneRow,
     DetailRow,
@@ -84,12 +84,8 @@ def make_figures(out: Path, options: FigureOptions) -> dict[str, Figure2 | Figur
     ------
     OutputExists
         `out` holds something other than earlier figures.
-    MissingPackage
-        Figure 4 is asked for, and scikit-image is not installed.
     """
     check_free(out, replace_if=PAGE_FILE)
-    if 4 in options.only:
-        tv_denoiser()
     if {2, 3} & set(options.only):
         inform("simulating 7 x 7 views of a toy truck at 500 mm and a toy airplane at 700 mm")
         scene = SyntheticOptions(snr=options.snr, seed=options.seed, size_px=options.size_px)

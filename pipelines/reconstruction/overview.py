@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.files import write_json
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, white_level, write_png
-from faintfield.pipelines.formats.results.records import OVERVIEW_FILE, Brightness, Overview
+from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers

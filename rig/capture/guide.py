@@ -7,7 +7,7 @@ from typing import Literal, NoReturn, Protocol
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.timing import Pace
+from faintfield.rig.capture.pace import Pace
 from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import PlannedFrame, StepKind
 from faintfield.rig.session.session import Session

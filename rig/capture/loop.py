@@ -5,9 +5,9 @@ from contextlib import suppress
 import msgspec
 
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
+from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import Decode, DriftChecks, FrameTaker
-from faintfield.rig.capture.timing import Pace
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, NotHomed, StageError
 from faintfield.rig.plan import PlannedFrame

@@ -10,7 +10,8 @@ import msgspec
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, board_warnings, check_frame
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
-from faintfield.rig.capture.timing import Pace, Settling, measure_settling
+from faintfield.rig.capture.pace import Pace
+from faintfield.rig.capture.settling import Settling, measure_settling
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, PositionDrifted
 from faintfield.rig.plan import PlannedFrame

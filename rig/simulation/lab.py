@@ -16,8 +16,8 @@ from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import standing_board
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from faintfield.rig.simulation.optics import through_mosaic
 from faintfield.rig.simulation.scene import TexturedPlane, render
+from faintfield.rig.simulation.sensor import through_mosaic
 from faintfield.rig.stages.protocol import Point
 
 # Bent rails and eccentric pulleys: number of waves over the travel, and the range of their lengths in mm.

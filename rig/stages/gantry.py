@@ -14,9 +14,10 @@ from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
 from faintfield.rig.stages.grbl.controller import GrblController
 from faintfield.rig.stages.marlin.controller import MarlinController
-from faintfield.rig.stages.motion import StageWorkspace, duration_s, one_sided_path, path_duration_s
+from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
 from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
+from faintfield.rig.stages.workspace import StageWorkspace
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
 _MAX_UNHOMED_JOG_MM = 10.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.rig.simulation.optics import SimulatedSensor
+from faintfield.rig.simulation.sensor import SimulatedSensor
 
 GOOD: dict[str, Any] = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0}
 

@@ -22,8 +22,9 @@ from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, RigError
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import open_session, verify
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 from tests.faults.capturing import FRAMES, SMALL_RIG
 

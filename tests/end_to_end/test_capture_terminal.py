@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from faintfield.pipelines import cli
-from faintfield.rig.session.resume import verify
+from faintfield.rig.session.verify import verify
 
 _MAX_WAIT_S = 60.0
 

@@ -11,7 +11,7 @@ import tomli_w
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.simulate import simulate
-from faintfield.rig.simulation.optics import SimulatedSensor
+from faintfield.rig.simulation.sensor import SimulatedSensor
 from tests.pipelines.noise_sets import write_frames
 
 

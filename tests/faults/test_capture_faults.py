@@ -18,8 +18,9 @@ from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, CaptureStopped, RigError, SessionUnwritable
 from faintfield.rig.session.disk import encode_exposure
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import open_session, verify
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, is_sealed, read_plan, taken_frames
+from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, RigSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import verify
+from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, STEPS, capture_and_die, capture_small, in_process
 
 # A process that captures the small session ends long before this.

@@ -3,7 +3,6 @@
 import csv
 import json
 import statistics
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -21,7 +20,7 @@ from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, Figur
 from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
 from faintfield.recon.metrics import expected_snr_from_powers
 from faintfield.recon.solver.initialization import back_projection
-from faintfield.rig.simulation.experiment import shaded_ball, star_chart
+from faintfield.rig.simulation.objects import shaded_ball, star_chart
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -151,17 +150,6 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, faintfield: Co
     ended = faintfield("figures", tmp_path)
     assert ended.returncode == 1
     assert "OutputExists" in ended.stderr
-
-
-def test_without_scikit_image_the_extra_is_named_before_any_work(
-    tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "skimage.restoration", None)
-    ended = faintfield("figures", tmp_path / "out")
-    assert ended.returncode == 1
-    assert "MissingPackage: scikit-image is not installed" in ended.stderr
-    assert "pip install 'faintfield[figures]'" in ended.stderr
-    assert not (tmp_path / "out").exists()
 
 
 def test_exposures_have_the_snr_they_are_named_by(star: StagedObject) -> None:

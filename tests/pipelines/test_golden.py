@@ -10,10 +10,10 @@ import msgspec
 import pytest
 
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.records import (
     DepthMapFileRecord,
     Metrics,
-    Overview,
     PlaneFileRecord,
     ReconstructionRecord,
 )

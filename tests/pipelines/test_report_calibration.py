@@ -18,7 +18,7 @@ from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_png
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
-from faintfield.pipelines.formats.results.records import Brightness, Overview
+from faintfield.pipelines.formats.results.overview import Brightness, Overview
 from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_beside

@@ -20,8 +20,8 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-from faintfield.rig.session.resume import verify
 from faintfield.rig.session.session import taken_frames
+from faintfield.rig.session.verify import verify
 from tests.pipelines.sessions import SWEEPS, captured, rig_toml
 
 

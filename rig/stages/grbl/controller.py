@@ -9,17 +9,10 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 from faintfield.rig.errors import StageLost, StageTimeout, WrongFirmware
-from faintfield.rig.stages.grbl.connection import (
-    CANCEL_JOG,
-    HOLD,
-    POLL_INTERVAL_S,
-    RESET,
-    RESET_S,
-    SOFT_LIMIT_ALARM,
-    GrblConnection,
-    state_failure,
-)
-from faintfield.rig.stages.grbl.messages import Feedback, GrblSetting, GrblSettings, Report
+from faintfield.rig.stages.grbl.connection import CANCEL_JOG, HOLD, POLL_INTERVAL_S, RESET, RESET_S, GrblConnection
+from faintfield.rig.stages.grbl.failures import SOFT_LIMIT_ALARM, state_failure
+from faintfield.rig.stages.grbl.messages import Feedback, GrblSetting, Report
+from faintfield.rig.stages.grbl.settings import GrblSettings
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AxisIndex, Identity, Point
 from faintfield.rig.stages.transport import LineTransport

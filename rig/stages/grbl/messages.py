@@ -1,4 +1,4 @@
-"""Parses the lines that GRBL 1.1 sends, derives travel and rates from its settings, and refuses unsafe settings.
+"""Parses the lines that GRBL 1.1 sends.
 
 Responses (`ok`, `error:N`) answer commands; GRBL sends all other lines unasked. A line that does not match a known form
 exactly is `Unknown`, so that a damaged line is never taken for a response.
@@ -9,9 +9,6 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from faintfield.rig.errors import WrongFirmware
-from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
 from faintfield.rig.stages.transport import Ok, Unknown
 
 _NUMBER = r"-?\d{1,7}(?:\.\d{1,6})?"
@@ -123,114 +120,3 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] =
     (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda found: Feedback(found[1], found[2])),
     (re.compile(r"(Grbl|GrblHAL) (\d{1,2}\.\d{1,2}[a-z]?)(?: .*)?"), lambda found: Banner(found[1], found[2])),
 )
-
-
-# Reports and commands have three decimals, and each rounds by up to half a micrometre.
-_ROUNDING_MM = 0.001
-
-# Homing may take this long (s) even where the settings predict less: a slow stage must not fail half way.
-_MIN_HOMING_BOUND_S = 240.0
-
-# The value of $1 that keeps the motors on between motions.
-_KEEP_MOTORS_ON = 255
-
-
-class GrblSettings(Struct, frozen=True):
-    """The `$$` settings and the `$I` build information of one controller.
-
-    Parameters
-    ----------
-    values : dict
-        Setting number to value, as reported.
-    build : dict
-        Kind (`VER`, `OPT`) to text of the build information.
-    """
-
-    values: dict[int, str]
-    build: dict[str, str]
-
-    def identity(self, axes: tuple[int, ...]) -> Identity:
-        """Return firmware, travel, rates and tolerances of the controller.
-
-        Parameters
-        ----------
-        axes : tuple of int
-            The controller's numbers for the two axes.
-
-        Raises
-        ------
-        WrongFirmware
-            The firmware is not GRBL 1.1, or a setting makes positions unsafe; the message says what to set.
-        """
-        version = self.build.get("VER", "")
-        if not re.match(r"v?1\.1", version):
-            raise WrongFirmware(
-                f"the controller is GRBL {version or 'of no version'!r}; 1.1 or grblHAL is needed; flash it"
-            )
-        self._refuse_unsafe()
-        x, y = axes
-        return Identity(
-            firmware=f"Grbl {version.rstrip(':')}",
-            travel_mm=Box(self._travel(x), self._travel(y)),
-            motion=MotionLimits(
-                rate_mm_per_s=(self._number(110 + x) / 60.0, self._number(110 + y) / 60.0),
-                acceleration_mm_per_s2=(self._number(120 + x), self._number(120 + y)),
-            ),
-            tolerance_mm=(self._tolerance(x), self._tolerance(y)),
-            homing_bound_s=self._homing_bound_s(axes),
-            homes_together="H" not in self._options(),
-            pull_off_mm=self._number(27),
-            settings={f"${number}": value for number, value in sorted(self.values.items())},
-            warnings=tuple(self._warnings()),
-        )
-
-    def _refuse_unsafe(self) -> None:
-        """Raise for settings under which positions cannot be known."""
-        if not int(self._number(22)) & 1:
-            raise WrongFirmware("$22=0: the controller has no homing, so its position cannot be known; set $22=1")
-        if self._number(13) != 0:
-            raise WrongFirmware("$13=1: positions are reported in inches; set $13=0")
-
-    def _warnings(self) -> list[str]:
-        """Return settings that should be changed, each with its remedy."""
-        warnings = []
-        if self._number(20) == 0:
-            warnings.append("$20=0: the controller itself does not keep to its travel; set $20=1")
-        if self._number(1) != _KEEP_MOTORS_ON:
-            warnings.append(f"$1={self.values[1]}: the motors let go between motions; set $1={_KEEP_MOTORS_ON}")
-        return warnings
-
-    def _travel(self, axis: int) -> tuple[float, float]:
-        """Return the machine coordinates of the ends of `axis`.
-
-        Homing sets the end with the switch to zero, and the travel extends to negative coordinates from there. It
-        extends to positive ones if the firmware was built with the switch as origin (option Z) and homes to the lower
-        end ($23).
-        """
-        length_mm = self._number(130 + axis)
-        homes_low = bool(int(self._number(23)) >> axis & 1)
-        return (0.0, length_mm) if "Z" in self._options() and homes_low else (-length_mm, 0.0)
-
-    def _tolerance(self, axis: int) -> float:
-        """Return half a motor step plus the rounding of reports, in mm."""
-        return 0.5 / self._number(100 + axis) + _ROUNDING_MM
-
-    def _homing_bound_s(self, axes: tuple[int, ...]) -> float:
-        """Return a bound for homing: the whole travel at the seek rate, and twice the slow search."""
-        seek_s = 60.0 * max(self._number(130 + axis) for axis in axes) / self._number(25)
-        locate_s = 4.0 * 60.0 * self._number(27) / self._number(24)
-        return max(_MIN_HOMING_BOUND_S, timeout_s(seek_s + locate_s))
-
-    def _options(self) -> str:
-        """Return the letters of the compile-time options."""
-        return self.build.get("OPT", "").partition(",")[0]
-
-    def _number(self, setting: int) -> float:
-        """Return a setting; raises `WrongFirmware` if it was not reported or has an impossible value."""
-        value = float(self.values.get(setting, "nan"))
-        if not (value > 0.0 or (value == 0.0 and setting < 100 and setting not in (24, 25))):
-            raise WrongFirmware(
-                f"${setting}={self.values.get(setting, 'not reported')}: the stage cannot be driven with it; "
-                "set it in the controller"
-            )
-        return value

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.stages.marlin import messages as marlin
-from faintfield.rig.stages.marlin.messages import MarlinSettings
+from faintfield.rig.stages.marlin.settings import MarlinSettings
 from faintfield.rig.stages.motion import timeout_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure

@@ -13,14 +13,15 @@ from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.settling import Settling
 from faintfield.rig.capture.survey import survey
-from faintfield.rig.capture.timing import Settling
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
 from faintfield.rig.plan import Grid, PlannedFrame
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import open_session, verify
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, taken_frames
+from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import SimulatedLab
 from faintfield.rig.stages.protocol import Point

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from faintfield.rig.cameras.protocol import Pixels
-from faintfield.rig.capture.timing import measure_settling
+from faintfield.rig.capture.settling import measure_settling
 from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.controller.wire import SimulatedClock
 from faintfield.rig.simulation.experiment import paper_experiment

@@ -19,8 +19,9 @@ from faintfield.rig.plan import CapturePlan, planned_frames
 from faintfield.rig.session import journal as journal_module
 from faintfield.rig.session.disk import set_aside, write_new
 from faintfield.rig.session.journal import Journal
-from faintfield.rig.session.resume import check_same_rig, open_session, verify
+from faintfield.rig.session.resume import check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, read_plan
+from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 
 

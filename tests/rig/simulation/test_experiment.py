@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
-from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment, toy_airplane, toy_truck
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.objects import toy_airplane, toy_truck
 from faintfield.rig.simulation.scene import TexturedPlane, render
 
 

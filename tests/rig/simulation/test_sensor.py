@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from faintfield.rig.simulation.optics import SimulatedSensor
+from faintfield.rig.simulation.sensor import SimulatedSensor
 
 PIXELS = (1000, 1000)
 

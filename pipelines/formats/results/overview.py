@@ -1,0 +1,52 @@
+"""The record of a set at a glance: `overview.json`, with its SNR and photon figures."""
+
+from msgspec import UNSET, Struct, UnsetType
+
+from faintfield.pipelines.formats.results.records import Poses
+
+OVERVIEW_FILE = "overview.json"
+
+
+class Brightness(Struct, frozen=True):
+    """The SNR and photon figures of a set's reference view.
+
+    Attributes
+    ----------
+    region, noise_from : str
+        What was measured, and what it was compared with.
+    snr : float, optional
+        Eq. (4), a ratio of powers; None if the noise model states no read noise to compare with.
+    electrons_linear, electrons_from_moments : float, optional
+        Electrons per pixel by eq. (7), and of a uniform object with this SNR; None if the SNR is not positive.
+    mean_signal_e : float
+        Mean electrons per pixel above the dark level.
+    photons_linear, photons_from_moments : float, optional
+        The same in photons; None if the quantum efficiency is not known.
+    """
+
+    region: str
+    noise_from: str
+    snr: float | None
+    electrons_linear: float | None
+    electrons_from_moments: float | None
+    mean_signal_e: float
+    photons_linear: float | None = None
+    photons_from_moments: float | None = None
+
+
+class Overview(Struct, frozen=True, kw_only=True):
+    """`overview.json`: a set at a glance, beside its pictures."""
+
+    set: str
+    views: int
+    grid: tuple[int, int] | UnsetType | None = UNSET
+    poses: Poses = "stated"
+    size_px: tuple[int, int]
+    exposure_s: float
+    frames_per_view: int = 1
+    read_noise_e: float
+    has_noise_reference: bool = False
+    quantum_efficiency: float | None = None
+    dark_e: float | UnsetType = UNSET
+    grey_scale_dn: tuple[float, float] | UnsetType = UNSET
+    brightness: Brightness
