@@ -71,6 +71,19 @@ def prefetch(_context, begin, count):
     return types.void(begin, count), build
 
 
+def _bitcast(numba_type, llvm_type):
+    """Return a function that takes the 32 bits of a number for one of another type."""
+
+    @intrinsic
+    def cast(_context, number):
+        return numba_type(number), lambda _, builder, __, arguments: builder.bitcast(arguments[0], llvm_type)
+
+    return cast
+
+
+_bits, _float_from_bits = _bitcast(types.int32, ir.IntType(32)), _bitcast(types.float32, ir.FloatType())
+
+
 def logarithm(x):
     """Return ln x for positive, normal x, and a meaningless number for any other."""
     return math.log(x)
@@ -95,9 +108,9 @@ def _exponential(x):
 
 def _logarithm_single(x):
     """Return ln x from x = 2ᵉ m with m near one, and six terms of the series of ln m = 2 artanh((m − 1)/(m + 1))."""
-    bits = np.float32(x).view(np.int32)
+    bits = _bits(x)
     exponent = np.int32(bits - _HALF_ROOT_BITS) >> np.int32(23)
-    mantissa = np.int32(bits - np.int32(exponent << np.int32(23))).view(np.float32)
+    mantissa = _float_from_bits(np.int32(bits - np.int32(exponent << np.int32(23))))
     s = (mantissa - np.float32(1)) / (mantissa + np.float32(1))
     t = s * s
     series = np.float32(2 / 9) + t * np.float32(2 / 11)
@@ -113,4 +126,4 @@ def _exponential_single(x):
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = np.float32(1 / 24) + r * (np.float32(1 / 120) + r * (np.float32(1 / 720) + r * np.float32(1 / 5040)))
     series = np.float32(1) + r * (np.float32(1) + r * (np.float32(1 / 2) + r * (np.float32(1 / 6) + r * series)))
-    return series * np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return series * _float_from_bits(np.int32((np.int32(n) + np.int32(127)) << np.int32(23)))

@@ -195,8 +195,9 @@ def _log_factorial_over_power(n, mean):
     at_least_one = max(n, one)
     inverse = one / at_least_one
     square = inverse * inverse
-    series = number(1 / 360) - square * (number(1 / 1260) - square / number(1680))
-    series = inverse * (number(1 / 12) - square * series)
+    series = inverse * (
+        number(1 / 12) - square * (number(1 / 360) - square * (number(1 / 1260) - square / number(1680)))
+    )
     series = number(0.08106146679532726) if n == one else series
     root = number(0.5) * logarithm(number(2 * np.pi) * at_least_one)
     return n * logarithm(at_least_one / mean) - n + root + series if n > number(0) else number(0)

@@ -115,7 +115,7 @@ def index_of_pixels(homographies: NDArray[Any], grid: PlaneGrid) -> NDArray[np.f
     ("bad", "words"),
     [
         ({"transmission": np.ones((3, 4, 13, 5))}, "transmission has shape"),
-        ({"transmission": np.full((3, *IMAGES_SHAPE), -0.1)}, "a transmission is negative"),
+        ({"transmission": np.full((3, *IMAGES_SHAPE), -0.1)}, "the transmission is negative"),
         ({"transmission": np.full((3, *IMAGES_SHAPE), np.nan)}, "not a finite number"),
         ({"grids": GRIDS[:2]}, "do not fit"),
         ({"grids": (*GRIDS[:2], PlaneGrid((5, 5), 1.0, (9e5, 0.0)))}, "no pixel of any of the 4 views"),
