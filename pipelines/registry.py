@@ -68,7 +68,7 @@ def _register(app: App, name: str, target: str, example: str, place: int, group:
     Importing all modules for their docstrings would take seconds.
     """
     module, _, function = target.partition(":")
-    source = Path(__file__).parent.joinpath("commands", *module.split(".")).with_suffix(".py").read_text()
+    source = Path(__file__).parent.joinpath("commands", *module.split(".")).with_suffix(".py").read_text("utf-8")
     app.command(
         f"{_COMMANDS}.{target}",
         name=name,
