@@ -95,7 +95,7 @@ def test_colmap_opens_what_we_write(writer: ModuleType, tmp_path: Path) -> None:
 
 
 def test_a_text_model_takes_no_names_that_colmap_would_cut(tmp_path: Path) -> None:
-    with pytest.raises(BadValue, match="precedes a space; use --binary"):
+    with pytest.raises(BadValue, match="has a space, where COLMAP ends a name in a text model; use --binary"):
         write_model(tmp_path, read_model(STORED / "binary"), binary=False)
     assert not list(tmp_path.iterdir())
 
