@@ -47,7 +47,7 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
         TextColumn("to go"),
         TimeRemainingColumn(),
     )
-    # Without a terminal there is no thread that redraws: left behind by a caller, it could not be joined at exit
+    # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
     drawn = console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
         yield from bar.track(items, description=label, total=total)

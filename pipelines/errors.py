@@ -26,7 +26,7 @@ from faintfield.rig.errors import RigError
 
 
 class InputError(Exception):
-    """A file or folder given to a command cannot be used."""
+    """A command's input, its output or a resource that it needs cannot be used."""
 
 
 class MissingFile(InputError):

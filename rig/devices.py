@@ -51,7 +51,7 @@ class Rig:
 
 
 def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
-    """Return the stage and the camera of a rig.toml, not yet connected.
+    """Construct the stage and the camera of a rig.toml; neither is connected yet.
 
     Raises
     ------

@@ -113,12 +113,12 @@ class RigGeometry:
         return np.asarray(jacobian @ self.covariance @ jacobian.T)
 
     def sigma_mm(self) -> NDArray[np.float64]:
-        """Return the standard deviation of each centre (node,): √ of the trace of its covariance."""
+        """Return the total standard deviation of each centre over its three axes (node,): √ of the trace."""
         variances = np.diag(self.centre_covariance_mm2()).reshape(-1, 3)
         return np.asarray(np.sqrt(variances.sum(axis=1)))
 
     def sigma_rad(self) -> NDArray[np.float64]:
-        """Return the standard deviation of each orientation (node,): √ of the trace of its rotation's covariance."""
+        """Return the total standard deviation of each orientation over its three axes (node,): √ of the trace."""
         return np.array([np.sqrt(np.trace(self.pose_covariance(node)[:3, :3])) for node in range(len(self.nodes))])
 
     def _pose_slice(self, node: int) -> slice:

@@ -1,7 +1,7 @@
 """Convert fitted parameters to EMVA 1288 quantities with intervals, or with the reason why there is no value.
 
-A quantity has a value if the frames determine it: gain and read noise to a tenth, the dark current so well that its
-error does not matter in comparison with the noise. A fit returns a number even if they do not.
+A fit always returns numbers. A quantity has a value only if the frames determine it: gain and read noise if the gain is
+known to 10 %, the dark current if its error does not matter in comparison with the noise.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from faintfield.calib.noise.pixels import Response, quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.statistics import Series
 
-# Largest relative standard error of a value.
+# Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
 
 _FLATS_REMEDY = "record at least 2 flats at half of saturation, or darks long enough for tens of dark electrons"
@@ -81,7 +81,7 @@ def _in_electrons(
 def _levels_quantile(fit: NoiseFit, moments: Moments) -> float:
     """Return the half width of a 95 % interval, in standard errors, of a quantity that follows from the dark levels.
 
-    It is Student's if the jitter of the levels, which few frames determine, matters.
+    The quantile is that of Student's t if jitter between frames dominates, because few frames determine it.
     """
     pixel_part = float(np.exp(fit.values["log_read_dn2"])) / moments.pixels
     freedom = float((moments.darks.frames - 1).sum())
@@ -122,7 +122,7 @@ def _why_no_current(
     if not levels_hold:
         return "the dark levels are no straight line over exposure time; let the camera settle and record them again"
     signal, half_width = fit.values["dark_signal_dn_per_s"], quantile * fit.standard_error("dark_signal_dn_per_s")
-    # The error of a normal law with the same interval: with few frames the formal one is too small.
+    # Standard error of a normal distribution with the same interval: with few frames the formal one is too small.
     se = half_width / float(stats.norm.ppf(0.975))
     gain = float(np.exp(fit.values["log_gain"]))
     noise_e2 = float(np.exp(fit.values["log_read_dn2"])) / gain**2
@@ -204,7 +204,7 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
         se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
         return _root(excess, se, quantile)
 
-    # A fit at its bound of zero has no curvature; the error is then that of the levels' scatter without jitter.
+    # A jitter fitted as zero has no standard error: use the scatter of the levels that is expected without jitter.
     chance = float(np.average(noise, weights=freedom) / pixels * np.sqrt(2 / freedom.sum()))
     jitter_se = fit.standard_error("jitter_dn2") or chance
     return {

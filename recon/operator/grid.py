@@ -40,12 +40,12 @@ class PlaneGrid:
 
     @classmethod
     def covering(cls, left_mm: float, top_mm: float, right_mm: float, bottom_mm: float, pitch_mm: float) -> "PlaneGrid":
-        """Return the grid whose samples, squares of `pitch_mm`, tile the rectangle with the given edges."""
+        """Return the grid of samples `pitch_mm` apart on the rectangle with these edges, whole samples only."""
         rows, columns = round((bottom_mm - top_mm) / pitch_mm), round((right_mm - left_mm) / pitch_mm)
         return cls((rows, columns), pitch_mm, (left_mm + pitch_mm / 2, top_mm + pitch_mm / 2))
 
     def binned(self, bins: int) -> "PlaneGrid":
-        """Return the grid whose samples each cover `bins` by `bins` of these, without a remainder at the far edges."""
+        """Return the grid with samples of `bins` by `bins` of these; incomplete ones at the far edges are dropped."""
         first = tuple(origin + self.pitch_mm * (bins - 1) / 2 for origin in self.origin_mm)
         return PlaneGrid((self.shape[0] // bins, self.shape[1] // bins), self.pitch_mm * bins, (first[0], first[1]))
 

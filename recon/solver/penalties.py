@@ -42,15 +42,16 @@ class Penalty:
     def for_noise(cls, name: PenaltyName, noise_e: Callable[[], float]) -> "Penalty":
         """Return a penalty whose δ suits a back-projection with noise of standard deviation `noise_e()`.
 
-        Total variation has no δ and does not call it. The quadratic penalty weights differences as large as the noise
-        about as much as total variation does; Huber's is total variation for differences above a tenth of the noise.
+        Total variation has no δ, so `noise_e` is not called. The quadratic penalty weights differences as large as the
+        noise about as much as total variation does; Huber's is total variation for differences above a tenth of the
+        noise.
         """
         share = {"quadratic": 1.0, "huber-tv": 0.1}.get(name, 0.0)
         return cls(name, share * noise_e() if share else 0.0)
 
     @property
     def bounded(self) -> bool:
-        """Whether the derivative of φ stays below one."""
+        """Whether the derivative of φ never exceeds one."""
         return self.name != "quadratic"
 
 

@@ -1,9 +1,9 @@
-"""The stage of every driver: decides when a reported position can be trusted, and checks limits and arrival.
+"""The stage, whatever its driver: decides when a reported position can be trusted, and checks limits and arrival.
 
 A `Controller` only sends motions and reads positions; the rules are here, in one place. The position is trusted from
 homing until something happens after which the controller's count and the carriage may differ: an alarm that loses the
-position, a restart, a lost connection, a timeout, a report that is off target, an interruption. Only homing restores
-trust.
+position, a restart, a lost connection, a timeout, a report that is off target, an interruption. Only homing
+of all axes restores trust.
 """
 
 import math
@@ -97,7 +97,7 @@ class Gantry:
         return min(self.identify().motion.rate_mm_per_s) if configured is None else configured / 60.0
 
     def home(self, axis: AxisIndex | None = None) -> Homing:
-        """Find the switches; positions are trusted from then on.
+        """Home the stage; positions are trusted once all axes have been homed together.
 
         Parameters
         ----------
@@ -120,7 +120,8 @@ class Gantry:
     def move_to(self, x_mm: float, y_mm: float) -> Position:
         """Go to a position, wait until the stage stands still there, and return the verified report.
 
-        Every axis arrives upwards (`one_sided_path`), so play in the drive does not affect where the carriage stops.
+        Each axis approaches its target in the positive direction (`one_sided_path`), so play in the drive does not
+        affect where the carriage stops.
 
         Raises
         ------
@@ -206,7 +207,7 @@ class Gantry:
             return self._controller.switches()
 
     def hold(self) -> None:
-        """Stop at once; the position is kept if the controller slows down within its acceleration."""
+        """Stop at once; the position is kept if the controller decelerates without losing steps."""
         self._here = None
         with self._tracking_trust():
             self._trusted &= self._controller.stop()
