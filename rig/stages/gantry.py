@@ -2,8 +2,8 @@
 
 A `Controller` only sends motions and reads positions; the rules are here, in one place. The position is trusted from
 homing until something happens after which the controller's count and the carriage may differ: an alarm that loses the
-position, a restart, a lost connection, a timeout, a report that is off target, an interruption. Only homing
-of all axes restores trust.
+position, a restart, a lost connection, a timeout, a report that is off target, an interruption. Only homing of all
+axes restores trust.
 """
 
 import math
@@ -120,8 +120,7 @@ class Gantry:
     def move_to(self, x_mm: float, y_mm: float) -> Position:
         """Go to a position, wait until the stage stands still there, and return the verified report.
 
-        Each axis approaches its target in the positive direction (`one_sided_path`), so play in the drive does not
-        affect where the carriage stops.
+        Each axis arrives in the positive direction (`one_sided_path`), so play in the drive does not affect the place.
 
         Raises
         ------

@@ -52,7 +52,7 @@ def test_what_is_found_beside_a_plane_is_vouched_for_with_it(scene: Path, tmp_pa
     sigma.write_bytes(sigma.read_bytes()[:-4] + b"\0\0\x80\x3f")
     assert "1 of 2 planes are there" in done(*words, "--uncertainty").stderr
     assert _files(out) == first
-    assert "How sure: the standard deviation" in (out / "report.html").read_text()
+    assert "Uncertainty: the standard deviation" in (out / "report.html").read_text()
     done(*words)
     assert set(_files(out)) == {name for name in first if "sigma" not in name}
 

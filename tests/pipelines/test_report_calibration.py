@@ -328,7 +328,7 @@ def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> Non
     path.write_text(json.dumps(content))
     done("report", folder)
     text = (folder / "report.html").read_text()
-    table = text[text.index("What knowing the poses is worth") : text.index("All planes")]
+    table = text[text.index("Errors by kind of poses") : text.index("All planes")]
     assert [table.index(f"{kind} poses") for kind in ("nominal", "measured", "true")] == sorted(
         table.index(f"{kind} poses") for kind in errors
     )
