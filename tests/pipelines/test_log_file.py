@@ -33,7 +33,7 @@ def test_a_command_that_succeeds_and_one_that_fails_share_a_log(tmp_path: Path, 
     assert re.search(r"versions: python \S+, faintfield \S+, numpy ", words[1])
     assert words[2] == first.stderr.strip()
     assert re.fullmatch(r"done in \d+\.\d s", words[3])
-    assert f"by OutputExists: {rig}: is there already" in words[6]
+    assert f"by OutputExists: {rig}: exists and is not overwritten" in words[6]
 
 
 def test_wrong_usage_is_recorded_in_a_line(tmp_path: Path, faintfield: Command) -> None:
