@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
-from faintfield.rig.session import durable
+from faintfield.rig.session import durable, regular_files
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
@@ -199,7 +199,7 @@ def require_room(path: Path, needed_bytes: int) -> None:
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
     try:
-        return durable.sha256(path)
+        return regular_files.sha256(path)
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 

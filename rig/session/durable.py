@@ -1,6 +1,5 @@
-"""Hash files, and make renames survive a power cut; for sessions and for results."""
+"""Make renames survive a power cut; for sessions and for results."""
 
-import hashlib
 import os
 from pathlib import Path
 
@@ -12,9 +11,3 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file's bytes, in hexadecimal."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

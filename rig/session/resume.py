@@ -9,8 +9,9 @@ import msgspec
 
 from faintfield.rig.errors import PlanRefused, SessionCorrupt
 from faintfield.rig.session.disk import PART, lock_session, set_aside, translate_errors, write_new
-from faintfield.rig.session.durable import sha256, sync_folder
+from faintfield.rig.session.durable import sync_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
+from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.session.session import (
     ASIDE,
     FRAMES,

@@ -12,8 +12,8 @@ from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.disk import encode_exposure, write_new
-from faintfield.rig.session.durable import sha256
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
+from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"

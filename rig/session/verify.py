@@ -9,8 +9,8 @@ from msgspec import Struct
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import PlannedFrame, planned_frames
 from faintfield.rig.session.disk import lock_session
-from faintfield.rig.session.durable import sha256
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal, Sealed, Suspect
+from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed, read_plan
 
 

@@ -1,0 +1,56 @@
+"""Read and hash regular files of a bounded size; for sessions and for results.
+
+A name in a file may lead to a pipe, which never answers, or to a device, which never ends. Both are refused here.
+"""
+
+import errno
+import hashlib
+import os
+import stat
+from io import BufferedReader
+from pathlib import Path
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """Open a regular file, or a link to one, for reading.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened, or is a pipe, a device, a socket or a folder.
+    """
+    _require_regular(path, os.stat(path))  # before it is opened, which can already act on a device
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        _require_regular(path, os.fstat(descriptor))
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_regular(path: Path, max_bytes: int) -> bytes:
+    """Return the content of a regular file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be opened or read, is not a regular file, or is larger than `max_bytes`.
+    """
+    with open_regular(path) as file:
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        size = path.stat().st_size
+        raise OSError(errno.EFBIG, f"holds {size} bytes, at most {max_bytes} are read", str(path))
+    return content
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a regular file's bytes, in hexadecimal; raise OSError as `open_regular` does."""
+    with open_regular(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _require_regular(path: Path, state: os.stat_result) -> None:
+    if not stat.S_ISREG(state.st_mode):
+        raise OSError(errno.EINVAL, "is not a regular file", str(path))
