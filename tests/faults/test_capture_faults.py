@@ -28,6 +28,7 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, in_process
 from tests.faults.stage_faults import Fault, faults_of
+from tests.patience import HANG_S
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
@@ -208,7 +209,7 @@ def limited_capture(folder: Path, room_bytes: int) -> None:
 def test_a_full_disk(tmp_path: Path, room_bytes: int) -> None:
     folder = tmp_path / "session"
     process = in_process(limited_capture, folder, room_bytes)
-    process.join(60.0)
+    process.join(HANG_S)
     assert process.exitcode == 0
     assert not list(folder.glob("frames/*.part"))
     capture_small(folder)
@@ -244,7 +245,7 @@ def capture_read_only(folder: Path, place: str) -> None:
 def test_a_folder_made_read_only(tmp_path: Path) -> None:
     folder = tmp_path / "session"
     process = in_process(capture_read_only, folder, "frames")
-    process.join(60.0)
+    process.join(HANG_S)
     assert process.exitcode == 0
     (folder / "frames").chmod(0o700)
     assert 0 < len(list((folder / "frames").iterdir())) < FRAMES

@@ -14,6 +14,7 @@ import tifffile
 import tomli_w
 
 from faintfield.pipelines.cli import run
+from tests.patience import HANG_S
 
 type Damage = Callable[[Path], object]
 
@@ -167,7 +168,7 @@ def test_decoders_add_no_words_of_their_own(name: str, whole_set: Path, tmp_path
     (folder / name).write_bytes(content)
     words = ["reconstruct", str(folder), "--out", str(tmp_path / "out"), "--depth-mm", "500"]
     code = f"from faintfield.pipelines.cli import main; main({words!r})"
-    ended = run_process([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
+    ended = run_process([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG_S, check=False)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.startswith("faintfield: UnreadableImage: ")
     assert len(ended.stderr.splitlines()) == 1
