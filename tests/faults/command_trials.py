@@ -15,11 +15,13 @@ from pathlib import Path
 import pytest
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.formats.files import CACHE_FILE
+from faintfield.pipelines.formats.files import CACHE_FILE, UNFINISHED
+from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.rig.session.disk import PART
 from faintfield.rig.session.session import JOURNAL, SUMS
 from faintfield.rig.session.verify import verify
 from tests.faults.io_faults import KINDS, Action, Ended, Fault, Faults, Trial, compiled, faults
+from tests.patience import HANG_S
 
 _RIG = """
 [stage]
@@ -60,13 +62,11 @@ _FEW = (("dark_scene", 0.1, 1), ("dark", 0.1, 1))
 _ENOUGH = (*(("charuco", 0.05, 1),) * 3, ("dark_scene", 0.1, 1), ("dark", [0.1, 60.0], 2), ("flat", 0.1, 2))
 _PLANE = ["--depth-mm", "500", "--passes", "1", "--penalty-weight", "0.1"]
 
-_TIMES = re.compile(
-    rb'"wall_time_s": [^,\n]+|\d{4}-\d\d-\d\d \d\d:\d\d:\d\d UTC</td>\s*<td[^>]*>[^<]*</td>(\s*<td[^>]*>[^<]*</td>)*'
-)
+_TIMES = re.compile(rb'"wall_time_s": [^,\n]+|<th scope="row">(?:written|wall time, s)</th><td>[^<]*</td>')
 _EXPOSURE = re.compile(r"_x\d+")
 
-# Names that a command gives to what is not finished
-_TEMPORARY = re.compile(rf"\.unfinished$|{re.escape(PART)}$|^\.\w+\.\w{{8}}$|^\.parts$")
+# Names of what is not finished: files, and folders
+_TEMPORARY = re.compile(rf"{re.escape(UNFINISHED)}$|{re.escape(PART)}$|^\.\w+\.\w{{8}}$")
 
 
 @dataclass(frozen=True)
@@ -153,11 +153,11 @@ class Bench:
         shutil.rmtree(self.folder(name), ignore_errors=True)
         return Path(shutil.copytree(self._inputs / name, self.folder(name)))
 
-    def run(self, name: str, fault: Fault | None = None, diary: Path | None = None) -> Ended:
-        """Run a command, perhaps with a fault, on what is in its folder."""
+    def run(self, name: str, fault: Fault | None = None, diary: Path | None = None, limit_s: float = HANG_S) -> Ended:
+        """Run a command, perhaps with a fault, on what is in its folder; kill it after `limit_s`."""
         folder = self.folder(name)
         words = COMMANDS[name].words(folder)
-        return self._server.run(Trial(words, str(folder), fault or Fault(), str(diary) if diary else None))
+        return self._server.run(Trial(words, str(folder), fault or Fault(), str(diary) if diary else None, limit_s))
 
     def undisturbed(self, name: str) -> dict[str, bytes]:
         """Return inputs and results of a command after an undisturbed run."""
@@ -178,20 +178,22 @@ class Bench:
         """Assert that inputs and results are those of an undisturbed run, and that nothing else is left."""
         wanted, found = self.undisturbed(name), results(self.folder(name))
         if name != "capture":
-            assert found.keys() == wanted.keys()
-            assert [file for file in found if found[file] != wanted[file]] == []
+            assert found.keys() == wanted.keys(), f"not both there: {found.keys() ^ wanted.keys()}"
+            self._assert_none_differs(name, found)
             return
         verdict = verify(self.folder(name) / "out")
-        assert (verdict.problems, verdict.missing, verdict.superseded, verdict.sealed) == ((), (), 0, True)
-        assert _frames(found) == _frames(wanted)
+        assert (verdict.problems, verdict.missing, verdict.superseded, verdict.sealed) == ((), (), 0, True), verdict
+        assert _frames(found) == _frames(wanted), f"not both there: {_frames(found) ^ _frames(wanted)}"
         self._assert_none_differs(name, found)
 
     def assert_nothing_half_written(self, name: str, *, leftovers: bool) -> None:
         """Assert that each file is as an undisturbed run leaves it; `leftovers`: or has a temporary name."""
         found = results(self.folder(name))
         if not leftovers:
-            assert [file for file in found if _TEMPORARY.search(file)] == []
-        self._assert_none_differs(name, {file: content for file, content in found.items() if not _is_temporary(file)})
+            temporary = [file for file in found if _is_temporary(file)]
+            assert temporary == [], f"left: {temporary}"
+        finished = {file: content for file, content in found.items() if not (_is_temporary(file) or PARTS in file)}
+        self._assert_none_differs(name, finished)
 
     def _assert_none_differs(self, name: str, found: dict[str, bytes]) -> None:
         wanted = self.undisturbed(name)
@@ -200,9 +202,9 @@ class Bench:
         }
         for file, content in found.items():
             if name == "capture" and (file in changing or file not in wanted):
-                assert file in changing or _EXPOSURE.search(file), file
+                assert file in changing or _EXPOSURE.search(file), f"unknown file: {file}"
                 continue
-            assert wanted.get(file) == content, file
+            assert wanted.get(file) == content, f"differs: {file}"
 
 
 def _is_temporary(file: str) -> bool:
@@ -258,7 +260,7 @@ def assert_survives(bench: Bench, name: str, fault: Fault) -> bool:
     """Assert that a command with a fault succeeds, or fails by name and then succeeds; return whether it failed."""
     bench.renew(name)
     ended = bench.run(name, fault)
-    assert ended.stray == ""
+    assert ended.stray == "", ended.stray
     assert ended.code in (0, 1), ended.complaint or ended.code
     if ended.code == 0:
         bench.assert_finished(name)
@@ -267,8 +269,8 @@ def assert_survives(bench: Bench, name: str, fault: Fault) -> bool:
     assert len(lines) == 1, ended.complaint
     assert ended.complaint.splitlines()[-1] == lines[0]
     assert _FAILURE.match(lines[0]), lines[0]
-    assert "Traceback" not in ended.complaint
-    assert ended.said == ""
+    assert "Traceback" not in ended.complaint, ended.complaint
+    assert ended.said == "", ended.said
     bench.assert_nothing_half_written(name, leftovers=fault.kind == "remove")
     again = bench.run(name)
     assert (again.code, again.stray) == (0, ""), again.complaint

@@ -22,6 +22,8 @@ from typing import IO, Literal
 
 import msgspec
 
+from tests.patience import HANG_S
+
 ROOT = Path(__file__).parents[2]
 SOURCE = Path(__file__).with_suffix(".c")
 
@@ -29,8 +31,8 @@ SOURCE = Path(__file__).with_suffix(".c")
 KINDS = ("open", "create", "list", "status", "read", "write", "sync", "rename", "remove", "make", "lock", "allocate")
 ACTIONS = ("count", "fail once", "fail from then on", "cut short", "kill")
 
-# What an exit code tells of a command that ended by something else than itself
-CRASHED, HUNG = 70, 71
+# Exit codes of a command that ended by an exception, and of one that was killed after its time
+CRASHED, TIME_OVER = 70, 71
 
 type Action = Literal["count", "fail once", "fail from then on", "cut short", "kill"]
 
@@ -61,13 +63,27 @@ class Fault(msgspec.Struct, frozen=True):
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """A command, the folder whose files count, and the fault; all calls are listed in the file `diary`, if named."""
+    """What is tried.
+
+    Attributes
+    ----------
+    words : list of str
+        The command.
+    folder : str
+        The files in it count; no other may be changed.
+    fault : Fault
+        What happens to one of the calls.
+    diary : str, optional
+        File in which all calls are listed.
+    limit_s : float
+        The command is killed after this time.
+    """
 
     words: list[str]
     folder: str
     fault: Fault = Fault()
     diary: str | None = None
-    limit_s: float = 600.0
+    limit_s: float = HANG_S
 
 
 class Ended(msgspec.Struct, frozen=True):
@@ -188,12 +204,11 @@ def _tried(trial: Trial, library: ctypes.CDLL) -> Ended:
         if process.exitcode is None:
             process.kill()
             process.join()
-            code = HUNG
+            code = TIME_OVER
         else:
             code = process.exitcode
-        texts = [_content(file) for file in (said, complaint)]
         injected, _, stray = _content(report).partition(" ")
-        return Ended(code, *texts, int(injected or 0), stray)
+        return Ended(code, _content(said), _content(complaint), int(injected or 0), stray)
 
 
 def _child(trial: Trial, library: ctypes.CDLL, said: IO[bytes], complaint: IO[bytes], report: IO[bytes]) -> None:
