@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 
@@ -20,7 +21,7 @@ from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.rig.session.disk import PART
 from faintfield.rig.session.session import JOURNAL, SUMS
 from faintfield.rig.session.verify import verify
-from tests.faults.io_faults import KINDS, Action, Ended, Fault, Faults, Trial, compiled, faults
+from tests.faults.io_faults import KINDS, Action, Ended, Fault, Trial, compiled, faults
 from tests.patience import HANG_S
 
 _RIG = """
@@ -136,10 +137,16 @@ def _frames(found: dict[str, bytes]) -> set[str]:
     return {_EXPOSURE.sub("", name) for name in found if name.startswith("out/frames/")}
 
 
+class Server(Protocol):
+    """Runs trials, as `Faults` does."""
+
+    def run(self, trial: Trial) -> Ended: ...
+
+
 class Bench:
     """Where commands are tried: each finds its own inputs, untouched, at the same place every time."""
 
-    def __init__(self, folder: Path, server: Faults) -> None:
+    def __init__(self, folder: Path, server: Server) -> None:
         self._inputs, self._trials, self._server = folder / "inputs", folder / "trials", server
         self._undisturbed: dict[str, dict[str, bytes]] = {}
         self._calls: dict[str, list[str]] = {}

@@ -156,6 +156,26 @@ def faults(library: Path, warm_up: Sequence[Sequence[str]] = ()) -> Iterator[Fau
             process.kill()
 
 
+def loaded() -> ctypes.CDLL:
+    """Return the library that stands between this process and the C library."""
+    library = ctypes.CDLL(None)
+    library.faults_arm.argtypes = (
+        *(ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_long, ctypes.c_int, ctypes.c_char_p),
+    )
+    library.faults_injected.restype = ctypes.c_long
+    library.faults_stray.restype = ctypes.c_char_p
+    return library
+
+
+def arm(library: ctypes.CDLL, folder: str, fault: Fault, diary: str | None = None) -> None:
+    """Count the calls of this process on the files in a folder from now on, and let one of them fail."""
+    library.faults_arm(
+        *(folder.encode(), KINDS.index(fault.kind), ACTIONS.index(fault.action), fault.nth),
+        getattr(errno, fault.error),
+        None if diary is None else diary.encode(),
+    )
+
+
 def _remember(module: str, name: str) -> None:
     """Replace a function by one that remembers its results."""
     owner = importlib.import_module(module)
@@ -184,12 +204,7 @@ def _serve(warm_up: list[list[str]]) -> None:
     os.dup2(2, 1)
     for words in warm_up:
         assert run(words) == 0, words
-    library = ctypes.CDLL(None)
-    library.faults_arm.argtypes = (
-        *(ctypes.c_char_p, ctypes.c_int, ctypes.c_int, ctypes.c_long, ctypes.c_int, ctypes.c_char_p),
-    )
-    library.faults_injected.restype = ctypes.c_long
-    library.faults_stray.restype = ctypes.c_char_p
+    library = loaded()
     for line in sys.stdin.buffer:
         answers.write(msgspec.json.encode(_tried(msgspec.json.decode(line, type=Trial), library)) + b"\n")
 
@@ -217,12 +232,7 @@ def _child(trial: Trial, library: ctypes.CDLL, said: IO[bytes], complaint: IO[by
 
     os.dup2(said.fileno(), 1)
     os.dup2(complaint.fileno(), 2)
-    fault = trial.fault
-    library.faults_arm(
-        *(trial.folder.encode(), KINDS.index(fault.kind), ACTIONS.index(fault.action), fault.nth),
-        getattr(errno, fault.error),
-        None if trial.diary is None else trial.diary.encode(),
-    )
+    arm(library, trial.folder, trial.fault, trial.diary)
     try:
         code = run(trial.words)
     except BaseException:
