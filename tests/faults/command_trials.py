@@ -1,8 +1,8 @@
 """Commands on small inputs, each tried with a fault and without; what its results must be, to the byte.
 
-What may differ between two runs: the times that `reconstruction.json` and `report.html` state; the hidden cache of
-hashes, which holds times; in a captured session the journal and the lock (times, process number) and the sum of the
-journal. A frame that is exposed again has another number in its name, and another noise.
+What may differ between two runs: the times that `reconstruction.json` and `report.html` state, and hence the digests of
+records; the hidden cache of hashes, which holds times; in a captured session the journal and the lock (times, process
+number) and the sum of the journal. A frame that is exposed again has another number in its name, and another noise.
 """
 
 import re
@@ -16,6 +16,7 @@ from typing import Protocol
 import pytest
 
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.digests import DIGEST_KEY
 from faintfield.pipelines.formats.files import CACHE_FILE, UNFINISHED
 from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.rig.session.disk import PART
@@ -63,7 +64,10 @@ _FEW = (("dark_scene", 0.1, 1), ("dark", 0.1, 1))
 _ENOUGH = (*(("charuco", 0.05, 1),) * 3, ("dark_scene", 0.1, 1), ("dark", [0.1, 60.0], 2), ("flat", 0.1, 2))
 _PLANE = ["--depth-mm", "500", "--passes", "1", "--penalty-weight", "0.1"]
 
-_TIMES = re.compile(rb'"wall_time_s": [^,\n]+|<th scope="row">(?:written|wall time, s)</th><td>[^<]*</td>')
+_TIMES = re.compile(
+    rb'"wall_time_s": [^,\n]+|<th scope="row">(?:written|wall time, s)</th><td>[^<]*</td>|'
+    rb'"%s": "\w+"' % DIGEST_KEY.encode()
+)
 _EXPOSURE = re.compile(r"_x\d+")
 
 # Names of what is not finished: files, and folders

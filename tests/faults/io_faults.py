@@ -18,8 +18,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
-from typing import IO, Literal
+from types import CodeType
+from typing import IO, Any, Literal
 
+import jinja2
 import msgspec
 
 from tests.patience import HANG_S
@@ -106,6 +108,8 @@ _COMPUTATIONS = (
     "faintfield.pipelines.calibration.noise.calibrate",
     "faintfield.pipelines.commands.geometry.geometry_page",
     "faintfield.pipelines.commands.noise.draw_page",
+    "faintfield.pipelines.pages.geometry_page.node_drawing",
+    "faintfield.pipelines.pages.geometry_page.sigma_maps",
     "faintfield.rig.simulation.lab.lab_experiment",
 )
 
@@ -191,6 +195,20 @@ def _remember(module: str, name: str) -> None:
     setattr(owner, name, remembered)
 
 
+def _keep_templates() -> None:
+    """Let templates be compiled once only."""
+    compile_once = jinja2.Environment.compile
+    known: dict[object, CodeType] = {}
+
+    def kept(environment: jinja2.Environment, source: Any, *rest: Any, **named: Any) -> CodeType:
+        key = (source, rest, tuple(named.items()))
+        if key not in known:
+            known[key] = compile_once(environment, source, *rest, **named)
+        return known[key]
+
+    jinja2.Environment.compile = kept  # type: ignore[method-assign, assignment]
+
+
 def _serve(warm_up: list[list[str]]) -> None:
     """Run the commands, then one trial per line of standard input, each in a fork."""
     import cv2
@@ -200,6 +218,7 @@ def _serve(warm_up: list[list[str]]) -> None:
     cv2.setNumThreads(1)
     for place in _COMPUTATIONS:
         _remember(*place.rsplit(".", 1))
+    _keep_templates()
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     for words in warm_up:
