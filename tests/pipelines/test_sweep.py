@@ -49,7 +49,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
     found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     del found["report.html"]
     record = json.loads(found["reconstruction.json"])
-    del record["wall_time_s"]
+    del record["wall_time_s"], record["record_sha256"]
     return found | {"reconstruction.json": json.dumps(record).encode()}
 
 
