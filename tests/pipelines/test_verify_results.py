@@ -267,6 +267,7 @@ class TestVerify:
         assert "not checked: " in ended.stderr
         assert "not found; name their folder by --inputs" in ended.stderr
         assert faintfield("verify", planes, "--inputs", scene).returncode == 1
+        assert "no such folder" in faintfield("verify", planes, "--inputs", tmp_path / "absent").stderr
 
     def test_hostile_inputs_are_not_touched(self, planes: Path) -> None:
         path = planes / "plane_00500.0.json"
