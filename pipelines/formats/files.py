@@ -29,6 +29,8 @@ _NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVA
 UNFINISHED = ".unfinished"
 
 CACHE_FILE = ".hashes.json"
+
+# A cache of a hundred thousand files is smaller.
 _MAX_CACHE_BYTES = 64_000_000
 
 # In nanoseconds: a file changed this shortly before its hashing could change again with the same time stamp.
@@ -282,7 +284,7 @@ class Hashes:
         self._folder = folder
         self._known: dict[str, _Known] = {}
         self._changed = False
-        # Without a whole file, everything is hashed
+        # Without a whole file everything is hashed
         with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             content = regular_files.read_regular(folder / CACHE_FILE, _MAX_CACHE_BYTES)
             self._known = msgspec.json.decode(content, type=dict[str, _Known])
