@@ -99,7 +99,9 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     names = list_names(folder / FRAMES)
     digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
     interrupted = find_interrupted(frames, uncommitted, set(names) - {it.file for it in committed})
-    problems = [] if begun == [plan_sha256] else [f"{PLAN}: is not the plan that the session was begun with"]
+    problems: list[str] = []
+    if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
+        problems.append(f"{PLAN}: is not the plan that the session was begun with")
     problems += find_strangers(frames, committed)
     problems += _compare(committed, digests, set(interrupted))
     if is_sealed(folder):
