@@ -275,3 +275,41 @@ def test_histograms_follow_the_fitted_mass_function() -> None:
             share = histogram.count[common] / histogram.expected[common]
             assert np.abs(share - 1).max() < 0.25
             assert histogram.count.sum() == pytest.approx(histogram.expected.sum(), rel=0.01)
+
+
+def test_a_black_level_that_moves_from_series_to_series_is_no_pixels_offset() -> None:
+    """The same frames with levels off the straight line: the map must keep the pixels' differences from its mean."""
+    chip, rng = specimen(20, dsnu_e=0.5)
+    moved_dn = {0.1: 12, 1.0: 0, 10.0: 14, 60.0: 4}
+    series = take(chip, rng)
+    moved = [replace(s, levels_dn=s.levels_dn + moved_dn[s.conditions.exposure_s]) for s in series]
+    still, jittery = calibrate(series), calibrate(moved)
+    here, there = (one.maps.offset_dn - value(one, "offset_dn") for one in (jittery, still))
+    np.testing.assert_allclose(here, there, atol=0.05)
+    error_dn = jittery.maps.offset_dn - value(jittery, "offset_dn") - (chip.offset_dn - chip.sensor.offset_dn)
+    assert abs(error_dn.mean()) < 0.1
+
+
+def test_rounding_to_whole_numbers_is_part_of_the_noise_of_flats() -> None:
+    """At a tenth of a DN per electron rounding is a fifth of a dim flat's variance, and none of the gain."""
+    chip, rng = specimen(21, shape=(128, 128), gain_dn_per_e=0.1, read_noise_e=5.0, dark_current_e_per_s=0.02)
+    flats = [light(chip, rng, photons, 8, level) for level, photons in enumerate((20.0, 30.0, 40.0))]
+    result = calibrate([*take(chip, rng, (0.1, 1.0)), *flats])
+    assert value(result, "gain_dn_per_e") == pytest.approx(0.1, rel=0.05)
+    for point in result.points[2:]:
+        assert point.variance_dn2 == pytest.approx(0.25 + 1 / 12 + 0.1 * (point.mean_dn - 100.0), rel=0.02)
+        assert point.model_variance_dn2 == pytest.approx(point.variance_dn2, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [21, 22, 24])
+def test_a_dark_current_of_zero_has_an_error_also_where_single_values_are_fitted(seed: int) -> None:
+    chip, rng = specimen(seed, gain_dn_per_e=0.1, read_noise_e=4.5, dark_current_e_per_s=0.0)
+    flats = [light(chip, rng, photons, 8, level) for level, photons in enumerate((20.0, 40.0))]
+    result = calibrate([*take(chip, rng, (0.1, 1.0)), *flats])
+    assert result.likelihood is NoiseLikelihood.EXACT
+    # The level of ten frames of 4096 pixels, of read noise and rounding, at two exposures 0.9 s apart
+    expected_se = np.sqrt(2 * (4.5**2 + 100 / 12) / (10 * 64 * 64)) / 0.9
+    current = result.estimates["dark_current_e_per_s"]
+    assert current.se == pytest.approx(expected_se, rel=0.2)
+    assert current.value is not None
+    assert abs(current.value) < 3 * expected_se
