@@ -313,3 +313,34 @@ def test_a_dark_current_of_zero_has_an_error_also_where_single_values_are_fitted
     assert current.se == pytest.approx(expected_se, rel=0.2)
     assert current.value is not None
     assert abs(current.value) < 3 * expected_se
+
+
+def test_electrons_of_the_dark_are_no_electrons_of_the_light() -> None:
+    """Flats of 10 s, in which a third of the charge is dark current, give the quantum efficiency of the sensor."""
+    chip, rng = specimen(26, dark_current_e_per_s=100.0)
+    series = take(chip, rng, (0.1, 10.0))
+    for level, photons in enumerate((4000.0, 8000.0)):
+        frames: Frames = [(f"flat_{level}_{k}", expose(chip, 10.0, rng, photons)) for k in range(8)]
+        series.append(measure_series(frames, Conditions("flat", 10.0, level, photons)))
+    assert value(calibrate(series), "quantum_efficiency") == pytest.approx(0.5, rel=0.05)
+
+
+def test_the_error_of_row_noise_is_that_of_as_many_rows_as_there_are() -> None:
+    """The variance of R rows in n frames has 2/(R (n − 1)) of relative variance, four series add their freedom."""
+    banding_dn, rows, frames, exposures = 2.0, 64, 10, len(EXPOSURES_S)
+    result = calibrate(take(*specimen(27, banding_dn=banding_dn), frames=frames))
+    row_noise = result.estimates["row_noise_dn"]
+    assert row_noise.value == pytest.approx(banding_dn, rel=0.15)
+    expected_se = banding_dn * np.sqrt(2 / (rows * (frames - 1) * exposures)) / 2
+    assert row_noise.se == pytest.approx(expected_se, rel=0.25)
+
+
+def test_uneven_dark_current_in_long_flats_is_no_response_to_light() -> None:
+    """A third of the charge is dark current, which differs by a fifth between pixels; all respond alike."""
+    chip, rng = specimen(29, dark_current_e_per_s=100.0, dcnu=0.2)
+    series = take(chip, rng, (0.1, 10.0))
+    frames: Frames = [(f"flat_{k}", expose(chip, 10.0, rng, 4000.0)) for k in range(8)]
+    result = calibrate([*series, measure_series(frames, Conditions("flat", 10.0))])
+    response = result.maps.relative_response
+    assert response is not None
+    assert response[~result.maps.unusable].std() < 0.02
