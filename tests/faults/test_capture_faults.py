@@ -124,6 +124,22 @@ def test_stage_faults_in_mid_capture(tmp_path: Path, protocol: str, fault: Fault
     lab.assert_true_positions()
 
 
+@pytest.mark.parametrize("feed_mm_per_min", [300, 6000], ids=["it still moves afterwards", "it stands elsewhere"])
+def test_a_stage_that_somebody_jogs_during_an_exposure_has_the_frame_taken_again(
+    tmp_path: Path, feed_mm_per_min: int
+) -> None:
+    lab = Lab(tmp_path / "session", "grbl")
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        camera.on_exposure = {3: lambda: bench.firmware.receive(b"$J=G91 G21 X-0.5 F%d\n" % feed_mm_per_min)}
+
+    assert lab.run(prepare) is None
+    lab.assert_true_positions()
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        assert [frame for _, frame in journal.uncommitted()] == [2]
+        assert len(journal.events("stage_failed")) == 1
+
+
 def make_slip(bench: Bench, camera: TruthfulCamera) -> None:
     """Let an axis lose steps in the second step of the plan."""
 
