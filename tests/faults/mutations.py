@@ -1,0 +1,178 @@
+"""Mutate the files that commands read, and judge how the commands end; all of a case follows from its kind and seed.
+
+    python -m tests.faults.mutations KIND SEED          one case: print what it did and what came of it
+    python -m tests.faults.mutations KIND FIRST:LAST    many cases: print those that failed
+
+A case copies a small valid folder, does one to three operations to its files (tests/faults/mutation_operations.py) and
+runs one command that reads them (tests/faults/mutation_kinds.py) in a child process with 2 GB and 30 s. The command
+must end with exit code 0, or with 1 or 2 and one line. It must change no file outside its own folder, leave nothing
+half-written, and leave nothing running.
+"""
+
+import fcntl
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from faintfield.pipelines import registry
+from faintfield.pipelines.cli import run
+from faintfield.recon import compile_kernels
+from tests.faults import contained, mutation_operations
+from tests.faults.mutation_kinds import KINDS
+
+# Threads would not survive the fork, and their stacks count as memory; libraries read these as they are loaded.
+ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+
+CASES = Path(__file__).parent / "mutation_cases" / "found.jsonl"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One mutation: the kind of files, the number of the call, and what is done to which file."""
+
+    kind: str
+    call: int
+    edits: tuple[tuple[str, str, list[Any]], ...]
+
+    def __str__(self) -> str:
+        done = "; ".join(f"{file}: {name} {_short(arguments)}" for file, name, arguments in self.edits)
+        return f"{KINDS[self.kind].calls[self.call].words}\n    {done}"
+
+
+def _short(arguments: Sequence[Any]) -> str:
+    words = json.dumps(arguments)
+    return words if len(words) < 300 else f"{words[:200]} … {words[-50:]}"
+
+
+class Bench:
+    """Makes valid folders once, copies and mutates them, and runs the commands.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the valid folders are kept, which several benches may share, and where the cases run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._valid = folder / "valid"
+        self._valid.mkdir(parents=True, exist_ok=True)
+        self._guard = Path(tempfile.mkdtemp(prefix="case-", dir=folder))
+
+    def draw(self, kind: str, seed: int) -> Case:
+        """Return the case of a seed."""
+        rng = Random(f"{kind} {seed}")
+        self._lay_out(kind)
+        place = self._guard / "IN"
+        call = rng.randrange(len(KINDS[kind].calls))
+        edits = []
+        for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
+            pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
+            path = rng.choice(
+                sorted(it for it in place.glob(pattern) if it.is_file() and not it.is_symlink()) or [None]
+            )
+            if path is None:
+                continue
+            name, arguments = mutation_operations.draw(rng, path)
+            edits.append((str(path.relative_to(place)), name, arguments))
+            mutation_operations.apply(path, name, arguments)
+        return Case(kind, call, tuple(edits))
+
+    def faults(self, case: Case) -> list[str]:
+        """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
+        self._lay_out(case.kind)
+        call = KINDS[case.kind].calls[case.call]
+        place = self._guard / "IN"
+        for file, name, arguments in case.edits:
+            if os.path.lexists(place / file):
+                mutation_operations.apply(place / file, name, arguments)
+        before = contained.state_of(self._guard)
+        self.ended = contained.contained(lambda: run(call.words.split()), self._guard)
+        faults = contained.faults_of(self.ended, self._guard, before, call.may_change)
+        if self.ended.code == 0 and call.then:
+            after = contained.contained(lambda: run(call.then.split()), self._guard)
+            if after.code != 0:
+                faults.append(f"`{call.words}` ended well, and then `{call.then}` said: {after.err[-300:]}")
+        return faults
+
+    def close(self) -> None:
+        """Remove the files of the last case."""
+        shutil.rmtree(self._guard, ignore_errors=True)
+
+    def _lay_out(self, kind: str) -> None:
+        """Lay out the valid files of a kind in a folder that also holds files of other people."""
+        valid = self._valid_folder(kind)
+        shutil.rmtree(self._guard)
+        (self._guard / "beside").mkdir(parents=True)
+        (self._guard / "beside" / "notes.txt").write_text("of someone else\n")
+        (self._guard / mutation_operations.VICTIM).write_text("of someone else\n")
+        shutil.copytree(valid, self._guard / "IN", symlinks=True)
+
+    def _valid_folder(self, kind: str) -> Path:
+        """Return the valid folder of a kind, made by a child, by one bench for all."""
+        seed = KINDS[kind].seed
+        folder = self._valid / f"{kind} {getattr(seed, '__name__', '')}"
+        with (self._valid / f"{kind}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not folder.exists():
+                building = folder.with_name(f"{folder.name} unfinished")
+                shutil.rmtree(building, ignore_errors=True)
+                ended = contained.contained(lambda: seed(building) or 0, self._valid, seconds=600.0)
+                if ended.code != 0:
+                    raise RuntimeError(f"{kind}: cannot be made: {ended.err}")
+                building.rename(folder)
+        return folder
+
+
+def warm_up() -> None:
+    """Load what commands load when they are first used, so that children inherit it."""
+
+    folder = Path(registry.__file__).parent / "commands"
+    for path in folder.rglob("*.py"):
+        module = ".".join(path.relative_to(folder).with_suffix("").parts)
+        if path.stem not in ("__init__", "view"):
+            import_module(f"faintfield.pipelines.commands.{module}")
+    for module in ("matplotlib.figure", "matplotlib.backends.backend_agg", "skimage.filters", "mrcal", "zarr", "rawpy"):
+        import_module(module)
+    compile_kernels()
+    if len(os.listdir("/proc/self/task")) > 1:
+        raise RuntimeError("this process has threads, which would not survive a fork")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the cases that are asked for."""
+    words = [it for it in arguments if not it.startswith("--")]
+    kinds = list(KINDS) if words[0] == "all" else [words[0]]
+    first, _, last = words[1].partition(":")
+    place = os.environ.get("MUTATIONS", "")
+    folder = Path(place or tempfile.mkdtemp(prefix="mutations-"))
+    bench = Bench(folder)
+    warm_up()
+    failed = 0
+    for kind in kinds:
+        for seed in range(int(first), int(last) if last else int(first) + 1):
+            case = bench.draw(kind, seed)
+            faults = bench.faults(case)
+            failed += bool(faults)
+            if faults or not last:
+                sys.stdout.write(f"{kind} {seed}: {case}\n{''.join(f'    -> {fault}\n' for fault in faults)}")
+            if not last:
+                sys.stdout.write(f"    exit code {bench.ended.code}, {bench.ended.seconds:.2f} s\n{bench.ended.err}")
+    bench.close()
+    if not place:
+        shutil.rmtree(folder)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    if not os.environ.items() >= ONE_THREAD.items():
+        words = [sys.executable, "-m", "tests.faults.mutations", *sys.argv[1:]]
+        os.execve(sys.executable, words, os.environ | ONE_THREAD)
+    sys.exit(main(sys.argv[1:]))
