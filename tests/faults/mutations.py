@@ -15,7 +15,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -62,14 +62,16 @@ class Bench:
     """
 
     def __init__(self, folder: Path) -> None:
+        self.ended: contained.Ended
         self._valid = folder / "valid"
         self._valid.mkdir(parents=True, exist_ok=True)
         self._guard = Path(tempfile.mkdtemp(prefix="case-", dir=folder))
+        (self._guard / mutation_operations.VICTIM).touch()
 
     def draw(self, kind: str, seed: int) -> Case:
         """Return the case of a seed."""
         rng = Random(f"{kind} {seed}")
-        self._lay_out(kind)
+        self.lay_out(kind)
         place = self._guard / "IN"
         call = rng.randrange(len(KINDS[kind].calls))
         edits = []
@@ -87,26 +89,50 @@ class Bench:
 
     def faults(self, case: Case) -> list[str]:
         """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
-        self._lay_out(case.kind)
+        self.lay_out(case.kind)
         call = KINDS[case.kind].calls[case.call]
         place = self._guard / "IN"
         for file, name, arguments in case.edits:
             if os.path.lexists(place / file):
                 mutation_operations.apply(place / file, name, arguments)
-        before = contained.state_of(self._guard)
-        self.ended = contained.contained(lambda: run(call.words.split()), self._guard)
-        faults = contained.faults_of(self.ended, self._guard, before, call.may_change)
+        changed = sorted(self._changed(case.kind, call.notices))
+        faults = self.faults_of(lambda: run(call.words.split()), may_change=call.may_change)
+        if self.ended.code == 0 and changed:
+            faults.append(f"did not notice that {', '.join(changed)} changed")
         if self.ended.code == 0 and call.then:
-            after = contained.contained(lambda: run(call.then.split()), self._guard)
-            if after.code != 0:
-                faults.append(f"`{call.words}` ended well, and then `{call.then}` said: {after.err[-300:]}")
+            ended, self.ended = self.ended, contained.contained(lambda: run(call.then.split()), self._guard)
+            if self.ended.code != 0:
+                faults.append(f"ended well, and then `{call.then}` did not: {self.ended.err[-300:]}")
+            self.ended = ended
         return faults
+
+    def faults_of(
+        self,
+        call: Callable[[], int],
+        seconds: float = contained.MAX_SECONDS,
+        may_change: tuple[str, ...] = ("OUT", "OUT/*"),
+    ) -> list[str]:
+        """Run a call among the files that are laid out, and return what is wrong with how it ended."""
+        before = contained.state_of(self._guard)
+        self.ended = contained.contained(call, self._guard, seconds=seconds)
+        return contained.faults_of(self.ended, self._guard, before, may_change)
+
+    def _changed(self, kind: str, patterns: Iterable[str]) -> Iterator[str]:
+        """Yield the names of the files whose content is not that of the valid ones."""
+        valid, place = self._valid_folder(kind), self._guard / "IN"
+        for pattern in patterns:
+            for path in valid.glob(pattern):
+                name = path.relative_to(valid)
+                mutated = place / name
+                same = mutated.is_file() and mutated.stat().st_size == path.stat().st_size
+                if not (same and mutated.read_bytes() == path.read_bytes()):
+                    yield str(name)
 
     def close(self) -> None:
         """Remove the files of the last case."""
         shutil.rmtree(self._guard, ignore_errors=True)
 
-    def _lay_out(self, kind: str) -> None:
+    def lay_out(self, kind: str) -> None:
         """Lay out the valid files of a kind in a folder that also holds files of other people."""
         valid = self._valid_folder(kind)
         shutil.rmtree(self._guard)
@@ -146,27 +172,66 @@ def warm_up() -> None:
         raise RuntimeError("this process has threads, which would not survive a fork")
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Run the cases that are asked for."""
-    words = [it for it in arguments if not it.startswith("--")]
-    kinds = list(KINDS) if words[0] == "all" else [words[0]]
-    first, _, last = words[1].partition(":")
-    place = os.environ.get("MUTATIONS", "")
-    folder = Path(place or tempfile.mkdtemp(prefix="mutations-"))
-    bench = Bench(folder)
+def serve(folder: Path) -> None:
+    """Answer requests on standard input, one line of JSON each, by the faults that were found.
+
+    A request names a kind and the first and last seed, or a case, or a function to run in the place of a command.
+    """
     warm_up()
-    failed = 0
-    for kind in kinds:
-        for seed in range(int(first), int(last) if last else int(first) + 1):
-            case = bench.draw(kind, seed)
-            faults = bench.faults(case)
-            failed += bool(faults)
-            if faults or not last:
-                sys.stdout.write(f"{kind} {seed}: {case}\n{''.join(f'    -> {fault}\n' for fault in faults)}")
-            if not last:
-                sys.stdout.write(f"    exit code {bench.ended.code}, {bench.ended.seconds:.2f} s\n{bench.ended.err}")
+    bench = Bench(folder)
+    for line in sys.stdin:
+        request = json.loads(line)
+        if "function" in request:
+            bench.lay_out("elemental set")
+            found = bench.faults_of(named(request["function"]), request["seconds"])
+        elif "edits" in request:
+            found = _described(bench, "kept", Case(request["kind"], request["call"], request["edits"]))
+            if request.get("succeeds") and bench.ended.code != 0:
+                found.append(bench.ended.err)
+        else:
+            seeds = range(request["first"], request["last"])
+            found = [it for seed in seeds for it in _described(bench, seed, bench.draw(request["kind"], seed))]
+        sys.stdout.write(json.dumps(found) + "\n")
+        sys.stdout.flush()
     bench.close()
-    if not place:
+
+
+def named(name: str) -> Callable[[], int]:
+    """Return the function of a name such as `tests.faults.broken_commands:hang`."""
+    module, _, function = name.partition(":")
+    found: Callable[[], int] = getattr(import_module(module), function)
+    return found
+
+
+def _described(bench: Bench, seed: int | str, case: Case) -> list[str]:
+    """Run a case; return its description and its faults as one text, if it has faults."""
+    faults = bench.faults(case)
+    kept = json.dumps({"kind": case.kind, "call": case.call, "edits": case.edits})
+    words = kept if len(kept) < 2000 else ""
+    return ["\n    ".join([f"{case.kind} {seed}: {case}", words, *faults])] if faults else []
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the cases that are asked for, or serve."""
+    if arguments[0] == "--serve":
+        serve(Path(arguments[1]))
+        return 0
+    first, _, last = arguments[1].partition(":")
+    folder = Path(tempfile.mkdtemp(prefix="mutations-"))
+    warm_up()
+    bench = Bench(folder)
+    failed = 0
+    try:
+        for seed in range(int(first), int(last or int(first) + 1)):
+            case = bench.draw(arguments[0], seed)
+            found = _described(bench, seed, case)
+            failed += bool(found)
+            if found or not last:
+                sys.stdout.write("\n".join(found or [f"{arguments[0]} {seed}: {case}"]) + "\n")
+            if not last:
+                ended = bench.ended
+                sys.stdout.write(f"    exit code {ended.code}, {ended.seconds:.2f} s\n{ended.out}{ended.err}")
+    finally:
         shutil.rmtree(folder)
     return 1 if failed else 0
 
