@@ -15,6 +15,12 @@ _ROUND_TRIP_PX = 1e-3
 # Stopping tolerance of the undistortion in pixels, a little above rounding.
 _UNDISTORTION_TOLERANCE_PX = 1e-11
 
+# Largest detector: no sensor that is sold has more pixels, and TIFF and JPEG files hold no longer side.
+MAX_SIDE_PX, MAX_PIXELS = 65_535, 250_000_000
+
+# Largest focal length, principal point and distortion coefficient; computing with numbers up to it does not overflow.
+_MAX_NUMBER = 1e9
+
 # Rows that are undistorted at a time: OpenCV returns a Jacobian with every point, and strips keep it small.
 _STRIP_ROWS = 32
 
@@ -35,7 +41,7 @@ class Lens:
     Raises
     ------
     ValueError
-        A number is not finite, a focal length is not positive, or there are more than eight coefficients.
+        A number is not finite or too large, a focal length is not positive, or there are more than eight coefficients.
     """
 
     size_px: tuple[int, int]
@@ -47,12 +53,18 @@ class Lens:
 
     def __post_init__(self) -> None:
         numbers = (self.fx_px, self.fy_px, self.cx_px, self.cy_px, *self.distortion)
-        if not np.isfinite(numbers).all() or min(self.fx_px, self.fy_px) <= 0:
-            raise ValueError(f"focal lengths must be positive and all numbers finite, got {numbers}")
         if len(self.distortion) > 8:
             raise ValueError(f"distortion takes at most 8 coefficients, got {len(self.distortion)}")
+        if not np.isfinite(numbers).all() or min(self.fx_px, self.fy_px) <= 0:
+            raise ValueError(f"focal lengths must be positive and all numbers finite, got {numbers}")
+        if max(map(abs, numbers)) > _MAX_NUMBER:
+            raise ValueError(f"numbers of a lens are at most {_MAX_NUMBER:g} in size, got {numbers}")
         if min(self.size_px) < 1:
             raise ValueError(f"size_px must be positive, got {self.size_px}")
+        if max(self.size_px) > MAX_SIDE_PX or self.size_px[0] * self.size_px[1] > MAX_PIXELS:
+            raise ValueError(
+                f"size_px is at most {MAX_SIDE_PX} a side and {MAX_PIXELS / 1e6:g} million pixels, got {self.size_px}"
+            )
 
     @classmethod
     def from_parameters(cls, size_px: tuple[int, int], parameters: NDArray[np.float64]) -> Self:

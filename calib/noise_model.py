@@ -6,6 +6,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+# Largest number of a sensor; the squares of what is computed from such numbers do not overflow single precision.
+_MAX_NUMBER = 1e6
+
 type Map = float | NDArray[np.floating]
 """One value for the whole sensor, or one per pixel as an array (row, column)."""
 
@@ -34,7 +37,8 @@ class NoiseModel:
     Raises
     ------
     ValueError
-        A number is not finite (only `saturation_dn` may be infinite), a gain is not positive, or a noise is negative.
+        A number is not finite (only `saturation_dn` may be infinite) or too large to compute with, a gain is not
+        positive, or a noise is negative.
     """
 
     offset_dn: Map
@@ -45,12 +49,12 @@ class NoiseModel:
     saturation_dn: float = np.inf
 
     def __post_init__(self) -> None:
-        _require("offset_dn", self.offset_dn, at_least=-np.inf)
-        _require("gain_dn_per_e", self.gain_dn_per_e, at_least=np.finfo(float).tiny)
+        _require("offset_dn", self.offset_dn, at_least=-_MAX_NUMBER)
+        _require("gain_dn_per_e", self.gain_dn_per_e, at_least=1 / _MAX_NUMBER)
         _require("read_noise_e", self.read_noise_e, at_least=0.0)
         _require("dark_current_e_per_s", self.dark_current_e_per_s, at_least=0.0)
         if self.quantum_efficiency is not None:
-            _require("quantum_efficiency", self.quantum_efficiency, at_least=np.finfo(float).tiny, at_most=1.0)
+            _require("quantum_efficiency", self.quantum_efficiency, at_least=1 / _MAX_NUMBER, at_most=1.0)
         if not self.saturation_dn > 0:
             raise ValueError(f"saturation_dn must be positive, got {self.saturation_dn}")
 
@@ -73,10 +77,15 @@ class NoiseModel:
         return self.read_noise_e**2 + 1.0 / (12.0 * self.gain_dn_per_e**2)
 
 
-def _require(name: str, value: Map, *, at_least: float, at_most: float = np.inf) -> None:
+def _require(name: str, value: Map, *, at_least: float, at_most: float = _MAX_NUMBER) -> None:
     """Raise ValueError unless all numbers of `value` are finite and within the limits."""
     numbers = np.asarray(value)
     if not np.isfinite(numbers).all():
-        raise ValueError(f"{name} must be finite everywhere, got {value}")
+        raise ValueError(f"{name} must be finite everywhere, got {_range(numbers)}")
     if (numbers < at_least).any() or (numbers > at_most).any():
-        raise ValueError(f"{name} must lie within [{at_least:.3g}, {at_most:.3g}], got {value}")
+        raise ValueError(f"{name} must lie within [{at_least:.3g}, {at_most:.3g}], got {_range(numbers)}")
+
+
+def _range(numbers: NDArray[Any]) -> str:
+    """Return a number, or the smallest and largest of several, for a message of one line."""
+    return f"{numbers:.6g}" if numbers.ndim == 0 else f"{numbers.min():.6g} to {numbers.max():.6g}"

@@ -1,35 +1,25 @@
 """Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their colour mosaic."""
 
 import contextlib
-import logging
-import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import MissingFile, UnreadableImage
+from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
+from faintfield.pipelines.errors import InputError, MissingFile, UnreadableImage, WrongSize
+from faintfield.pipelines.formats.decoders import Accept, decode_photo, decode_tiff
+from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_FRAME_BYTES
+from faintfield.pipelines.formats.reading import is_file, opened
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
-
-# What tifffile raises on damaged or truncated files. Its log messages are dropped: UnreadableImage says it all.
-_TIFF_FAILURES = (
-    *(tifffile.TiffFileError, zlib.error, struct.error, OSError, LookupError, RuntimeError, TypeError, ValueError),
-    *(ArithmeticError, MemoryError),
-)
-logging.getLogger("tifffile").addHandler(logging.NullHandler())
-
-# The last bytes of a whole file. OpenCV silently fills the rest of a truncated photograph with grey.
-_END_MARKS = {".png": b"IEND", ".jpg": b"\xff\xd9", ".jpeg": b"\xff\xd9"}
 
 # Masked pixels this close to the active area are not used, px: they catch a little of its light.
 _MASKED_GUARD_PX = 4
@@ -92,81 +82,87 @@ class Frame:
     exposure_s: float | None = None
 
 
-def read_frame(path: Path) -> Frame:
-    """Read one image file.
+def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: str = "the camera") -> Frame:
+    """Read one image file, after the size that its header states was compared with what is expected.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    expected_px : (int, int), optional
+        Width and height that it must have.
+    of : str
+        Whose size that is, for the message.
 
     Raises
     ------
     MissingFile
-        There is no such file.
+        There is no such file, or it cannot be opened.
+    WrongSize
+        The file does not have the size that is expected.
     UnreadableImage
-        The file cannot be decoded, is truncated, or has no pixels.
+        The file cannot be decoded, is truncated, has no pixels, or is larger than any that is read.
     """
-    if not path.is_file():
-        raise MissingFile(f"{path}: no such image; put it there or correct the name")
+    if not is_file(path):
+        raise MissingFile(f"{path}: no such image file; put it there or correct the name")
     suffix = path.suffix.lower()
-    if suffix in RAW_SUFFIXES:
-        return _read_raw(path)
     if suffix not in IMAGE_SUFFIXES:
         readable = ", ".join(sorted(IMAGE_SUFFIXES))
         raise UnreadableImage(f"{path}: '{suffix}' is not a format that is read; use one of {readable}")
-    pixels = _read_tiff(path) if suffix in TIFF_SUFFIXES else _read_with_opencv(path)
-    if pixels.ndim == 3 and pixels.shape[2] == 4:
-        pixels = pixels[:, :, :3]
-    if pixels.size == 0:
-        raise UnreadableImage(_cannot_decode(path, "no pixels"))
-    if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] != 3):
+
+    def accept(width: int, height: int, size_bytes: int) -> None:
+        _require_sane_size(path, width, height, size_bytes)
+        if expected_px is not None and (width, height) != expected_px:
+            raise WrongSize(
+                f"{path}: is {width} x {height} px, {of} {expected_px[0]} x {expected_px[1]} px; "
+                "take it again with the same settings, or correct the size that is stated"
+            )
+
+    with opened(path) as file:
+        try:
+            frame = _decoded(file, path, suffix, accept)
+        except InputError:
+            raise
+        except Exception as failure:  # decoders raise exceptions of a dozen types
+            raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+    shape = frame.pixels_dn.shape
+    if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
         raise UnreadableImage(
-            f"{path}: holds an array of shape {pixels.shape}; one grey or RGB picture is wanted; export it as such"
+            f"{path}: holds an array of shape {shape}; one grey or RGB picture is wanted; export it as such"
         )
-    return Frame(pixels)
+    return frame
 
 
-def _read_tiff(path: Path) -> NDArray[Any]:
-    """Read a TIFF; compressions for which tifffile needs extra packages are read by OpenCV."""
-    try:
-        return np.asarray(tifffile.imread(path))
-    except _TIFF_FAILURES as failure:
-        if "imagecodecs" in str(failure):
-            return _read_with_opencv(path)
-        raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> None:
+    """Refuse a picture without pixels, and one that is larger than any camera takes."""
+    if not min(width, height) > 0:
+        raise UnreadableImage(_cannot_decode(path, "no pixels"))
+    if max(width, height) > MAX_SIDE_PX or width * height > MAX_PIXELS or size_bytes > MAX_FRAME_BYTES:
+        raise UnreadableImage(
+            f"{path}: is {width} x {height} px of {size_bytes / 1e6:.1f} MB; at most {MAX_SIDE_PX} px a side, "
+            f"{MAX_PIXELS / 1e6:g} million pixels and {MAX_FRAME_BYTES / 1e6:g} MB are read; bin or crop it"
+        )
 
 
-def _read_with_opencv(path: Path) -> NDArray[Any]:
-    """Read a file with OpenCV as (row, column) or (row, column, RGB), with its own bit depth and orientation."""
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
-    try:
-        content = path.read_bytes()
-        whole = _END_MARKS.get(path.suffix.lower(), b"") in content[-1024:] and _sound_png(content)
-        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED) if content and whole else None
-    except (OSError, cv2.error) as failure:
-        raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
-    if pixels is None:
-        raise UnreadableImage(_cannot_decode(path, "not an image, or truncated"))
-    if pixels.ndim == 3 and pixels.shape[2] >= 3:
-        pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
-    return np.asarray(pixels)
+def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept) -> Frame:
+    """Return the frame in a file; decoders raise exceptions of any type."""
+    if suffix in RAW_SUFFIXES:
+        return _read_raw(file, path, accept)
+    pixels = decode_tiff(file, path, accept) if suffix in TIFF_SUFFIXES else decode_photo(file, accept)
+    return Frame(pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels)
 
 
-def _sound_png(content: bytes) -> bool:
-    """Return whether every chunk of a PNG has a right checksum, True for other files; the decoder would only print."""
-    start = 8
-    while content.startswith(b"\x89PNG") and start < len(content):
-        end = start + 8 + int.from_bytes(content[start : start + 4])
-        if zlib.crc32(content[start + 4 : end]) != int.from_bytes(content[end : end + 4]) or end + 4 > len(content):
-            return False
-        if content[start + 4 : start + 8] == b"IEND":
-            break
-        start = end + 4
-    return True
-
-
-def _read_raw(path: Path) -> Frame:
+def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
     """Read the mosaic of a raw file, and its black level from the masked pixels."""
     import rawpy  # slow to load, and only raw files need it
 
+    if (size := path.stat().st_size) > MAX_FRAME_BYTES:
+        raise ValueError(f"a raw file has at most {MAX_FRAME_BYTES} bytes, this {size}")
     try:
-        with rawpy.imread(str(path)) as raw:
+        with rawpy.imread(file) as raw:
+            sizes = raw.sizes
+            _require_sane_size(path, sizes.raw_width, sizes.raw_height, 2 * sizes.raw_width * sizes.raw_height)
+            accept(sizes.width, sizes.height, 2 * sizes.width * sizes.height)
             if raw.raw_image.ndim != 2:
                 raise UnreadableImage(f"{path}: holds demosaiced colour; record raw files with their mosaic")
             pixels = raw.raw_image_visible.copy()
@@ -174,8 +170,7 @@ def _read_raw(path: Path) -> Frame:
             black_dn = _masked_black_dn(raw, mosaic_period(mosaic))
             saturation_dn = float(raw.white_level)
     except rawpy.LibRawError as failure:
-        reason = failure.args[0].decode() if isinstance(failure.args[0], bytes) else str(failure)
-        raise UnreadableImage(_cannot_decode(path, reason)) from failure
+        raise ValueError(failure.args[0].decode() if isinstance(failure.args[0], bytes) else failure) from failure
     return Frame(pixels, mosaic, black_dn, saturation_dn, exif_exposure_s(path))
 
 
@@ -211,9 +206,9 @@ def exif_exposure_s(path: Path) -> float | None:
     """Return the exposure that EXIF states, None if it states none (rawpy would report 1 s)."""
     import exifread  # slow to load, and only raw files need it
 
-    with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
+    with opened(path) as file, contextlib.suppress(Exception):  # of any type, if EXIF is damaged
         tag = exifread.process_file(file, details=False, stop_tag="EXIF ExposureTime").get("EXIF ExposureTime")
-        if tag is not None and tag.values and float(tag.values[0]) > 0:
+        if tag is not None and tag.values and 0 < float(tag.values[0]) <= MAX_EXPOSURE_S:
             return float(tag.values[0])
     return None
 

@@ -1,11 +1,19 @@
-"""Read files whole, of a bounded size, and turn all that can go wrong into one named failure with the path."""
+"""Read files, of a bounded size, and turn all that can go wrong into one named failure with the path."""
 
+import math
+import zipfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
+from typing import IO, Any
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.rig.session.regular_files import read_regular
+from faintfield.rig.session.regular_files import open_regular, read_regular
 
 # Size in bytes up to which a file of text, settings or records is read. The largest that faintfield writes, the record
 # of a sweep of a thousand planes, has a few million.
@@ -13,6 +21,45 @@ MAX_TEXT_BYTES = 64_000_000
 
 # What msgspec raises on content that is not JSON of the expected type, or is nested too deeply.
 JSON_FAILURES = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+
+# Kinds of numpy's data types that are plain numbers: booleans, integers and floats.
+_NUMBERS = "biuf"
+
+# What a .npz file may have besides its arrays: headers, and the list of its members.
+_OVERHEAD_BYTES = 1_000_000
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is a regular file; False for names that no file can have."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # longer than any name, or with a NUL
+        return False
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether there is a folder; False for names that none can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[BufferedReader]:
+    """Open a regular file for reading.
+
+    Raises
+    ------
+    MissingFile
+        It cannot be opened, or is not a regular file.
+    """
+    try:
+        file = open_regular(path)
+    except (OSError, ValueError) as failure:
+        raise _unreadable(path, failure) from failure
+    with file:
+        yield file
 
 
 def read_content(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
@@ -25,9 +72,19 @@ def read_content(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """
     try:
         return read_regular(path, max_bytes)
-    except (OSError, ValueError) as failure:  # ValueError: a name with a NUL
-        reason = failure.strerror if isinstance(failure, OSError) else str(failure)
-        raise MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here") from failure
+    except (OSError, ValueError) as failure:
+        raise _unreadable(path, failure) from failure
+
+
+def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
+    """Return the text of a file, in which undecodable bytes become replacement characters.
+
+    Raises
+    ------
+    MissingFile
+        As in `read_content`.
+    """
+    return read_content(path, max_bytes).decode(errors="replace")
 
 
 def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
@@ -54,3 +111,82 @@ def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
         return msgspec.json.decode(content, type=kind)
     except JSON_FAILURES as failure:
         raise BadValue(f"{path}: is not {what} ({failure}); {remedy}") from failure
+
+
+def read_arrays(
+    path: Path, names: Collection[str], *, max_bytes: int, remedy: str, shape: tuple[int, ...] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return those of the named arrays that a .npz file has.
+
+    The declared size of an array is checked before it is decompressed, and its checksum after. The arrays cannot be
+    written to.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    names : collection of str
+        Names of arrays of numbers.
+    max_bytes : int
+        Largest size of all of them together.
+    remedy : str
+        What to do if the file is damaged, for the message.
+    shape : tuple of int, optional
+        Shape that every array must have.
+
+    Raises
+    ------
+    MissingFile
+        The file cannot be read.
+    BadValue
+        It is damaged, or an array has another shape, is not of numbers, or exceeds `max_bytes`.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    with opened(path) as file:
+        try:
+            if (size := path.stat().st_size) > max_bytes + _OVERHEAD_BYTES:
+                raise ValueError(f"holds {size} bytes, at most {max_bytes} are expected")
+            with zipfile.ZipFile(file) as archive:
+                held = set(archive.namelist())
+                for name in [name for name in names if f"{name}.npy" in held]:
+                    arrays[name] = _member(archive, name, max_bytes, shape)
+                    max_bytes -= arrays[name].nbytes
+        except Exception as failure:  # zipfile, zlib and numpy raise exceptions of a dozen types
+            reason = " ".join(str(failure).split()) or type(failure).__name__
+            raise BadValue(f"{path}: cannot be read ({reason}); {remedy}") from failure
+    return arrays
+
+
+def _member(archive: zipfile.ZipFile, name: str, max_bytes: int, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    """Return one array of a .npz file; raise ValueError if it is not what is expected."""
+    entry = archive.getinfo(f"{name}.npy")
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"{name} is compressed by method {entry.compress_type}, which numpy does not use")
+    with archive.open(entry) as member:
+        found, column_major, dtype = _array_header(member)
+        size = math.prod(found) * dtype.itemsize
+        if dtype.kind not in _NUMBERS or min(found, default=0) < 0:
+            raise ValueError(f"{name} is {dtype} of shape {found}, which are no numbers")
+        if shape is not None and found != shape:
+            raise ValueError(f"{name} has shape {found}, expected is {shape}")
+        if size > max_bytes:
+            raise ValueError(f"{name} takes {size} bytes, at most {max_bytes} are expected")
+        content = member.read(size + 1)  # up to the end, where the checksum is compared
+    if len(content) != size:
+        raise ValueError(f"{name} does not have the {size} bytes that it states")
+    return np.frombuffer(content, dtype).reshape(found, order="F" if column_major else "C")
+
+
+def _array_header(member: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order and data type that an array in a file states."""
+    version = np.lib.format.read_magic(member)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"version {version} of the format is not read")
+    return read(member)
+
+
+def _unreadable(path: Path, failure: OSError | ValueError) -> MissingFile:
+    """Return the failure of a file that cannot be opened or read; a ValueError is a name with a NUL."""
+    reason = failure.strerror if isinstance(failure, OSError) else str(failure)
+    return MissingFile(f"{path}: cannot be read ({reason}); name a file of the kind that is read here")

@@ -3,9 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-import msgspec
-
-from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.settings import RigSettings
 
@@ -36,13 +34,10 @@ def read_stage_settings(rig: Path) -> dict[str, str] | None:
 
     Raises
     ------
-    BadValue
-        The file is not as `faintfield check --remember` writes it.
+    MissingFile, BadValue
+        The file cannot be read, or is not as `faintfield check --remember` writes it.
     """
     path = stage_settings_path(rig)
-    if not path.exists():
+    if not is_file(path):
         return None
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
-    except (msgspec.DecodeError, UnicodeDecodeError) as failure:
-        raise BadValue(f"{path}: is not what --remember writes ({failure}); run with --remember again") from failure
+    return read_json(path, dict[str, str], what="what --remember writes", remedy="run with --remember again")

@@ -2,7 +2,6 @@
 
 import difflib
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,16 @@ import tomli_w
 
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
 from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.reading import is_file, read_content
 
 # No quantity of a rig is larger, and computing with numbers up to it does not overflow.
 _MAX_NUMBER = 1e12
+
+# Size in bytes up to which TOML is read: a set of ten thousand views has some three million.
+_MAX_TOML_BYTES = 8_000_000
+
+# A key of more than 32 parts, such as a.a.a…: the time to read one grows with the square of its length.
+_LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 
 
 def read_toml[T](path: Path, kind: type[T]) -> T:
@@ -29,17 +35,27 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
         The file is not TOML, a key is missing, a value has the wrong type or is not one of its choices, or a number
         is not finite.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise MissingFile(f"{path}: no such file; name a folder or file of the kind that this command reads")
+    content = _decoded(path)
+    _require_finite(path, content)
     try:
-        content = msgspec.toml.decode(path.read_bytes())
-        _require_finite(path, content)
         return msgspec.convert(content, kind)
-    except OSError as failure:
-        raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
     except msgspec.ValidationError as failure:
         raise _failure_of(path, str(failure), kind) from None
-    except (tomllib.TOMLDecodeError, msgspec.DecodeError, UnicodeDecodeError) as failure:
+
+
+def _decoded(path: Path) -> Any:
+    """Return the content of a TOML file."""
+    content = read_content(path, _MAX_TOML_BYTES)
+    if (key := _LONG_KEY.search(content)) is not None:
+        line = content.count(b"\n", 0, key.start()) + 1
+        raise BadValue(f"{path}: line {line}: a key has more than 32 parts, and none that is read has; correct it")
+    try:
+        return msgspec.toml.decode(content)
+    except RecursionError as failure:
+        raise BadValue(f"{path}: its values are nested too deeply; none that is read is: correct it") from failure
+    except ValueError as failure:  # not TOML, not UTF-8, or an integer of thousands of digits
         raise BadValue(f"{path}: is not TOML ({failure}); correct the line") from failure
 
 
@@ -54,10 +70,14 @@ def inside(folder: Path, name: str, key: str) -> Path:
     Raises
     ------
     BadValue
-        The name is absolute, or climbs out of the folder.
+        The name is absolute, climbs out of the folder, or is none that a file can have.
     """
     path = folder / name
-    if not name or Path(name).is_absolute() or not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        lies_inside = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError):  # longer than any path, or with a NUL
+        lies_inside = False
+    if not name or Path(name).is_absolute() or not lies_inside:
         raise BadValue(f"{key} = '{name}' leaves the folder {folder}; name a file inside it")
     return path
 
@@ -72,8 +92,16 @@ def _require_finite(path: Path, value: Any, place: str = "") -> None:
             _require_finite(path, part, f"{place}[{index}]")
     elif isinstance(value, int | float) and not abs(value) <= _MAX_NUMBER:
         raise BadValue(
-            f"{path}: {place} = {value!s:.24}; numbers are finite, and at most {_MAX_NUMBER:g} in size: correct it"
+            f"{path}: {place} = {_shown(value)}; numbers are finite, and at most {_MAX_NUMBER:g} in size: correct it"
         )
+
+
+def _shown(number: float) -> str:
+    """Return the beginning of a number; Python does not print integers of more than 4300 digits."""
+    try:
+        return f"{number!s:.24}"
+    except ValueError:
+        return f"an integer of {int(number).bit_length()} bits"
 
 
 def _failure_of(path: Path, complaint: str, kind: type) -> InputError:

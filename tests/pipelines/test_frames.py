@@ -148,7 +148,7 @@ def test_a_png_that_claims_to_be_enormous_is_refused(tmp_path: Path) -> None:
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", 200_000, 200_000, 16, 0, 0, 0, 0))
     body = chunk(b"IDAT", zlib.compress(b"nothing")) + chunk(b"IEND", b"")
     (tmp_path / "frame.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + body)
-    with pytest.raises(UnreadableImage, match=r"frame\.png: cannot be decoded"):
+    with pytest.raises(UnreadableImage, match=r"frame\.png: is 200000 x 200000 px of"):
         read_frame(tmp_path / "frame.png")
 
 
@@ -162,7 +162,7 @@ def test_text_with_the_name_of_a_picture_is_refused(suffix: str, tmp_path: Path)
 
 def test_a_stack_of_pictures_is_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "stack.tiff", _pixels(np.uint16, 5, 40, 50), photometric="minisblack")
-    with pytest.raises(UnreadableImage, match=r"array of shape \(5, 40, 50\); one grey or RGB picture is wanted"):
+    with pytest.raises(UnreadableImage, match="holds several pictures of one size; export one"):
         read_frame(tmp_path / "stack.tiff")
 
 

@@ -119,7 +119,7 @@ class TestNoiseJson:
     def test_maps_of_another_sensor_are_refused(self, folder: Path, name: str) -> None:
         maps: dict[str, Any] = {name: np.ones((16, 12), bool)}
         np.savez(folder / "noise_maps.npz", **maps)
-        with pytest.raises(BadValue, match=rf"{name} has shape \(16, 12\), the camera \(12, 16\)"):
+        with pytest.raises(BadValue, match=rf"{name} has shape \(16, 12\), expected is \(12, 16\)"):
             load_set(folder)
 
     def test_it_and_its_maps_count_among_the_inputs(self, folder: Path) -> None:

@@ -15,6 +15,8 @@ from msgspec import Meta, Struct
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import remove, write_json, write_whole
+from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, MAX_NODE, sound_node, sound_pose
+from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
 
 GEOMETRY_FILE = "geometry.json"
 COVARIANCE_FILE = "geometry_covariance.npz"
@@ -156,14 +158,21 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
     MissingFile, BadValue
         There is none, or it is not a result of `faintfield geometry`.
     """
-    path = path / GEOMETRY_FILE if path.is_dir() else path
-    if not path.is_file():
+    path = path / GEOMETRY_FILE if is_folder(path) else path
+    if not is_file(path):
         raise MissingFile(f"{path}: no such file; run `faintfield geometry` on the board set first")
+    geometry = read_json(path, kind, what="the result of `faintfield geometry`", remedy="run that again")
     try:
-        geometry = msgspec.json.decode(path.read_bytes(), type=kind)
         geometry.camera_lens()
-    except (msgspec.MsgspecError, ValueError, OSError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield geometry` ({failure}); run that again") from failure
+    except ValueError as failure:
+        raise BadValue(f"{path}: lens: {failure}; run `faintfield geometry` again") from failure
+    for entry in geometry.nodes:
+        if not (sound_pose(entry.rt_cam_ref) and sound_node(entry.node)):
+            raise BadValue(
+                f"{path}: node {list(entry.node)} at {list(entry.rt_cam_ref)} is impossible; a node's numbers are at "
+                f"most {MAX_NODE}, its angles {MAX_ANGLE_RAD:g} rad, and its lengths {MAX_LENGTH_MM:g} mm in size: "
+                "run `faintfield geometry` again"
+            )
     return geometry
 
 

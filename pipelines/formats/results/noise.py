@@ -3,7 +3,6 @@
 Keys stand in the file in the order of the fields; docs/noise.md explains the quantities.
 """
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,13 +17,18 @@ from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole, writing
+from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
+from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
 STANDARD = "EMVA 1288 release 4.0"
 
 # The quantities that a reconstruction needs.
 _NEEDED = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
+
+# The maps that it takes, and the largest number of them that is written.
+_MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 9
 
 
 class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -133,13 +137,10 @@ def read_noise(path: Path) -> NoiseRecord:
 
     Raises
     ------
-    BadValue
-        The file is not a result of `faintfield noise`.
+    MissingFile, BadValue
+        The file cannot be read, or is not a result of `faintfield noise`.
     """
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=NoiseRecord)
-    except (msgspec.MsgspecError, ValueError, OSError) as failure:
-        raise BadValue(f"{path}: is not the result of `faintfield noise` ({failure}); run that again") from failure
+    return read_json(path, NoiseRecord, what="the result of `faintfield noise`", remedy="run that again")
 
 
 def write_noise(
@@ -193,33 +194,41 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
 
     Raises
     ------
-    BadValue
-        The file is no noise result, is another camera's, or a number that a reconstruction needs is not known.
-    ValueError
-        A number is out of its range.
+    MissingFile, BadValue
+        A file cannot be read, is no noise result, is another camera's or not the one that is named, or a number that a
+        reconstruction needs is not known or out of its range.
     """
     record = read_noise(path)
     values = _numbers(path, record)
     shape = size_px[::-1]
-    hot = np.array(record.hot_pixels, int).reshape(-1, 2)
-    outside = hot[((hot < 0) | (hot >= shape)).any(axis=1)]
-    if len(outside):
+    outside = [it for it in record.hot_pixels if not (0 <= it[0] < shape[0] and 0 <= it[1] < shape[1])]
+    if outside:
         raise BadValue(
-            f"{path}: hot pixel {outside[0].tolist()} is not one of {shape}; it seems to be another camera's; "
+            f"{path}: hot pixel {list(outside[0])} is not one of {shape}; it seems to be another camera's; "
             "measure this one"
         )
+    if record.mosaic and not sound_mosaic(record.mosaic, "RGB"):
+        raise BadValue(f"{path}: mosaic = {list(record.mosaic)} is no colour filter; run `faintfield noise` again")
     unusable = np.zeros(shape, bool)
-    unusable[tuple(hot.T)] = True
-    maps = _read_maps(path.with_name(NOISE_MAPS), (*_NEEDED, "mask", "relative_response"), shape)
-    unusable |= maps.pop("mask", False)
+    unusable[tuple(np.array(record.hot_pixels, int).reshape(-1, 2).T)] = True
+    maps = _read_maps(path.with_name(NOISE_MAPS), record, shape)
+    unusable |= maps.pop("mask", np.False_).astype(bool)
     response = maps.pop("relative_response", None)
     if response is not None:
         # Pixels with no response are masked already; the operator takes no negative one
         response = np.where(unusable, 1, np.maximum(response, 0)).astype(np.float32)
+        if not np.isfinite(response).all():
+            raise BadValue(
+                f"{path.with_name(NOISE_MAPS)}: relative_response is not finite; run `faintfield noise` again"
+            )
     stated = {name: getattr(record, name) for name in ("quantum_efficiency", "saturation_dn")}
     # Either number may be written with or without its error.
     stated = {name: it.value if isinstance(it, Measured) else it for name, it in stated.items()}
-    model = NoiseModel(**(values | maps), **{name: value for name, value in stated.items() if value is not None})
+    known = {name: value for name, value in stated.items() if value is not None}
+    try:
+        model = NoiseModel(**(values | maps), **known)
+    except ValueError as failure:
+        raise BadValue(f"{path}, or its maps: {failure}; run `faintfield noise` again") from failure
     return FittedNoise(model, unusable, response, record.mosaic or None)
 
 
@@ -241,19 +250,17 @@ def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
     return values
 
 
-def _read_maps(path: Path, names: tuple[str, ...], shape: tuple[int, int]) -> dict[str, Any]:
-    """Return those of the named maps (row, column) that the file has; none when there is no file."""
-    if not path.is_file():
+def _read_maps(path: Path, record: NoiseRecord, shape: tuple[int, int]) -> dict[str, Any]:
+    """Return the maps (row, column) that the file has, of those that a reconstruction takes; none without a file."""
+    if not is_file(path):
         return {}
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            maps = {name: file[name] for name in names if name in file}
-    except (ValueError, TypeError, OSError, EOFError, zipfile.BadZipFile) as failure:
-        raise BadValue(f"{path}: cannot be read ({failure}); run `faintfield noise` again") from failure
-    for name, values in maps.items():
-        if values.shape != shape:
-            raise BadValue(
-                f"{path}: {name} has shape {values.shape}, the camera {shape}; it seems to be another camera's; "
-                "measure this one"
-            )
+    maps = read_arrays(
+        path,
+        _MAPS_TAKEN,
+        shape=shape,
+        max_bytes=_MAPS_WRITTEN * shape[0] * shape[1] * np.dtype(np.float64).itemsize,
+        remedy="run `faintfield noise` again for this camera",
+    )
+    if record.maps_sha256 and sha256(path) != record.maps_sha256:
+        raise BadValue(f"{path}: is not the file that {NOISE_FILE} names by its SHA-256; run `faintfield noise` again")
     return maps

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-import msgspec
-
-from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, ReconstructionRecord
 
 # Folders of results lie at most this far below the folder that is shown.
@@ -22,13 +21,10 @@ def read_result[Record](path: Path, kind: type[Record]) -> Record:
 
     Raises
     ------
-    BadValue
-        The file is not of this type.
+    MissingFile, BadValue
+        The file cannot be read, or is not of this type.
     """
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, OSError) as failure:
-        raise BadValue(f"{path}: is not a result that can be shown ({failure}); reconstruct again") from failure
+    return read_json(path, kind, what="a result that can be shown", remedy="reconstruct again")
 
 
 def results_below(directory: Path) -> dict[Path, ReconstructionRecord]:

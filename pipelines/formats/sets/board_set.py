@@ -14,6 +14,8 @@ from faintfield.calib.geometry import Node
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import at_phase, mosaic_period, read_frame
+from faintfield.pipelines.formats.limits import MAX_NODE, sound_node
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.rig.plan import centre_node
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
@@ -125,9 +127,9 @@ def load_board_set(folder: Path) -> BoardSet:
     InputError
         A file is missing, a key unknown, or a value impossible; the message names it.
     """
-    if has_session(folder) and not (folder / FILE_NAME).is_file():
+    if has_session(folder) and not is_file(folder / FILE_NAME):
         return _of_session(folder)
-    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    path = folder if is_file(folder) else folder / FILE_NAME
     settings = read_toml(path, BoardSetFile)
     boards = _boards(path, settings.board)
     if not settings.image:
@@ -135,10 +137,12 @@ def load_board_set(folder: Path) -> BoardSet:
     files: dict[tuple[Node, int], list[Path]] = {}
     for index, entry in enumerate(settings.image):
         file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
-        if not file.is_file():
+        if not is_file(file):
             raise MissingFile(f"{path}: {entry.file} is named but missing; put it there or remove its entry")
-        if min(entry.node) < 0:
-            raise BadValue(f"{path}: image[{index}].node = {list(entry.node)}; rows and columns count from 0")
+        if min(entry.node) < 0 or not sound_node(entry.node):
+            raise BadValue(
+                f"{path}: image[{index}].node = {list(entry.node)}; rows and columns count from 0, to {MAX_NODE}"
+            )
         files.setdefault((entry.node, entry.sweep), []).append(file)
     if settings.pitch_mm is not None and not settings.pitch_mm > 0:
         raise BadValue(f"{path}: pitch_mm = {settings.pitch_mm}; it must be positive")
@@ -152,7 +156,7 @@ def _of_session(folder: Path) -> BoardSet:
     files: dict[tuple[Node, int], list[Path]] = {}
     for planned, _, path in taken_frames(folder):
         if planned.kind == "charuco":
-            if not path.is_file():
+            if not is_file(path):
                 raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
             files.setdefault((planned.stop.node, planned.sweep), []).append(path)
     if not files:

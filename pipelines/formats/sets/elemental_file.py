@@ -7,6 +7,17 @@ import msgspec
 import numpy as np
 
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.limits import (
+    MAX_ANGLE_RAD,
+    MAX_EXPOSURE_S,
+    MAX_LENGTH_MM,
+    MAX_NODE,
+    MAX_PERIOD_PX,
+    sound_mosaic,
+    sound_node,
+    sound_pose,
+)
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 
 FILE_NAME = "elemental.toml"
@@ -73,7 +84,7 @@ def read_set_file(path: Path) -> ElementalSetFile:
     _check_numbers(path, settings)
     _check_views(path, settings)
     for name in named_files(settings):
-        if not inside(path.parent, name, f"{path}: file").is_file():
+        if not is_file(inside(path.parent, name, f"{path}: file")):
             raise MissingFile(f"{path}: {name} is named but missing in {path.parent}; put it there or remove its entry")
     return settings
 
@@ -92,21 +103,28 @@ def named_files(settings: ElementalSetFile) -> list[str]:
 
 def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
     """Refuse an impossible exposure or mosaic."""
-    if settings.exposure_s <= 0:
-        raise BadValue(f"{path}: exposure_s = {settings.exposure_s}; it must be positive: give the exposure in seconds")
-    mosaic = settings.camera.mosaic
-    if mosaic is None:
-        return
-    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1 or set("".join(mosaic)) - set("RGB"):
+    if not 0 < settings.exposure_s <= MAX_EXPOSURE_S:
         raise BadValue(
-            f"{path}: camera.mosaic = {list(mosaic)}; give rows of equal length of the letters R, G and B, such as "
-            '["RG", "GB"]'
+            f"{path}: exposure_s = {settings.exposure_s}; it must be positive and at most {MAX_EXPOSURE_S:g}: give the "
+            "exposure in seconds"
+        )
+    mosaic = settings.camera.mosaic
+    if mosaic is not None and not sound_mosaic(mosaic, "RGB"):
+        raise BadValue(
+            f"{path}: camera.mosaic = {list(mosaic)}; give rows of equal length, at most {MAX_PERIOD_PX}, of the "
+            'letters R, G and B, such as ["RG", "GB"]'
         )
 
 
 def _check_views(path: Path, settings: ElementalSetFile) -> None:
     """Refuse a set without views, without its reference, or with a repeated view."""
     count = len(settings.view)
+    for index, view in enumerate(settings.view):
+        if not (sound_pose(view.rt_cam_ref) and (view.node is None or sound_node(view.node))):
+            raise BadValue(
+                f"{path}: view[{index}] has the pose {list(view.rt_cam_ref)} and the node {view.node}; angles are at "
+                f"most {MAX_ANGLE_RAD:g} rad, lengths {MAX_LENGTH_MM:g} mm and nodes {MAX_NODE} in size: correct it"
+            )
     if not 0 <= settings.reference_view < count:
         raise BadValue(
             f"{path}: reference_view = {settings.reference_view}, but there are {count} views; give 0…{count - 1}"
@@ -121,11 +139,13 @@ def _check_views(path: Path, settings: ElementalSetFile) -> None:
     counts = {1 + len(view.repeats) for view in settings.view}
     if len(counts) > 1:
         raise BadValue(f"{path}: views have {min(counts)} to {max(counts)} frames; give all of them as many repeats")
-    _refuse_repeated(path, "node", [list(view.node) for view in settings.view if view.node is not None])
+    _refuse_repeated(path, "node", [view.node for view in settings.view if view.node is not None])
 
 
 def _refuse_repeated(path: Path, key: str, names: list[Any]) -> None:
     """Refuse a name that several views share."""
-    for index, name in enumerate(names):
-        if name in names[:index]:
+    seen = set()
+    for name in names:
+        if name in seen:
             raise BadValue(f"{path}: {key} = {name} is named by more than one view; give each view its own")
+        seen.add(name)

@@ -14,6 +14,7 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.records import Poses
@@ -27,6 +28,9 @@ from faintfield.pipelines.formats.sets.elemental_file import (
 
 # Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
+
+# Largest relative response of a pixel.
+_MAX_RESPONSE = 1e6
 
 
 @dataclass(frozen=True)
@@ -155,7 +159,7 @@ class ElementalSet:
             yield name, sha256(self.folder / name)
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
-            if maps.is_file():
+            if is_file(maps):
                 yield str(maps.relative_to(self.folder)), sha256(maps)
         if self.measured_in is not None:
             yield self.measured_in.name, sha256(self.measured_in)
@@ -169,7 +173,7 @@ def load_set(folder: Path) -> ElementalSet:
     InputError
         A file is missing, a key is unknown, or a value is impossible; the message names it.
     """
-    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    path = folder if is_file(folder) else folder / FILE_NAME
     folder = path.parent
     settings = read_set_file(path)
     camera = settings.camera
@@ -185,7 +189,7 @@ def load_set(folder: Path) -> ElementalSet:
         offset_from_files=isinstance(settings.noise, Noise) and settings.noise.offset_dn is None,
         flat=noise.response if camera.flat is None else _read_flat(folder / camera.flat, camera.size_px),
         unusable=noise.unusable,
-        noise_reference=tuple(path for path in [folder / NOISE_REFERENCE] if path.is_file()),
+        noise_reference=tuple(path for path in [folder / NOISE_REFERENCE] if is_file(path)),
     )
 
 
@@ -211,13 +215,13 @@ def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:
 
 def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     """Return the relative response (row, column) from a float TIFF."""
-    flat = np.asarray(read_frame(path).pixels_dn, np.float32)
-    if flat.shape != size_px[::-1] or not np.isfinite(flat).all() or (flat < 0).any():
+    flat = read_frame(path, size_px).pixels_dn
+    if flat.ndim != 2 or not np.isfinite(flat).all() or (flat < 0).any() or (flat > _MAX_RESPONSE).any():
         raise BadValue(
-            f"{path}: the flat field must be {size_px[0]} x {size_px[1]} px, finite and not negative; "
-            f"got {flat.shape[::-1]}, least {np.nanmin(flat)}"
+            f"{path}: a flat field is grey, finite, not negative, and at most {_MAX_RESPONSE:g}; got an array of shape "
+            f"{flat.shape} from {flat.min():g} to {flat.max():g}; divide it by its mean"
         )
-    return flat
+    return np.asarray(flat, np.float32)
 
 
 def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
@@ -228,7 +232,7 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
     BadValue
         A view has no node, a node was not measured, the reference is another, or the image has another size.
     """
-    path = path / GEOMETRY_FILE if path.is_dir() else path
+    path = path / GEOMETRY_FILE if is_folder(path) else path
     geometry, settings = read_geometry(path, CameraPoses), loaded.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
     _check_match(path, geometry, loaded)

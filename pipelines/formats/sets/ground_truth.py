@@ -7,9 +7,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.toml_files import inside
 
 TRUTH_FILE = "truth.json"
 
@@ -42,12 +43,13 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def read_truth(folder: Path) -> Truth | None:
     """Return the ground truth of a simulated set, None for any other."""
     path = folder / TRUTH_FILE
-    if not path.is_file():
+    if not is_file(path):
         return None
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Truth)
-    except msgspec.DecodeError as failure:
-        raise BadValue(f"{path}: {failure}; simulate the set again, or remove the file") from failure
+    truth = read_json(path, Truth, what="the truth of a simulated set", remedy="simulate the set again, or remove it")
+    for plane in truth.planes:
+        for name in (plane.texture, plane.visible):
+            inside(folder, name, f"{path}: file")
+    return truth
 
 
 def true_plane(truth: Truth | None, depth_mm: float) -> TruePlane | None:

@@ -9,11 +9,16 @@ import numpy as np
 from faintfield.calib.noise import Conditions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
+from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
 from faintfield.rig.session.session import has_session, read_plan, taken_frames
 
 FILE_NAME = "noise.toml"
+
+# Largest number of photons per pixel; no pixel holds a thousandth of the electrons.
+_MAX_PHOTONS = 1e9
 
 
 class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,9 +46,9 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
     MissingFile, BadValue
         The file is missing, is not what it should be, or names a frame that is not there.
     """
-    if has_session(folder) and not (folder / FILE_NAME).is_file():
+    if has_session(folder) and not is_file(folder / FILE_NAME):
         return folder, _of_session(folder)
-    path = folder / FILE_NAME if folder.is_dir() or not folder.exists() else folder
+    path = folder if is_file(folder) else folder / FILE_NAME
     settings = read_toml(path, NoiseSet)
     folder = path.parent
     if not settings.frame:
@@ -51,15 +56,17 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
     seen: set[Path] = set()
     for index, frame in enumerate(settings.frame):
         image = inside(folder, frame.file, f"{path}: frame[{index}].file")
-        if not image.is_file():
+        if not is_file(image):
             raise MissingFile(f"{image}: is named by {path} but missing; put it there or remove its entry")
         if image in seen:
             raise BadValue(f"{path}: {frame.file} is named twice; remove one of the entries")
         seen.add(image)
         _check_numbers(path, frame)
     mosaic = settings.mosaic
-    if mosaic is not None and (not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) != 1):
-        raise BadValue(f'{path}: mosaic = {list(mosaic)}; give rows of equal length, such as ["RG", "GB"]')
+    if mosaic is not None and not sound_mosaic(mosaic):
+        raise BadValue(
+            f'{path}: mosaic = {list(mosaic)}; give rows of equal length, at most {MAX_PERIOD_PX}, such as ["RG", "GB"]'
+        )
     return folder, settings
 
 
@@ -137,8 +144,11 @@ def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list
 
 def _check_numbers(path: Path, frame: NoiseFrame) -> None:
     """Refuse impossible exposures, temperatures and photons."""
-    for key, value in (("exposure_s", frame.exposure_s), ("photons", frame.photons)):
-        if value is not None and value < 0:
-            raise BadValue(f"{path}: {frame.file}: {key} = {value}; it must not be negative")
+    for key, value, most in (
+        ("exposure_s", frame.exposure_s, MAX_EXPOSURE_S),
+        ("photons", frame.photons, _MAX_PHOTONS),
+    ):
+        if value is not None and not 0 <= value <= most:
+            raise BadValue(f"{path}: {frame.file}: {key} = {value}; give a number from 0 to {most:g}")
     if frame.temperature_c is not None and not -273.15 <= frame.temperature_c < 200:
         raise BadValue(f"{path}: {frame.file}: temperature_c = {frame.temperature_c}; give degrees Celsius")

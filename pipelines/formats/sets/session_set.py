@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
@@ -56,7 +57,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
     exposure_s, frames = _frames_of_views(folder, plan, kind)
     measured_in = geometry or folder / GEOMETRY_FILE
     for path, command in ((measured_in, "geometry"), (folder / NOISE_FILE, "noise")):
-        if not path.exists():
+        if not (is_file(path) or is_folder(path)):
             raise MissingFile(
                 f"{path}: no such file; run `faintfield {command} {folder}` first, or `faintfield run {folder}` for all"
             )
@@ -73,7 +74,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         offset_from_files=False,
         flat=None if noise.response is None else _relative_to_axis(noise.response, noise.unusable, lens),
         unusable=noise.unusable,
-        measured_in=measured_in / GEOMETRY_FILE if measured_in.is_dir() else measured_in,
+        measured_in=measured_in / GEOMETRY_FILE if is_folder(measured_in) else measured_in,
         poses="nominal",
         described_in=PLAN,
         noise_reference=tuple(path for path, _ in _at_centre(folder, "noise_reference")),
@@ -94,7 +95,7 @@ def _frames_of_views(folder: Path, plan: CapturePlan, kind: SceneKind) -> tuple[
     taken: dict[tuple[int, int], tuple[Stop, list[str]]] = {}
     for frame, _, path in taken_frames(folder):
         if frame.kind == kind:
-            if not path.is_file():
+            if not is_file(path):
                 raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
             taken.setdefault(frame.stop.node, (frame.stop, []))[1].append(str(path.relative_to(folder)))
     whole = [taken[node] for node in sorted(taken) if len(taken[node][1]) == len(at_centre)]
@@ -112,7 +113,7 @@ def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
     """Return the frames of a kind at the centre node, each with its exposure in s."""
     centre = read_plan(folder).plan.centre
     taken = [(frame, path) for frame, _, path in taken_frames(folder) if frame.kind == kind and frame.stop == centre]
-    return [(path, frame.exposure_s) for frame, path in taken if path.is_file()]
+    return [(path, frame.exposure_s) for frame, path in taken if is_file(path)]
 
 
 def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:

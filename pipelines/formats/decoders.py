@@ -1,0 +1,166 @@
+"""Pictures decoded from TIFF, PNG and JPEG files, each after the size that its header states was accepted."""
+
+import logging
+import struct
+import zlib
+from collections.abc import Callable
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines.errors import UnreadableImage
+
+# Takes width and height in px and the size in bytes of a picture when it is decoded; raises if it is too large.
+type Accept = Callable[[int, int, int], None]
+
+# What the content of a PNG or JPEG file begins with.
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+
+# Number of channels of a PNG, by its colour type; a palette is decoded to colours.
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}
+
+# The last bytes of a whole file. OpenCV silently fills the rest of a truncated photograph with grey.
+_END_MARKS = {_PNG: b"IEND", _JPEG: b"\xff\xd9"}
+
+# Compressions of a TIFF that tifffile decodes itself: none, two names of deflate, and packbits.
+_DEFLATE = (8, 32946)
+_OWN_COMPRESSIONS = (1, *_DEFLATE, 32773)
+
+# Deflate shrinks by at most this factor; a strip whose content cannot exceed the limit in bytes is decoded untested.
+_DEFLATE_RATIO, _UNTESTED_BYTES = 1032, 300_000_000
+
+# What a file may have in bytes besides its pixels: its header, and a picture of its own.
+_OVERHEAD_BYTES = 64_000_000
+
+# TIFFs of microscopes and scanners, whose pages tifffile would look for in ways of their own.
+_NO_SPECIAL_KIND: dict[str, Any] = {f"is_{kind}": False for kind in ("lsm", "ndpi", "philips", "scanimage", "stk")}
+
+# Messages of tifffile are dropped: the failure says it all.
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+
+
+def decode_tiff(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any]:
+    """Return the picture of a TIFF; compressions for which tifffile needs extra packages are decoded by OpenCV.
+
+    Raises
+    ------
+    Exception
+        Of any type, when the file is damaged, or `accept` refuses its size.
+    """
+    with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
+        page = tiff.pages.first
+        if page.dtype is None:
+            raise ValueError("its pixels are of no known type")
+        accept(page.imagewidth, page.imagelength, page.nbytes)
+        if page.compression in _OWN_COMPRESSIONS:
+            _require_one_page(tiff, path)
+            _require_honest_strips(page, file)
+            return np.asarray(page.asarray())
+    file.seek(0)
+    return _with_opencv(_content(file, page.nbytes))
+
+
+def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
+    """Return the picture of a PNG or JPEG, (row, column) or (row, column, RGB), with its own depth and orientation.
+
+    Raises
+    ------
+    Exception
+        Of any type, when the file is damaged, or `accept` refuses its size.
+    """
+    mark = next((mark for mark in _END_MARKS if file.peek(8).startswith(mark)), None)
+    if mark is None:
+        raise ValueError("not an image, or truncated")
+    width, height, pixel_bytes = _png_size(file) if mark is _PNG else _jpeg_size(file)
+    size_bytes = width * height * pixel_bytes
+    accept(width, height, size_bytes)
+    file.seek(0)
+    content = _content(file, size_bytes)
+    if _END_MARKS[mark] not in content[-1024:] or (mark is _PNG and not _sound_png(content)):
+        raise ValueError("not an image, or truncated")
+    return _with_opencv(content)
+
+
+def _require_one_page(tiff: tifffile.TiffFile, path: Path) -> None:
+    """Refuse a stack; a smaller picture after the first, as cameras add, is passed over."""
+    first = tiff.pages.first
+    try:
+        second = tiff.pages[1]
+    except IndexError:
+        return
+    if (second.shape, second.dtype) == (first.shape, first.dtype):
+        raise UnreadableImage(f"{path}: holds several pictures of one size; export one to a file of its own")
+
+
+def _require_honest_strips(page: tifffile.TiffPage, file: BufferedReader) -> None:
+    """Refuse strips or tiles that take more memory than the picture, compressed or decompressed."""
+    pixel_bytes = page.samplesperpixel * -(-page.bitspersample // 8)
+    most = max(page.tilewidth * page.tilelength * page.tiledepth * pixel_bytes, page.nbytes)
+    if most > page.nbytes + _OVERHEAD_BYTES or sum(page.databytecounts) > 2 * most + _OVERHEAD_BYTES:
+        raise ValueError("its strips or tiles are larger than the picture")
+    if page.compression not in _DEFLATE:
+        return
+    for offset, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+        if size * _DEFLATE_RATIO > _UNTESTED_BYTES:
+            file.seek(offset)
+            if len(zlib.decompressobj().decompress(file.read(size), most + 1)) > most:
+                raise ValueError("a strip decompresses to more than the picture")
+
+
+def _png_size(file: BufferedReader) -> tuple[int, int, int]:
+    """Return width, height and bytes per pixel that the header of a PNG states."""
+    width, height, depth, colour_type = struct.unpack(">16x2I2B", file.read(26))
+    return width, height, _PNG_CHANNELS.get(colour_type, 4) * (2 if depth > 8 else 1)
+
+
+def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
+    """Return width, height and bytes per pixel that the frame header of a JPEG states."""
+    file.seek(2)
+    while True:
+        begin, marker, length = struct.unpack(">BBH", file.read(4))
+        if begin == marker == 0xFF:  # a marker may be preceded by any number of these
+            file.seek(-3, 1)
+            continue
+        if begin != 0xFF or length < 2:
+            raise ValueError("not an image, or truncated")
+        if marker in range(0xC0, 0xD0) and marker not in (0xC4, 0xC8, 0xCC):  # tables, not frames
+            _, height, width, channels = struct.unpack(">BHHB", file.read(6))
+            return width, height, channels
+        file.seek(length - 2, 1)
+
+
+def _content(file: BufferedReader, picture_bytes: int) -> bytes:
+    """Return the content of a file that holds a picture of a size when it is decoded."""
+    content = file.read(picture_bytes + _OVERHEAD_BYTES + 1)
+    if len(content) > picture_bytes + _OVERHEAD_BYTES:
+        raise ValueError("is far larger than its picture")
+    return content
+
+
+def _with_opencv(content: bytes) -> NDArray[Any]:
+    """Return the picture of a file's content, decoded by OpenCV."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
+    pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise ValueError("not an image, or truncated")
+    if pixels.ndim == 3 and pixels.shape[2] >= 3:
+        pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
+    return np.asarray(pixels)
+
+
+def _sound_png(content: bytes) -> bool:
+    """Return whether every chunk of a PNG has a right checksum; the decoder would only print."""
+    start = 8
+    while start < len(content):
+        end = start + 8 + int.from_bytes(content[start : start + 4])
+        if zlib.crc32(content[start + 4 : end]) != int.from_bytes(content[end : end + 4]) or end + 4 > len(content):
+            return False
+        if content[start + 4 : start + 8] == b"IEND":
+            break
+        start = end + 4
+    return True
