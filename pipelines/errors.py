@@ -7,6 +7,7 @@ InputError
 ├── WrongBitDepth
 ├── BadValue
 │   └── UnknownKey
+├── ResultDamaged
 ├── OutputExists
 ├── OutputBusy
 ├── MissingPackage
@@ -51,6 +52,10 @@ class BadValue(InputError):
 
 class UnknownKey(BadValue):
     """A file has a key that is not read, most often a misspelt one."""
+
+
+class ResultDamaged(InputError):
+    """A result, a file beside it or one of its inputs is not what its record says."""
 
 
 class OutputExists(InputError):

@@ -11,7 +11,7 @@ from faintfield.pipelines.commands.capture import capture
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.files import check_free, write_json
+from faintfield.pipelines.formats.files import check_free, write_json, write_record
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
@@ -73,7 +73,7 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     reconstruct_and_report(nominal_session(session), out / "nominal", alone)
     reconstruct_and_report(true_set(session, truth), out / "true", alone)
     metrics = demo_metrics(out, session, truth, _METHODS, DEFAULT_METHOD)
-    write_json(out / METRICS_FILE, metrics)
+    write_record(out / METRICS_FILE, metrics)
     return DemoResult(str(out), str(write_report(out)), metrics)
 
 

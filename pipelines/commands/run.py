@@ -2,14 +2,13 @@
 
 from pathlib import Path
 
-import msgspec
-
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
-from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE, CameraPoses
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS
-from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method, ReconstructionRecord
+from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
+from faintfield.pipelines.formats.results.noise import NOISE_FILE
+from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.planes import Settings
@@ -97,14 +96,12 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
             results={NOISE_FILE: {}},
             make=measure_noise,
             inputs=lambda: _frames(session, "dark", "flat"),
-            sidecars=lambda _: [NOISE_MAPS],
         ),
         Step(
             "geometry",
             results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
             make=measure_geometry,
             inputs=lambda: _frames(session, "charuco"),
-            sidecars=lambda content: msgspec.json.decode(content, type=CameraPoses).files_beside(),
         ),
         *_steps_of_request(session, request),
     ]
@@ -119,11 +116,11 @@ def _steps_of_request(session: Path, request: Request) -> list[Step]:
             "reconstruct",
             results={
                 str(folder / RECONSTRUCTION_FILE): request.options(name, "measured") for name, folder in folders.items()
-            },
+            }
+            | {f"{RECONSTRUCTIONS}/{OVERVIEW_FILE}": None},
             make=lambda: reconstruct_and_report(load_session(session), out, request),
             needs=("noise", "geometry"),
             inputs=lambda: files_of_scene(session, "dark_scene"),
-            sidecars=_plane_files,
         ),
         Step(
             "report",
@@ -132,11 +129,6 @@ def _steps_of_request(session: Path, request: Request) -> list[Step]:
             needs=("reconstruct",),
         ),
     ]
-
-
-def _plane_files(content: bytes) -> list[str]:
-    """Return the names of the planes of a reconstruction.json."""
-    return [plane.file for plane in msgspec.json.decode(content, type=ReconstructionRecord).planes]
 
 
 def _frames(session: Path, *kinds: str) -> list[str]:

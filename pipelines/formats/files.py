@@ -16,6 +16,7 @@ from typing import Any, BinaryIO
 import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
+from faintfield.pipelines.formats.digests import with_digest
 from faintfield.rig.session import durable, regular_files
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
@@ -66,6 +67,11 @@ def write_whole(path: Path, content: bytes | str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON-able value or msgspec Struct, indented, whole or not at all."""
     write_whole(path, msgspec.json.format(msgspec.json.encode(value)) + b"\n")
+
+
+def write_record(path: Path, record: msgspec.Struct) -> None:
+    """Write the record of a result as JSON with its own digest, whole or not at all."""
+    write_whole(path, with_digest(msgspec.json.encode(record)))
 
 
 @contextmanager

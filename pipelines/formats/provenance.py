@@ -57,7 +57,7 @@ def first_difference[Options](content: bytes, now: Provenance[Options]) -> str |
 
     Raises
     ------
-    msgspec.MsgspecError, UnicodeDecodeError
+    msgspec.MsgspecError, UnicodeDecodeError, RecursionError
         The file is damaged.
     """
     record = msgspec.json.decode(content, type=dict[str, object])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds
 from faintfield.rig.session.regular_files import open_regular, read_regular
 
 # Size in bytes up to which a file of text, settings or records is read. The largest that faintfield writes, the record
@@ -104,13 +105,17 @@ def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
     MissingFile
         The file cannot be read.
     BadValue
-        It is not JSON, or not of this type.
+        It is not JSON, not of this type, or does not agree with the digest that it carries.
     """
     content = read_content(path)
     try:
-        return msgspec.json.decode(content, type=kind)
+        record = msgspec.json.decode(content, type=kind)
+        altered = digest_holds(content) is False
     except JSON_FAILURES as failure:
         raise BadValue(f"{path}: is not {what} ({failure}); {remedy}") from failure
+    if altered:
+        raise BadValue(f"{path}: was altered after it was written: it disagrees with its {DIGEST_KEY}; {remedy}")
+    return record
 
 
 def read_arrays(

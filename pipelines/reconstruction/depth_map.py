@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole
+from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded, grey_levels, white_level, write_plane
 from faintfield.pipelines.formats.large_arrays import memory_or_file
@@ -152,7 +152,7 @@ def write_depth_map(
         sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
         hashes = _write_maps(folder, found, sharp)
         vouching = DepthMapFileRecord(1, found.record, hashes, **msgspec.structs.asdict(origins[method]))
-        write_json(folder / DEPTH_MAP_FILE, vouching)
+        write_record(folder / DEPTH_MAP_FILE, vouching)
     return found.record
 
 

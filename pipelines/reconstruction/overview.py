@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.files import write_record
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, white_level, write_png
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Brightness, Overview
@@ -165,7 +165,7 @@ def write_overview(loaded: ElementalSet, out: Path) -> None:
         grey_scale_dn=(black, white),
         brightness=brightness_within(loaded, region, name),
     )
-    write_json(out / OVERVIEW_FILE, record)
+    write_record(out / OVERVIEW_FILE, record)
 
 
 def _write_bright_view(loaded: ElementalSet, region: Region | None, out: Path) -> None:

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_json
+from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
@@ -72,7 +72,7 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     metrics = assess(loaded, sweep.written)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:
-        write_json(out / METRICS_FILE, metrics)
+        write_record(out / METRICS_FILE, metrics)
     remove(out / REPORT_FILE)  # likewise
     focus, records = sweep.focus(), sweep.records
     for name, folder in folders.items():
@@ -84,7 +84,7 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
             wall_time_s=time.monotonic() - started,
             **msgspec.structs.asdict(sweep.origins[name]),
         )
-        write_json(folder / RECONSTRUCTION_FILE, result)
+        write_record(folder / RECONSTRUCTION_FILE, result)
         if request.with_focus:
             write_stack(folder, result.planes)
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted

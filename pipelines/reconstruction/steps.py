@@ -10,7 +10,9 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile
 from faintfield.pipelines.formats.files import Hashes
 from faintfield.pipelines.formats.provenance import first_difference, provenance
+from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
 from faintfield.pipelines.formats.results.records import REPORT_FILE
+from faintfield.pipelines.formats.results.verification import is_record, records_of, verify_results
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.rig.session.session import taken_frames
 
@@ -24,15 +26,13 @@ class Step:
     name : str
         Name of the command that does it alone.
     results : dict of str to mapping or msgspec.Struct
-        The options of each result file, if it is up to date; None if it is enough that the file exists.
+        The options of each result file, if it is up to date; None if it records none.
     make : callable
         Does it.
     needs : tuple of str
         Names of the steps whose results it reads.
     inputs : callable
         Returns the names of all files that it reads.
-    sidecars : callable
-        Takes a result file's content; returns the names of the files that belong to it, in the same folder.
     """
 
     name: str
@@ -40,7 +40,6 @@ class Step:
     make: Callable[[], object]
     needs: tuple[str, ...] = ()
     inputs: Callable[[], Sequence[str]] = tuple
-    sidecars: Callable[[bytes], Sequence[str]] = lambda _: ()
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
@@ -119,15 +118,22 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
     for file, options in step.results.items():
         if not (session / file).is_file():
             return f"{file} does not exist yet"
+        if problem := _problem_of(session / file):
+            return problem.removeprefix(f"{session}/")
         if options is None:
             continue
         try:
-            content = (session / file).read_bytes()
-            if difference := first_difference(content, provenance(step.name, options, inputs)):
-                return f"{file} was made with another {difference}"
-            sidecars = [(session / file).parent / name for name in step.sidecars(content)]
-        except (msgspec.MsgspecError, UnicodeDecodeError, LookupError, TypeError):
+            difference = first_difference(read_content(session / file), provenance(step.name, options, inputs))
+        except (MissingFile, *JSON_FAILURES):
             return f"{file} is damaged"
-        if missing := [path for path in sidecars if not path.is_file()]:
-            return f"{missing[0].relative_to(session)} is missing"
+        if difference:
+            return f"{file} was made with another {difference}"
     return None
+
+
+def _problem_of(path: Path) -> str | None:
+    """Return why a result does not stand, None if it does, or is none that vouches for itself."""
+    if not is_record(path):
+        return None
+    verdict = verify_results(records_of(path))
+    return next(iter(verdict.problems + verdict.unchecked), None)

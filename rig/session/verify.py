@@ -33,6 +33,8 @@ class Verdict(Struct, frozen=True):
         Names of frames that were kept although the next check of the stage failed.
     sealed : bool
         Whether the session is complete.
+    interrupted : tuple of str
+        Names of the files of an exposure that was interrupted, which are no damage.
     """
 
     problems: tuple[str, ...]
@@ -43,6 +45,7 @@ class Verdict(Struct, frozen=True):
     superseded: int
     suspect: tuple[str, ...]
     sealed: bool
+    interrupted: tuple[str, ...] = ()
 
 
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:

@@ -10,11 +10,11 @@ from typing import Annotated, Literal
 import cv2
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.files import remove, write_json, write_whole
+from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, MAX_NODE, sound_node, sound_pose
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
 
@@ -70,10 +70,6 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
         """Return the lens."""
         lens = self.lens
         return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-
-    def files_beside(self) -> list[str]:
-        """Return the names of the files that lie beside geometry.json."""
-        return [COVARIANCE_FILE, CORNERS_FILE, GEOMETRY_PAGE, *(CAMERA_FILE.format(*it.node) for it in self.nodes)]
 
 
 class RepeatabilityRecord(Struct, frozen=True):
@@ -131,7 +127,10 @@ class GeometryOptions(Struct, frozen=True):
 
 
 class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
-    """`geometry.json` whole: the lens and the poses, how well they are known, and how they were found."""
+    """`geometry.json` whole: the lens and the poses, how well they are known, and how they were found.
+
+    It vouches for the files beside it, by SHA-256; those of earlier versions do not.
+    """
 
     rms_inlier_px: float
     rms_mrcal_px: float
@@ -148,6 +147,7 @@ class GeometryRecord(CameraPoses, frozen=True, kw_only=True):
     options: GeometryOptions
     inputs: dict[str, str]
     versions: dict[str, str]
+    sha256: dict[str, str] | UnsetType = UNSET
 
 
 def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
@@ -186,4 +186,5 @@ def write_geometry(out: Path, record: GeometryRecord, beside: Mapping[str, bytes
         remove(earlier)  # the node may not be part of the new geometry
     for name, content in beside.items():
         write_whole(out / name, content)
-    write_json(out / GEOMETRY_FILE, record)
+    hashes = {name: sha256(out / name) for name in beside}
+    write_record(out / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import remove, sha256, write_json, write_whole, writing
+from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole, writing
 from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
@@ -163,7 +163,7 @@ def write_noise(
     for name, page in pages.items():
         write_whole(out / name, page)
     record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
-    write_json(out / NOISE_FILE, record)
+    write_record(out / NOISE_FILE, record)
     return record
 
 

@@ -1,7 +1,7 @@
 """A plane as files: TIFFs, a preview and the record that vouches for them; its colours, until all are there."""
 
-import zipfile
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,22 +10,33 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import MissingFile
-from faintfield.pipelines.formats.files import remove, sha256, write_json, writing
+from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.digests import digest_holds
+from faintfield.pipelines.formats.files import remove, sha256, write_record, writing
 from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.provenance import Provenance, first_difference
+from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content, read_json
 from faintfield.pipelines.formats.results.records import (
     DepthMapFileRecord,
+    FileName,
     FocusPoint,
     Method,
     PlaneFileRecord,
     PlaneRecord,
     ReconstructionOptions,
+    Sha256,
 )
+from faintfield.pipelines.formats.results.result_files import problem_of_file
 
 # Folder of the colours of planes that still lack others.
 PARTS = ".parts"
+
+# The colours' files hold numbers of this type alone, so that nothing in them has to be decoded.
+_SUFFIX_OF_PARTS, _STORED = ".float32", np.dtype("<f4")
+
+_A_COLOUR, _ANEW = "the record of a colour of a plane", f"remove the folder {PARTS} and reconstruct again"
 
 # What may be known of each sample besides its light, each in a file of its own.
 _SIDECARS = ("sigma", "opacity")
@@ -39,10 +50,12 @@ def plane_name(place: Place) -> str:
 
 
 class _Part(Provenance[ReconstructionOptions], frozen=True):
-    """What is stored with the arrays of one colour: what it adds to the plane's record."""
+    """The record of one colour: what it adds to the plane's record, and the arrays (row, column) in its file."""
 
     record: PlaneRecord
     focus: FocusPoint | None
+    arrays: list[str]
+    sha256: dict[FileName, Sha256]
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,8 @@ class PlaneFiles:
 
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
-        return read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
+        record = read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
+        return record if record is not None and self._is_of(record.planes, record.focus) else None
 
     def missing(self) -> list[str]:
         """Return the colours that are still to be reconstructed."""
@@ -96,18 +110,27 @@ class PlaneFiles:
         record, focus : PlaneRecord, FocusPoint
             What this colour adds to the plane's record.
         """
-        part = _Part(record, focus, **msgspec.structs.asdict(self.origin))
-        content = np.frombuffer(msgspec.json.encode(part), np.uint8)
-        with writing(self._part(channel)) as file:
-            np.savez(file, allow_pickle=False, content=content, **arrays)
+        path = self._part(channel)
+        with writing(path) as file:
+            for array in arrays.values():
+                file.write(np.ascontiguousarray(array, _STORED).data)
+        hashes = {path.name: sha256(path)}
+        write_record(
+            path.with_suffix(".json"),
+            _Part(record, focus, list(arrays), hashes, **msgspec.structs.asdict(self.origin)),
+        )
 
     def finish(self, pitch_mm: float) -> PlaneFileRecord:
-        """Write the plane and its preview from its colours, then the record that vouches for them, and return that."""
-        parts = []
-        for channel in self.channels:
-            with np.load(self._part(channel), allow_pickle=False) as part:
-                parts.append(dict(part))
-        entries = [msgspec.json.decode(part["content"].tobytes(), type=_Part) for part in parts]
+        """Write the plane and its preview from its colours, then the record that vouches for them, and return that.
+
+        Raises
+        ------
+        BadValue
+            The file of a colour does not hold the arrays that its record names.
+        """
+        paths = [self._part(channel) for channel in self.channels]
+        entries = [read_json(path.with_suffix(".json"), _Part, what=_A_COLOUR, remedy=_ANEW) for path in paths]
+        parts = [_arrays(*pair) for pair in zip(paths, entries, strict=True)]
         plane = _joined(parts, "plane")
         write_plane(self.path, plane, pitch_mm)
         preview = self.path.with_suffix(".png")
@@ -122,9 +145,10 @@ class PlaneFiles:
             {path.name: sha256(path) for path in written},
             **msgspec.structs.asdict(self.origin),
         )
-        write_json(self.path.with_suffix(".json"), record)
-        for channel in self.channels:
-            self._part(channel).unlink()
+        write_record(self.path.with_suffix(".json"), record)
+        for path in paths:
+            path.unlink()
+            path.with_suffix(".json").unlink()
         return record
 
     def _write_sidecars(self, parts: list[dict[str, NDArray[Any]]], pitch_mm: float) -> dict[str, Path]:
@@ -140,32 +164,56 @@ class PlaneFiles:
         return written
 
     def _part(self, channel: str) -> Path:
-        return self.folder / PARTS / f"{plane_name(self.place)}_{channel}.npz"
+        return self.folder / PARTS / f"{plane_name(self.place)}_{channel}{_SUFFIX_OF_PARTS}"
 
     def _has(self, channel: str) -> bool:
         """Return whether a colour is there, whole and current."""
-        try:
-            with np.load(self._part(channel), allow_pickle=False) as part:
-                content = part["content"].tobytes()
-            msgspec.json.decode(content, type=_Part)
-            return first_difference(content, self.origin) is None
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):  # msgspec's errors are ValueErrors
-            return False
+        path = self._part(channel)
+        part = read_current(path.with_suffix(".json"), _Part, self.origin)
+        return part is not None and list(part.sha256) == [path.name] and part.record.channel == channel
+
+    def _is_of(self, planes: Sequence[PlaneRecord], focus: Sequence[FocusPoint | None]) -> bool:
+        """Return whether a record has an entry for each colour of this plane, and no other."""
+        stated = [(plane.method, plane.channel, plane.file) for plane in planes]
+        expected = [(self.method, channel, self.path.name) for channel in self.channels]
+        return stated == expected and len(focus) == len(expected)
 
 
-def read_current[Record: (PlaneFileRecord, DepthMapFileRecord)](
+def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, _Part)](
     path: Path, kind: type[Record], origin: Origin
 ) -> Record | None:
-    """Return a record whose files, in the same folder, are whole and of this origin; None for any other."""
+    """Return a record of this origin that agrees with its digest and with its files, in the same folder; else None.
+
+    One that was altered or damaged is named in a message: it will be made again.
+    """
+    if not path.is_file():
+        return None
     try:
-        content = path.read_bytes()
+        content = read_content(path)
+        record = msgspec.json.decode(content, type=kind)
         if first_difference(content, origin) is not None:
             return None
-        record = msgspec.json.decode(content, type=kind)
-        whole = all(sha256(path.parent / name) == known for name, known in record.sha256.items())
-    except (OSError, MissingFile, ValueError):
-        return None  # there is none, or it cannot be read
-    return record if whole else None
+        problem = None if digest_holds(content) else "was altered, or is of an earlier version and has no digest"
+    except (MissingFile, *JSON_FAILURES):
+        problem = "is damaged"
+    else:
+        for name, known in record.sha256.items():
+            fault = problem_of_file(path.with_name(name), path.parent, known)
+            problem = problem or (fault and f"{name} {fault}")
+    if problem is None:
+        return record
+    inform(f"{path}: {problem}; it is made again")
+    return None
+
+
+def _arrays(path: Path, part: _Part) -> dict[str, NDArray[np.float32]]:
+    """Return the arrays (row, column) of one colour by name."""
+    shape = (len(part.arrays), *part.record.shape)
+    found, needed = path.stat().st_size, math.prod(shape) * _STORED.itemsize
+    if found != needed or "plane" not in part.arrays:
+        raise BadValue(f"{path}: holds {found} bytes, and its record names {needed}; {_ANEW}")
+    arrays = np.frombuffer(read_content(path, needed), _STORED).reshape(shape)
+    return dict(zip(part.arrays, arrays, strict=True))
 
 
 def _joined(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:

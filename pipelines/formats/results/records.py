@@ -5,6 +5,7 @@ exports can do without have defaults, so that results of earlier versions and th
 """
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
@@ -18,11 +19,31 @@ REPORT_FILE = "report.html"
 
 type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
 
+# A file beside a record: one name, which cannot lead elsewhere or act on a terminal.
+type FileName = Annotated[str, Meta(pattern=r"^(?!\.{1,2}\Z)[^/\\\x00-\x1f\x7f]+\Z", max_length=200)]
+
+type Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
+
+# Lengths of a plane in mm, from atoms to a thousand km: what is outside can only be damage.
+type LengthMm = Annotated[float, Meta(ge=1e-6, le=1e9)]
+
+type Count = Annotated[int, Meta(ge=0, le=1_000_000)]
+
 # Methods that reconstruct all planes together.
 JOINT_METHODS: tuple[Method, ...] = ("joint", "occlusion")
 
 # Where poses come from: as the set states them, measured, where the stage was told to go, or known to the simulator.
 type Poses = Literal["stated", "measured", "nominal", "true"]
+
+
+def preview_name(name: str) -> str:
+    """Return the name of the preview of a plane or a map."""
+    return str(Path(name).with_suffix(".png"))
+
+
+def record_name(name: str) -> str:
+    """Return the name of the record that vouches for a plane."""
+    return str(Path(name).with_suffix(".json"))
 
 
 class Certificate(Struct, frozen=True, kw_only=True):
@@ -90,13 +111,13 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     """
 
     name: str | UnsetType = UNSET
-    depth_mm: float
+    depth_mm: LengthMm
     rt_ref_plane: tuple[float, float, float, float, float, float] | UnsetType = UNSET
     method: Method
     channel: str
-    file: str
-    shape: tuple[int, int] = (0, 0)
-    pitch_mm: float
+    file: FileName
+    shape: tuple[Count, Count] = (0, 0)
+    pitch_mm: LengthMm
     origin_mm: tuple[float, float] = (0.0, 0.0)
     penalty_weight: float | None
     penalty_weight_chosen: str
@@ -112,8 +133,13 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     occlusion: bool | UnsetType = UNSET
     occlusion_left_out: str | UnsetType = UNSET
     flux_e: float
-    sigma_file: str | UnsetType = UNSET
-    opacity_file: str | UnsetType = UNSET
+    sigma_file: FileName | UnsetType = UNSET
+    opacity_file: FileName | UnsetType = UNSET
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files of this plane, beside the record."""
+        return [name for name in (self.file, self.sigma_file, self.opacity_file) if name is not UNSET]
 
 
 class FocusPoint(Struct, frozen=True):
@@ -145,14 +171,19 @@ class BestFocusRecord(Struct, frozen=True):
 class DepthMapRecord(Struct, frozen=True):
     """The maps of a sweep: their files, unit and how much of them is known."""
 
-    file: str
-    confidence: str
-    all_in_focus: str
+    file: FileName
+    confidence: FileName
+    all_in_focus: FileName
     unit: Literal["mm", "px"]
     bins_px: int
     sure_above: float
     sure_share: float
     median: float | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the maps, beside the record, each with a preview."""
+        return [self.file, self.confidence, self.all_in_focus]
 
 
 class ReconstructionOptions(Struct, frozen=True):
@@ -178,7 +209,7 @@ class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
     format: Literal[1]
     planes: list[PlaneRecord]
     focus: list[FocusPoint | None]
-    sha256: dict[str, str]
+    sha256: dict[FileName, Sha256]
 
 
 class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
@@ -186,7 +217,7 @@ class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
 
     format: Literal[1]
     depth_map: DepthMapRecord
-    sha256: dict[str, str]
+    sha256: dict[FileName, Sha256]
 
 
 class ReconstructionRecord(Struct, frozen=True, kw_only=True):
@@ -202,6 +233,12 @@ class ReconstructionRecord(Struct, frozen=True, kw_only=True):
     options: ReconstructionOptions
     inputs: dict[str, str]
     versions: dict[str, str]
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files that it lists, beside it."""
+        maps = self.depth_map.files if self.depth_map else []
+        return [*dict.fromkeys(name for plane in self.planes for name in plane.files), *maps, *map(preview_name, maps)]
 
 
 class PlaneErrors(Struct, frozen=True, kw_only=True):

@@ -1,8 +1,10 @@
 """Finding and reading the JSON files of results, with a named failure for a damaged one."""
 
+from collections.abc import Callable
 from pathlib import Path
 
-from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, ReconstructionRecord
 
@@ -22,9 +24,53 @@ def read_result[Record](path: Path, kind: type[Record]) -> Record:
     Raises
     ------
     MissingFile, BadValue
-        The file cannot be read, or is not of this type.
+        The file cannot be read, is not of this type, or does not agree with its digest.
     """
     return read_json(path, kind, what="a result that can be shown", remedy="reconstruct again")
+
+
+def file_within(folder: Path, name: str) -> Path:
+    """Return the path of a file that a record in `folder` names; it may be missing.
+
+    Raises
+    ------
+    BadValue
+        It leads out of the folder, or is a pipe, a device or a folder.
+    """
+    path = folder / name
+    if not _is_within(path, folder):
+        raise BadValue(f"{path}: leads out of the folder, or is no regular file; reconstruct again")
+    return path
+
+
+def problem_of_file(path: Path, folder: Path, known: str, hashed: Callable[[Path], str] = sha256) -> str | None:
+    """Return in words how a file that a record names differs from the one that it vouches for, None if it does not.
+
+    Parameters
+    ----------
+    path, folder : Path
+        The file, and the folder that it must lie in.
+    known : str
+        Its SHA-256 as recorded.
+    hashed : callable
+        Returns the SHA-256 of a file.
+    """
+    if not _is_within(path, folder):
+        return "leads out of its folder, or is no regular file"
+    try:
+        if not path.exists():
+            return "is missing"
+        return None if hashed(path) == known else "was altered"
+    except MissingFile as failure:
+        return f"cannot be read ({failure.__cause__})"
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    """Return whether a path is that of a regular file in a folder, or of none."""
+    try:
+        return path.resolve().is_relative_to(folder.resolve()) and (path.is_file() or not path.exists())
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def results_below(directory: Path) -> dict[Path, ReconstructionRecord]:
@@ -33,11 +79,15 @@ def results_below(directory: Path) -> dict[Path, ReconstructionRecord]:
     Raises
     ------
     MissingFile, BadValue
-        There is none, or one that cannot be read.
+        There is none, or one that cannot be read, or that names a file outside its folder.
     """
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
     paths = files_below(directory, RECONSTRUCTION_FILE)
     if not paths:
         raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
-    return {path.parent: read_result(path, ReconstructionRecord) for path in paths}
+    results = {path.parent: read_result(path, ReconstructionRecord) for path in paths}
+    for folder, result in results.items():
+        for name in result.files:
+            file_within(folder, name)
+    return results

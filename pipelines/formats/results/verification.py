@@ -1,0 +1,299 @@
+"""Verify results: each record against its digest, the files that it vouches for, and the inputs that it was made from.
+
+Nothing is changed. Inputs are compared where they are found; a verdict says which were not.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+from faintfield.pipelines.errors import InputError, MissingFile
+from faintfield.pipelines.formats.digests import digest_holds
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, GeometryRecord
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
+from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Overview
+from faintfield.pipelines.formats.results.records import (
+    DEPTH_MAP_FILE,
+    METRICS_FILE,
+    RECONSTRUCTION_FILE,
+    DepthMapFileRecord,
+    Metrics,
+    PlaneFileRecord,
+    ReconstructionRecord,
+    record_name,
+)
+from faintfield.pipelines.formats.results.result_files import files_below, problem_of_file, read_result
+
+# The type of each record, by a pattern of its name; of geometry.json, a person may write the poses alone.
+_KINDS: dict[str, tuple[type[Struct], ...]] = {
+    RECONSTRUCTION_FILE: (ReconstructionRecord,),
+    "plane_*.json": (PlaneFileRecord,),
+    DEPTH_MAP_FILE: (DepthMapFileRecord,),
+    OVERVIEW_FILE: (Overview,),
+    METRICS_FILE: (Metrics,),
+    NOISE_FILE: (NoiseRecord,),
+    GEOMETRY_FILE: (GeometryRecord, CameraPoses),
+}
+
+# How far above a result its inputs are searched for: a method's folder lies in `reconstructions`, this in the session.
+_LEVELS_ABOVE = 2
+
+
+class ResultVerdict(Struct, frozen=True):
+    """What was found of results.
+
+    Attributes
+    ----------
+    records, files, inputs : int
+        Number of records that were read, of the files beside them and of the inputs that were compared with them.
+    problems : tuple of str
+        All problems, one line each; empty if there is none.
+    unchecked : tuple of str
+        What could not be checked, one line each.
+    """
+
+    records: int
+    files: int
+    inputs: int
+    problems: tuple[str, ...]
+    unchecked: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Named:
+    """A file that a record names by its SHA-256; it must lie in `folder`."""
+
+    record: Path
+    folder: Path
+    name: str
+    sha256: str
+    is_input: bool
+
+
+# Returns the folder that the inputs of a record lie in, given its path and their SHA-256 by name; None if not found.
+type FindInputs = Callable[[Path, Mapping[str, str]], Path | None]
+
+
+def is_record(path: Path) -> bool:
+    """Return whether a file has the name of a record that can be verified."""
+    return bool(_kinds_of(path))
+
+
+def records_below(folder: Path) -> list[Path]:
+    """Return the records in a folder and below it, in order."""
+    return sorted({path for pattern in _KINDS for path in files_below(folder, pattern)})
+
+
+def records_of(path: Path) -> list[Path]:
+    """Return the records that belong to a result: all below a folder, and those that a reconstruction.json repeats.
+
+    Raises
+    ------
+    MissingFile
+        It does not exist, or is no result.
+    """
+    if path.is_dir():
+        found = records_below(path)
+        if not found:
+            raise MissingFile(f"{path}: holds no session and no result; name the folder of one")
+        return found
+    if not path.is_file() or not is_record(path):
+        raise MissingFile(
+            f"{path}: is no folder and no record of a result ({', '.join(_KINDS)}); name one of these, or its folder"
+        )
+    if path.name != RECONSTRUCTION_FILE:
+        return [path]
+    try:
+        repeated = _repeated(read_result(path, ReconstructionRecord))
+    except InputError:
+        return [path]
+    return [path, *(own for name in repeated if (own := path.with_name(name)).is_file())]
+
+
+def verify_results(
+    records: Sequence[Path],
+    find_inputs: FindInputs | None = None,
+    progress: Callable[[Sequence[Path]], Iterable[Path]] = iter,
+    hashed: Callable[[Path], str] = sha256,
+) -> ResultVerdict:
+    """Verify records.
+
+    Parameters
+    ----------
+    records : sequence of Path
+        The records.
+    find_inputs : callable, optional
+        Finds the inputs of a record; without it, they are not compared.
+    progress : callable
+        Wraps the iteration over the files that are hashed, to draw a progress bar.
+    hashed : callable
+        Returns the SHA-256 of a file.
+    """
+    work = _Verification()
+    for path in records:
+        work.read(path)
+    work.compare_records()
+    if find_inputs is not None:
+        work.look_for_inputs(find_inputs)
+    inputs = sum(one.is_input for one in work.named)
+    for one, path in zip(work.named, progress([one.folder / one.name for one in work.named]), strict=True):
+        work.compare(one, path, hashed)
+    return ResultVerdict(
+        records=len(work.content),
+        files=len(work.named) - inputs,
+        inputs=inputs,
+        problems=tuple(work.problems),
+        unchecked=tuple(work.unchecked),
+    )
+
+
+class _Verification:
+    """A verification under way: what was read, what is to be hashed, and what was found."""
+
+    def __init__(self) -> None:
+        self.content: dict[Path, Struct] = {}
+        self.named: list[_Named] = []
+        self.problems: list[str] = []
+        self.unchecked: list[str] = []
+        self._vouching: set[Path] = set()
+
+    def read(self, path: Path) -> None:
+        """Read a record, compare it with its digest, and note the files beside it."""
+        try:
+            text = read_content(path)
+            self.content[path] = record = _decoded(text, _kinds_of(path))
+            holds = digest_holds(text)
+        except MissingFile as failure:
+            self.problems.append(f"{path}: cannot be read ({failure.__cause__})")
+            return
+        except JSON_FAILURES as failure:
+            self.problems.append(f"{path}: is damaged ({failure})")
+            return
+        if holds:
+            self._vouching.add(path)
+        elif holds is None:
+            self.unchecked.append(f"{path}: has no digest: an earlier version wrote it, or a person")
+        else:
+            self.problems.append(f"{path}: was altered after it was written")
+        self.named += [_Named(path, path.parent, name, known, is_input=False) for name, known in _beside(record)]
+
+    def compare_records(self) -> None:
+        """Compare each reconstruction.json with the records of its planes and of its depth map, which it repeats."""
+        for path, record in self.content.items():
+            if isinstance(record, ReconstructionRecord):
+                faults = [f"{path}: {fault}" for fault in self._disagreements(path, record)]
+                (self.problems if path in self._vouching else self.unchecked).extend(faults)
+
+    def _disagreements(self, path: Path, record: ReconstructionRecord) -> Iterator[str]:
+        """Yield in words where a reconstruction.json is not what the records beside it say."""
+        for name, part in _repeated(record).items():
+            own = path.with_name(name)
+            if own not in self.content:
+                yield f"{name} is missing or damaged"
+            elif own not in self._vouching:
+                yield f"{name} does not vouch for what it repeats"
+            elif msgspec.json.encode(_own_part(self.content[own])) != msgspec.json.encode(part):
+                yield f"does not say what {name} says"
+
+    def look_for_inputs(self, find: FindInputs) -> None:
+        """Note the inputs of every record that are found, and name the others."""
+        for path, record in self.content.items():
+            inputs = _inputs_of(record)
+            folder = find(path, inputs) if inputs else None
+            there = {name: known for name, known in inputs.items() if folder and _exists(folder / name)}
+            self.named += [_Named(path, folder, *it, is_input=True) for it in there.items() if folder]
+            if absent := [name for name in inputs if name not in there]:
+                more = f" and {len(absent) - 1} other inputs" if len(absent) > 1 else ""
+                self.unchecked.append(f"{path}: {absent[0]}{more} not found; name their folder by --inputs")
+
+    def compare(self, one: _Named, path: Path, hashed: Callable[[Path], str]) -> None:
+        """Compare one file with the SHA-256 by which a record names it."""
+        fault = problem_of_file(path, one.folder, one.sha256, hashed)
+        if fault and one.is_input:
+            self.problems.append(f"{one.record}: was made from another {one.name} than {path}, which {fault}")
+        elif fault:
+            self.problems.append(f"{path}: {fault}")
+
+
+def inputs_in(folder: Path) -> FindInputs:
+    """Return a function that says that all inputs are in one folder."""
+    return lambda _, __: folder
+
+
+def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:
+    """Return the folder of a record's inputs: its own, one around it, or one beside it that holds the very same file.
+
+    The first input is the file that describes the others, such as elemental.toml or the plan of a session.
+    """
+    described_in, known = next(iter(inputs.items()))
+    folder = record.parent.resolve()
+    around = [folder, *folder.parents[:_LEVELS_ABOVE]]
+    for candidate in around:
+        if _exists(candidate / described_in):
+            return candidate
+    with suppress(OSError):  # a folder around it that may not be listed
+        for candidate in (one for level in around[1:] for one in sorted(level.iterdir()) if one.is_dir()):
+            if problem_of_file(candidate / described_in, candidate, known) is None:
+                return candidate
+    return None
+
+
+def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:
+    """Return a record of the first type that it fits."""
+    for kind in kinds[:-1]:
+        with suppress(msgspec.ValidationError):
+            return msgspec.json.decode(text, type=kind)
+    return msgspec.json.decode(text, type=kinds[-1])
+
+
+def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
+    """Return the types of a record by its name; none if it is not that of a record."""
+    return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
+
+
+def _beside(record: Struct) -> Iterable[tuple[str, str]]:
+    """Return the name and the SHA-256 of each file beside a record for which it vouches."""
+    match record:
+        case PlaneFileRecord() | DepthMapFileRecord():
+            return record.sha256.items()
+        case GeometryRecord():
+            return (record.sha256 or {}).items()
+        case NoiseRecord() if record.maps_sha256:
+            return [(record.maps, record.maps_sha256)]
+        case _:
+            return []
+
+
+def _inputs_of(record: Struct) -> Mapping[str, str]:
+    """Return the SHA-256 of a record's inputs by name."""
+    made = record.provenance if isinstance(record, NoiseRecord) else record
+    inputs: Mapping[str, str] = getattr(made, "inputs", {})
+    return inputs
+
+
+def _repeated(record: ReconstructionRecord) -> dict[str, object]:
+    """Return the parts of a reconstruction.json that records beside it hold, too, by the names of these."""
+    parts: dict[str, object] = {}
+    for file in dict.fromkeys(plane.file for plane in record.planes):
+        parts[record_name(file)] = [plane for plane in record.planes if plane.file == file]
+    return parts if record.depth_map is None else parts | {DEPTH_MAP_FILE: record.depth_map}
+
+
+def _own_part(record: Struct) -> object:
+    """Return the part of a record that reconstruction.json repeats."""
+    return record.planes if isinstance(record, PlaneFileRecord) else getattr(record, "depth_map", None)
+
+
+def _exists(path: Path) -> bool:
+    """Return whether there is a file of any kind; False for names that no file can have."""
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
