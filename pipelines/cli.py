@@ -4,16 +4,18 @@ A command is a function of its arguments that returns its result, a JSON-able ob
 commands by name, so that a module is imported only when its command runs.
 """
 
+import os
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from json import dumps
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
-from faintfield.pipelines.console import framed_console, inform
+from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, WrongUsage
 from faintfield.pipelines.log_file import logged
 from faintfield.pipelines.registry import register_commands
@@ -33,6 +35,7 @@ app = App(
     help_epilogue=_START,
     version=version("faintfield"),
     error_console=framed_console,
+    error_formatter=lambda failure: CycloptsPanel(visible(str(failure))),
     default_parameter=Parameter(negative=()),
     result_action="return_value",
 )
@@ -62,9 +65,24 @@ def _launch(
     with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)):
         result: object = app(tokens, exit_on_error=False, print_error=True)
     if json and result is not None:
-        sys.stdout.write(msgspec.json.encode(result).decode() + "\n")
+        _print_bytes(_json(result))
     elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
-        sys.stdout.write(f"{report}\n")
+        _print_bytes(os.fsencode(visible(str(report)) if sys.stdout.isatty() else report))
+
+
+def _json(result: object) -> bytes:
+    """Return a result as one line of JSON."""
+    try:
+        return msgspec.json.encode(result)
+    except UnicodeEncodeError:  # the name of a file is not UTF-8
+        return dumps(msgspec.to_builtins(result)).encode()
+
+
+def _print_bytes(line: bytes) -> None:
+    """Write a line to standard output as it is: the name of a file may be text in no encoding."""
+    sys.stdout.flush()
+    sys.stdout.buffer.write(line + b"\n")
+    sys.stdout.buffer.flush()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -21,9 +21,34 @@ logger = logging.getLogger("faintfield")
 framed_console = Console(stderr=True, highlight=False, emoji=False)
 
 
+# Words that no log may hold.
+_secrets: set[str] = set()
+
+
+def visible(text: str) -> str:
+    r"""Return `text` with each character that cannot be seen as its escape, so that no name can forge or hide a line.
+
+    >>> visible("name\n\x1b[2Kdone")
+    'name\\n\\x1b[2Kdone'
+    """
+    return "".join(it if it.isprintable() else it.encode("unicode_escape").decode() for it in text)
+
+
+def conceal(secret: str) -> None:
+    """Keep a word out of the log from here on, wherever it is said."""
+    _secrets.add(secret)
+
+
+def without_secrets(text: str) -> str:
+    """Return `text` with each concealed word replaced."""
+    for secret in tuple(_secrets):
+        text = text.replace(secret, "(concealed)")
+    return text
+
+
 def inform(text: str) -> None:
     """Print one line for people, and record it in the log if there is one."""
-    console.print(text, markup=False)
+    console.print(visible(text), markup=False)
     logger.info(text)
 
 
@@ -40,7 +65,7 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
         The number of items, if `items` has no length.
     """
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -50,4 +75,4 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
     # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
     drawn = console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
-        yield from bar.track(items, description=label, total=total)
+        yield from bar.track(items, description=visible(label), total=total)

@@ -1,28 +1,33 @@
 """Serve a capture as a local web page: what the terminal shows, with its keys as buttons, dim red on black.
 
 The page is served to this computer only, at an address that cannot be guessed: its path begins with a random token.
+Whatever any program sends there, the capture goes on: connections are bounded in number, size and time, and each
+serves one request.
 """
 
+import asyncio
 import secrets
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import files
+from json import dumps
 from typing import Any
 
 import msgspec
 import numpy as np
 import uvicorn
-from starlette.applications import Starlette
-from starlette.middleware import Middleware
-from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.datastructures import Headers
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
-from starlette.routing import Route
+from starlette.routing import Route, Router
+from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
-from faintfield.pipelines.live.panel import REQUESTS, CapturePanel
+from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
 from faintfield.pipelines.live.terminal import LABELS, display_levels
 from faintfield.rig.capture.guide import format_duration
 
@@ -30,9 +35,16 @@ _HOST = "127.0.0.1"
 # Width of the frame's picture in pixels.
 _PICTURE_PX = 960
 _HISTOGRAM_BINS = 64
-# Longer requests are not read: a press is far shorter.
+# Bounds on connections: how many, of which so many may arrive at once; how long one may last; what it may send.
+_MAX_CONNECTIONS = 64
+_MAX_ARRIVALS = 16
+_MAX_REQUEST_S = 15.0
+_MAX_HEADER_BYTES = 8192
 _MAX_PRESS_BYTES = 1000
+# The end of the capture waits no longer for the page.
+_MAX_FAREWELL_S = 5.0
 _HEADERS = {
+    "Connection": "close",
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
@@ -50,81 +62,197 @@ class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
 
 @contextmanager
 def serve_page(panel: CapturePanel) -> Iterator[str]:
-    """Serve the page of `panel` while the block runs; yield its address."""
+    """Serve the page of `panel` while the block runs; yield its address, which no log records."""
     token = secrets.token_urlsafe(24)
+    conceal(token)
     listener = socket.create_server((_HOST, 0))
-    application = _application(panel, token)
     server = uvicorn.Server(
-        uvicorn.Config(application, log_level="critical", lifespan="off", timeout_graceful_shutdown=1)
+        uvicorn.Config(
+            _Door(_pages(panel), token),
+            http=_BoundedConnection,
+            h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
+            backlog=_MAX_ARRIVALS,
+            ws="none",
+            lifespan="off",
+            proxy_headers=False,
+            server_header=False,
+            headers=list(_HEADERS.items()),
+            log_config=None,
+            log_level="critical",
+            timeout_graceful_shutdown=1,
+        )
     )
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True, name="page")
+    thread = threading.Thread(target=_run, args=(server, listener), daemon=True, name="page")
     thread.start()
     try:
         yield f"http://{_HOST}:{listener.getsockname()[1]}/{token}/"
     finally:
         server.should_exit = True
-        thread.join()
+        thread.join(_MAX_FAREWELL_S)
         listener.close()
 
 
-def _application(panel: CapturePanel, token: str) -> Starlette:
-    """Return the web application; every path of it begins with the token."""
+def _run(server: uvicorn.Server, listener: socket.socket) -> None:
+    """Run the server; its failure is told, and does not end the capture."""
+
+    async def serve() -> None:
+        # What fails in a connection concerns nobody else, and asyncio would print its traceback
+        asyncio.get_running_loop().set_exception_handler(lambda _, __: None)
+        await server.serve(sockets=[listener])
+        for connection in tuple(server.server_state.connections):
+            connection.transport.abort()
+
+    try:
+        asyncio.run(serve())
+    except Exception as failure:
+        inform(f"warning: the page has ended ({type(failure).__name__}: {failure}); the capture goes on without it")
+
+
+class _BoundedConnection(H11Protocol):
+    """A connection that is closed after a limited time, or sooner if others need its place.
+
+    When there are too many, the oldest that has not given the token goes: who has it is never kept out for long.
+    """
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._deadline = self.loop.call_later(_MAX_REQUEST_S, transport.abort)
+        self._strangers: dict[object, asyncio.Transport] = self.config.app.strangers  # type: ignore[union-attr]
+        self._strangers[self.client or self] = transport
+        if len(self.connections) > _MAX_CONNECTIONS:
+            self._strangers.pop(next(iter(self._strangers))).abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._deadline.cancel()
+        self._strangers.pop(self.client or self, None)
+        super().connection_lost(exc)
+
+
+class _Door:
+    """Passes a request on if it gives the token, and comes from this page; tells others nothing.
+
+    Attributes
+    ----------
+    strangers : dict
+        The connections that have not given the token, the oldest first, by the address of the other side.
+    """
+
+    def __init__(self, pages: Router, token: str) -> None:
+        self.strangers: dict[object, asyncio.Transport] = {}
+        self._pages = pages
+        self._token = token.encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        token, _, path = scope["path"].removeprefix("/").partition("/")
+        if secrets.compare_digest(token.encode(), self._token) and _is_own(Headers(scope=scope)):
+            self.strangers.pop(scope["client"], None)
+            await self._pages({**scope, "path": f"/{path}"}, receive, send)
+        else:
+            await Response(status_code=404)(scope, receive, send)
+
+
+def _is_own(headers: Headers) -> bool:
+    """Return whether a request comes from the page itself.
+
+    A foreign page can make a name of its own point to this computer, which `Host` tells, or post to an address that it
+    knows, which `Origin` tells. Any port will do, because the page may be reached through a tunnel.
+    """
+    host = headers.get("host", "")
+    return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
+
+
+def _pages(panel: CapturePanel) -> Router:
+    """Return what is served behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
     async def index(_: Request) -> Response:
-        return HTMLResponse(html, headers=_HEADERS)
+        return HTMLResponse(html)
 
     async def state(_: Request) -> Response:
-        return JSONResponse(_state(panel), headers=_HEADERS)
+        # Escaped, because the name of a file may not be UTF-8
+        return Response(dumps(_state(panel)), media_type="application/json")
 
     async def picture(_: Request) -> Response:
-        if panel.shown is None:
-            return Response(status_code=404, headers=_HEADERS)
-        grey = display_levels(panel.shown.pixels, _PICTURE_PX)
-        zero = np.zeros_like(grey)
-        red = encoded(np.dstack([grey, zero, zero]), ".png")
-        return Response(red, media_type="image/png", headers=_HEADERS)
+        shown = panel.shown
+        if shown is None:
+            return Response(status_code=404)
+        return Response(_png(shown), media_type="image/png")
 
     async def press(request: Request) -> Response:
         try:
-            body = await request.body()
-            pressed = msgspec.json.decode(body[:_MAX_PRESS_BYTES], type=_PressRequest)
-        except msgspec.DecodeError as failure:
-            return JSONResponse({"error": str(failure)}, status_code=400, headers=_HEADERS)
+            pressed = msgspec.json.decode(await _body(request), type=_PressRequest)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            return JSONResponse({"error": "not a press of a button"}, status_code=400)
         if pressed.word not in LABELS:
-            return JSONResponse({"error": "no such button"}, status_code=400, headers=_HEADERS)
+            return JSONResponse({"error": "no such button"}, status_code=400)
         panel.press(pressed.word, pressed.prompt)
-        return JSONResponse({}, headers=_HEADERS)
+        return JSONResponse({})
 
-    return Starlette(
-        routes=[
-            Route(f"/{token}/", index),
-            Route(f"/{token}/state", state),
-            Route(f"/{token}/frame.png", picture),
-            Route(f"/{token}/press", press, methods=["POST"]),
+    return Router(
+        [
+            Route("/", index),
+            Route("/state", state),
+            Route("/frame.png", picture),
+            Route("/press", press, methods=["POST"]),
         ],
-        # Turn away requests by another host name, which a foreign page could make point to this computer
-        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=[_HOST])],
+        redirect_slashes=False,
     )
+
+
+async def _body(request: Request) -> bytes:
+    """Return the body of a request; nothing, and without reading on, if it is too long for a press."""
+    if int(request.headers.get("content-length", 0)) > _MAX_PRESS_BYTES:
+        return b""
+    body = b""
+    async for chunk in request.stream():
+        body += chunk
+        if len(body) > _MAX_PRESS_BYTES:
+            return b""
+    return body
+
+
+def _kept[T](make: Callable[[ShownFrame], T]) -> Callable[[ShownFrame], T]:
+    """Let `make` keep what it made of the last frame: the page asks several times a second."""
+    last: tuple[ShownFrame, T] | None = None
+
+    def make_once(shown: ShownFrame) -> T:
+        nonlocal last
+        present = last
+        if present is None or present[0] is not shown:
+            present = last = (shown, make(shown))
+        return present[1]
+
+    return make_once
+
+
+@_kept
+def _png(shown: ShownFrame) -> bytes:
+    """Return the picture of a frame in red, as a PNG file."""
+    grey = display_levels(shown.pixels, _PICTURE_PX)
+    zero = np.zeros_like(grey)
+    return encoded(np.dstack([grey, zero, zero]), ".png")
+
+
+@_kept
+def _frame(shown: ShownFrame) -> dict[str, Any]:
+    """Return name, values and histogram of a frame as a JSON object."""
+    counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
+    return {
+        "name": shown.frame.name,
+        "values": dict(shown.values),
+        "histogram": np.log1p(counts).tolist(),
+        "range_dn": [float(edges[0]), float(edges[-1])],
+    }
 
 
 def _state(panel: CapturePanel) -> dict[str, Any]:
     """Return what the page shows, except the picture, as a JSON object."""
     asked, status, shown = panel.asked, panel.status, panel.shown
     words = REQUESTS if asked is None else asked.prompt.answers
-    frame = None
-    if shown is not None:
-        counts, edges = np.histogram(shown.pixels, bins=_HISTOGRAM_BINS)
-        frame = {
-            "name": shown.frame.name,
-            "values": dict(shown.values),
-            "histogram": np.log1p(counts).tolist(),
-            "range_dn": [float(edges[0]), float(edges[-1])],
-        }
     return {
         "prompt": None if asked is None else {"number": asked.number, **msgspec.to_builtins(asked.prompt)},
         "status": None if status is None else msgspec.to_builtins(status),
         "to_go": "" if status is None else format_duration(status.to_go_s),
         "buttons": [{"word": word, "label": LABELS[word]} for word in words],
-        "frame": frame,
+        "frame": None if shown is None else _frame(shown),
     }

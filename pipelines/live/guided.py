@@ -7,7 +7,9 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 
-from faintfield.pipelines.console import inform, progress
+import numpy as np
+
+from faintfield.pipelines.console import console, inform, progress
 from faintfield.pipelines.errors import InputError
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
@@ -18,6 +20,7 @@ from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import is_simulated, open_rig
+from faintfield.rig.errors import CaptureStopped
 from faintfield.rig.plan import CapturePlan
 from faintfield.rig.session.resume import check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
@@ -58,12 +61,10 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
         if page:
-            from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
-
-            inform(f"page: {stack.enter_context(serve_page(panel))}")
+            _open_page(panel, stack)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
-        Capture(session, open_rig(settings, session.journal), panel, _read_pixels).run()
+        Capture(session, open_rig(settings, session.journal), panel, read_pixels).run()
         taken = len(session.valid()) - before
     inform(f"{folder}: complete, {taken} frames taken; faintfield verify {folder} compares every byte")
     return taken
@@ -83,12 +84,29 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     return FrozenPlan(found.plan, settings)
 
 
-def _read_pixels(path: Path) -> Pixels | None:
-    """Return the pixels of a frame's file, None if it cannot be decoded."""
+def _open_page(panel: CapturePanel, stack: ExitStack) -> None:
+    """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
     try:
-        return read_frame(path).pixels_dn
+        from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
+
+        address = stack.enter_context(serve_page(panel))
+    except (OSError, RuntimeError) as failure:
+        if not (panel.unattended or console.is_terminal):
+            raise CaptureStopped(
+                f"there is no page ({failure}) and no terminal to answer prompts on; run the same command in a terminal"
+            ) from failure
+        inform(f"warning: there is no page ({failure}); the capture goes on without it")
+    else:
+        inform(f"page: {address}")
+
+
+def read_pixels(path: Path) -> Pixels | None:
+    """Return the pixels of a frame's file, None if it cannot be decoded or holds what is no number."""
+    try:
+        pixels_dn = read_frame(path).pixels_dn
     except InputError:
         return None
+    return pixels_dn if np.isfinite(pixels_dn).all() else None
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from rich.console import Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from faintfield.pipelines.console import console, inform
+from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.live.panel import CapturePanel, ShownFrame
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import Prompt, Status, format_duration
@@ -102,13 +102,14 @@ def _key_line(words: Iterable[str], gap: str) -> str:
 def status_line(status: Status) -> str:
     """Return a status as one line."""
     node = "" if status.node is None else f" node {status.node[0]},{status.node[1]}"
-    return f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
+    line = f"{status.done} of {status.total} frames, {format_duration(status.to_go_s)} to go;{node}: {status.doing}"
+    return visible(line)
 
 
 def values_line(shown: ShownFrame) -> str:
     """Return a line with name and histogram of a frame, and a second one with its measured values."""
-    values = "  ".join(f"{name} {value:g}" for name, value in shown.values.items())
-    return f"{shown.frame.name}  {histogram_bars(shown.pixels)}\n{values}"
+    values = visible("  ".join(f"{name} {value:g}" for name, value in shown.values.items()))
+    return f"{visible(shown.frame.name)}  {histogram_bars(shown.pixels)}\n{values}"
 
 
 def histogram_bars(pixels: Pixels, bins: int = 24) -> str:

@@ -1,6 +1,8 @@
 """The command line: help, exit codes, and which words go where."""
 
+import io
 import json
+import os
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,8 +11,9 @@ from typing import Any
 
 import pytest
 from cyclopts import App
+from rich.console import Console
 
-from faintfield.pipelines import cli
+from faintfield.pipelines import cli, console
 from faintfield.pipelines.errors import BadValue
 from faintfield.recon.errors import NotConverged
 
@@ -170,6 +173,54 @@ def test_named_failures_are_one_line_as_it_is_and_exit_code_1(
     monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
     ended = faintfield("report", "folder")
     assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", line)
+
+
+# Each begins a line of its own, hides what follows, or turns its direction
+HOSTILE = "\n\r\t\a\b\x1b\x7f\x85\x9b\u200f\u2028\u2029\u202a\u202e\u2066\u2069\ufeff\udcff"
+ESCAPED = r"\n\r\t\x07\x08\x1b\x7f\x85\x9b\u200f\u2028\u2029\u202a\u202e\u2066\u2069\ufeff\udcff"
+
+
+def test_what_a_name_holds_is_escaped_in_a_failure(monkeypatch: pytest.MonkeyPatch, faintfield: Command) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise BadValue(f"{HOSTILE}é…[red]: 1 plane(s) in 3.0 s")
+
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    said = faintfield("report", "folder").stderr
+    assert said == f"faintfield: BadValue: {ESCAPED}é…[red]: 1 plane(s) in 3.0 s\n"
+
+
+def test_what_a_name_holds_is_escaped_in_a_message(tmp_path: Path, done: Command) -> None:
+    rig = tmp_path / f"{HOSTILE}.toml"
+    said = done("init", rig).stderr
+    assert said.startswith(f"wrote {tmp_path}/{ESCAPED}.toml; ")
+    assert len(said.splitlines()) == 1
+
+
+def test_what_a_word_holds_is_escaped_in_wrong_usage(faintfield: Command) -> None:
+    for words in ((HOSTILE,), ("verify", f"--{HOSTILE}"), ("simulate", "OUT", "--seed", HOSTILE)):
+        ended = faintfield(*words)
+        assert ended.returncode == 2
+        assert ended.stderr.isascii() or set(ended.stderr) - set("╭─╮│╰╯\n") <= set(map(chr, range(32, 127)))
+        assert r"\x1b" in ended.stderr
+        assert all(line[0] in "╭│╰" for line in ended.stderr.splitlines())
+
+
+def test_a_bar_shows_its_label_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    screen = io.StringIO()
+    monkeypatch.setattr(console, "console", Console(file=screen, force_terminal=True, width=200))
+    assert list(console.progress([1, 2], f"[bold]{HOSTILE}")) == [1, 2]
+    assert f"[bold]{ESCAPED}" in screen.getvalue()
+
+
+@pytest.mark.parametrize("json_wanted", [False, True])
+def test_a_path_that_is_not_utf_8_is_printed(
+    json_wanted: bool, monkeypatch: pytest.MonkeyPatch, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    report = os.fsdecode(b"out \xff/report.html")
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", lambda folder: Path(report))
+    assert cli.run(["report", "folder", *(["--json"] if json_wanted else [])]) == 0
+    said = capfdbinary.readouterr().out
+    assert json.loads(said)["report"] == report if json_wanted else said == b"out \xff/report.html\n"
 
 
 def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatch, faintfield: Command) -> None:

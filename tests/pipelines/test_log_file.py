@@ -9,6 +9,7 @@ from subprocess import CompletedProcess
 import pytest
 
 from faintfield.pipelines import cli
+from faintfield.pipelines.console import conceal, inform
 
 type Command = Callable[..., CompletedProcess[str]]
 _LINE = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (INFO|WARNING|ERROR) (.*)")
@@ -55,7 +56,41 @@ def test_a_bug_leaves_its_traceback_and_a_warning_its_words(tmp_path: Path, monk
     assert ("WARNING", "the wind has turned") in _entries(log)
     assert _entries(log)[-1][1].endswith("by ZeroDivisionError: a bug")
     assert "Traceback (most recent call last)" in log.read_text()
-    assert log.read_text().splitlines()[-1] == "ZeroDivisionError: a bug"
+    assert log.read_text().splitlines()[-1] == "  ZeroDivisionError: a bug"
+
+
+def test_no_name_can_forge_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forged = "a\n2026-01-01T00:00:00.000Z INFO done in 1.0 s\x1b[2K\u2028\udcff"
+
+    def fail(*_: object) -> None:
+        logging.getLogger("some.library").warning(forged)
+        raise ZeroDivisionError(forged)
+
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    log = tmp_path / "day.log"
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["report", forged, "--log", str(log)])
+    escaped = r"a\n2026-01-01T00:00:00.000Z INFO done in 1.0 s\x1b[2K\u2028\udcff"
+    levels, words = zip(*_entries(log), strict=True)
+    assert levels == ("INFO", "INFO", "WARNING", "ERROR")
+    assert words[0].startswith(f"begins: faintfield report {escaped} (in ")
+    assert words[2] == escaped
+    assert words[3].endswith(f"by ZeroDivisionError: {escaped}")
+    assert all(line.isprintable() for line in log.read_text().split("\n"))
+
+
+def test_a_secret_is_in_no_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        conceal("sesame")
+        inform("the word is sesame")
+        raise ZeroDivisionError("sesame")
+
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    log = tmp_path / "day.log"
+    with pytest.raises(ZeroDivisionError):
+        cli.run(["report", "folder", "--log", str(log)])
+    assert "sesame" not in log.read_text()
+    assert ("INFO", "the word is (concealed)") in _entries(log)
 
 
 def test_the_log_is_closed_in_the_end(tmp_path: Path, faintfield: Command) -> None:
@@ -71,3 +106,14 @@ def test_a_log_that_cannot_be_written_is_refused_before_the_command_runs(tmp_pat
     assert ended.stderr.startswith("faintfield: CannotWrite: --log ")
     assert "name a file that can be written" in ended.stderr
     assert not rig.exists()
+
+
+def test_a_full_disk_ends_the_log_and_not_the_command(tmp_path: Path, faintfield: Command) -> None:
+    rig = tmp_path / "rig.toml"
+    ended = faintfield("--log", "/dev/full", "init", rig)
+    assert ended.returncode == 0
+    assert rig.is_file()
+    warning, message = ended.stderr.splitlines()
+    assert warning.startswith("warning: --log /dev/full: ")
+    assert warning.endswith("No space left on device; the log is incomplete")
+    assert message.startswith(f"wrote {rig}; ")
