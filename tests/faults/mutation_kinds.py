@@ -297,7 +297,12 @@ KINDS: Mapping[str, Kind] = {
     "noise": Kind(
         _measured_noise,
         ("noise.json", "noise_maps.npz"),
-        (Call(_RECONSTRUCT), Call(_BACKPROJECT), Call("darken IN OUT")),
+        (
+            Call(_RECONSTRUCT),
+            Call(_BACKPROJECT),
+            Call("darken IN OUT"),
+            Call("verify IN", _NOTHING, notices=("noise_maps.npz",)),
+        ),
     ),
     "geometry": Kind(
         _measured_geometry,
@@ -305,6 +310,7 @@ KINDS: Mapping[str, Kind] = {
         (
             Call("reconstruct IN/scene --geometry IN --out OUT --depth-mm 500 --method backprojection"),
             Call("reconstruct IN/scene --geometry IN/geometry.json --out OUT --depth-mm 500 --method backprojection"),
+            Call("verify IN", _NOTHING, notices=("*.npz", "cameras/*")),
         ),
     ),
     "COLMAP text": Kind(_exported("colmap"), ("model/*.txt",), (Call("import colmap IN/model OUT --images IN"),)),
@@ -352,8 +358,12 @@ KINDS: Mapping[str, Kind] = {
             Call("report IN/planes", ("IN/planes/report.html",)),
             Call("report IN/sweep", ("IN/sweep/report.html",)),
             Call("report IN", ("IN/report.html",)),
-            Call(f"reconstruct IN/set --out IN/planes {_PLANES}", ("IN/planes", "IN/planes/*")),
-            Call(f"reconstruct IN/set --out IN/sweep {_SWEEP}", ("IN/sweep", "IN/sweep/*")),
+            Call(
+                f"reconstruct IN/set --out IN/planes {_PLANES}", ("IN/planes", "IN/planes/*"), then="verify IN/planes"
+            ),
+            Call(f"reconstruct IN/set --out IN/sweep {_SWEEP}", ("IN/sweep", "IN/sweep/*"), then="verify IN/sweep"),
+            Call("verify IN/planes", _NOTHING, notices=("planes/plane_*.tiff",)),
+            Call("verify IN/sweep", _NOTHING, notices=("sweep/plane_*.tiff",)),
             Call("export zarr IN/sweep OUT"),
         ),
     ),

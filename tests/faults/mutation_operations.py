@@ -3,6 +3,7 @@
 An operation and its arguments are JSON, so that a mutation can be kept and made again whatever the random numbers are.
 """
 
+import hashlib
 import json
 import os
 import re
@@ -18,10 +19,13 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import tifffile
 import tomli_w
 
+from faintfield.pipelines.formats.digests import DIGEST_KEY, with_digest
+from faintfield.rig.session.session import JOURNAL, PLAN, SUMS
 from tests.faults.contained import FORGED, SCRIPT
 
 # Names in the folder around all of a case's files; nothing may be written to any of them.
@@ -741,6 +745,30 @@ def _packed(path: Path, at: int, number: str) -> None:
 
 BINARY = {"number": Operation(_draw_packed, _packed)}
 
+# --- what vouches for a file
+
+_DIGEST = re.compile(rf',\s*"{DIGEST_KEY}":\s*"[^"]*"')
+
+
+def _sign(path: Path) -> None:
+    """Renew what vouches for a file, as one who alters it on purpose would do."""
+    if path.suffix == ".json" and DIGEST_KEY in _text(path):
+        path.write_bytes(with_digest(_DIGEST.sub("", path.read_text()).encode()))
+    session = next((folder for folder in path.parents if (folder / JOURNAL).is_file()), None)
+    if session is None:
+        return
+    if path.name == PLAN:
+        with closing(_opened(session / JOURNAL)) as db:
+            digest = json.dumps({"plan_sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
+            _attempt(db, "UPDATE event SET detail = ? WHERE kind = 'begun'", [digest])
+    if (session / SUMS).is_file():
+        names = [line.partition("  ")[2] for line in (session / SUMS).read_text().splitlines()]
+        digests = {name: hashlib.sha256((session / name).read_bytes()).hexdigest() for name in names}
+        (session / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in digests.items()))
+
+
+SIGN = {"sign": Operation(lambda *_: [], _sign)}
+
 _OF_SUFFIX: dict[str, tuple[dict[str, Operation], ...]] = {
     ".toml": (TREE, TREE, TREE, TEXT),
     ".json": (TREE, TREE, TREE, TEXT),
@@ -757,9 +785,15 @@ _OF_SUFFIX: dict[str, tuple[dict[str, Operation], ...]] = {
 }
 ALL = {
     name.strip(): operation
-    for group in (BYTES, WHOLE_FILE, TREE, TEXT, TIFF, PNG, JPEG, NPZ, SQLITE, BINARY)
+    for group in (BYTES, WHOLE_FILE, TREE, TEXT, TIFF, PNG, JPEG, NPZ, SQLITE, BINARY, SIGN)
     for name, operation in group.items()
 }
+
+
+_NOT_OF_ITS_KIND = (
+    *(ValueError, LookupError, OSError, RecursionError, struct.error),
+    *(sqlite3.Error, tifffile.TiffFileError, zipfile.BadZipFile, zlib.error),
+)
 
 
 def draw(rng: Random, path: Path) -> tuple[str, Arguments]:
@@ -769,7 +803,7 @@ def draw(rng: Random, path: Path) -> tuple[str, Arguments]:
     name = rng.choice(list(group))
     try:
         arguments = group[name].draw(rng, path)
-    except (ValueError, LookupError, struct.error, OSError, sqlite3.Error, tifffile.TiffFileError):
+    except _NOT_OF_ITS_KIND:
         return "flip", [[[rng.randrange(400), rng.randrange(8)]]]  # not of its kind any more
     return name.strip(), arguments
 
@@ -788,5 +822,5 @@ def apply(path: Path, name: str, arguments: Arguments) -> None:
     """Do an operation to a file."""
     try:
         ALL[name].apply(path, *(_expanded(it, guard_of(path)) for it in arguments))
-    except (ValueError, LookupError, TypeError, struct.error, sqlite3.Error, tifffile.TiffFileError):
+    except (*_NOT_OF_ITS_KIND, TypeError, msgspec.MsgspecError):
         pass  # an earlier operation on the same file, or another version of it, left nothing to do
