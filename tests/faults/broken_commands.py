@@ -32,6 +32,11 @@ def hang() -> int:
         time.sleep(60)
 
 
+def endless_loop() -> int:
+    while True:
+        pass
+
+
 def hanging_thread() -> int:
     import threading
 

@@ -5,9 +5,11 @@ The child is forked, so that nothing is imported again: this process must have n
 
 import atexit
 import json
+import math
 import os
 import re
 import resource
+import select
 import signal
 import sys
 import threading
@@ -25,6 +27,9 @@ from pathlib import Path
 MAX_EXTRA_BYTES = 2 << 30
 MAX_FILE_BYTES = 1 << 30
 MAX_SECONDS = 30.0
+
+# Share of a processor that a child has even on a busy machine, unless it waits.
+_LEAST_RUNNING = 0.02
 
 # Begins a line that only a name in a file can have brought about, and a script that must never reach a page as such.
 FORGED = "faintfield-forged:"
@@ -55,19 +60,44 @@ class Ended:
 def contained(
     call: Callable[[], int], place: Path, *, seconds: float = MAX_SECONDS, extra_bytes: int = MAX_EXTRA_BYTES
 ) -> Ended:
-    """Run `call` in a child whose working folder is `place`; its result is the exit code."""
+    """Run `call` in a child whose working folder is `place`; its result is the exit code.
+
+    The child may compute for `seconds`, and wait for as long.
+    """
     out, err = (os.memfd_create(name) for name in ("out", "err"))
     limit = _data_bytes() + extra_bytes
     begun = time.monotonic()
     child = os.fork()
     if child == 0:
         _be_child(call, place, (out, err), seconds, limit)
-    _, status = os.waitpid(child, 0)
+    status = _wait(child, seconds)
     alone = _group_is_gone(child)
     texts = [_content(file).decode(errors="replace") for file in (out, err)]
     killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
     code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
     return Ended(code, killed, texts[0], texts[1], alone, time.monotonic() - begun)
+
+
+def _wait(child: int, seconds: float) -> int:
+    """Return the status of a child at its end; end it if it waits for something that never comes.
+
+    On a busy machine it may take long, but it then still runs now and then.
+    """
+    ended = select.poll()
+    watched = os.pidfd_open(child)
+    ended.register(watched, select.POLLIN)
+    used = 0.0
+    while not ended.poll(1000 * seconds):
+        before, used = used, _cpu_seconds(child)
+        if used - before < _LEAST_RUNNING * seconds:
+            os.kill(child, signal.SIGALRM)
+    os.close(watched)
+    return os.waitpid(child, 0)[1]
+
+
+def _cpu_seconds(process: int) -> float:
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seconds: float, limit: int) -> None:
@@ -84,10 +114,11 @@ def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seco
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
         resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, MAX_FILE_BYTES))
-        for number in (signal.SIGALRM, signal.SIGTERM):
+        whole_seconds = math.ceil(seconds)
+        resource.setrlimit(resource.RLIMIT_CPU, (whole_seconds, whole_seconds + 1))
+        for number in (signal.SIGALRM, signal.SIGTERM, signal.SIGXCPU):
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
         code = call()
         # What Python does at its end: it waits for threads, and lets libraries clean up
         threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001
@@ -180,8 +211,8 @@ def _ended_badly(ended: Ended) -> list[str]:
     faults = []
     lines = ended.err.splitlines()
     said = [line for line in lines if _FAILURE.match(line)]
-    if ended.signal == signal.SIGALRM:
-        faults.append("hang: ran out of time")
+    if ended.signal in (signal.SIGALRM, signal.SIGXCPU):
+        faults.append(f"hang: {'waited' if ended.signal == signal.SIGALRM else 'ran'} too long")
     elif ended.signal is not None:
         faults.append(f"died by signal {signal.Signals(ended.signal).name}")
     elif "Traceback (most recent call last)" in ended.err:

@@ -89,10 +89,12 @@ class Bench:
 
     def __init__(self, folder: Path) -> None:
         self.ended: contained.Ended
+        self._made: dict[str, Path] = {}
+        self._kind = ""
+        self._clean: contained.State = {}
         self._valid = folder / "valid"
         self._valid.mkdir(parents=True, exist_ok=True)
         self._guard = Path(tempfile.mkdtemp(prefix="case-", dir=folder))
-        (self._guard / mutation_operations.VICTIM).touch()
 
     def draw(self, kind: str, seed: int) -> Case:
         """Return the case of a seed."""
@@ -100,17 +102,16 @@ class Bench:
         self.lay_out(kind)
         place = self._guard / "IN"
         call = rng.randrange(len(KINDS[kind].calls))
-        edits = []
+        edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
             pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
-            path = rng.choice(
-                sorted(it for it in place.glob(pattern) if it.is_file() and not it.is_symlink()) or [None]
-            )
-            if path is None:
-                continue
+            files = sorted(it for it in place.glob(pattern) if it.is_file() and not it.is_symlink())
+            if not files:
+                continue  # an earlier operation removed them
+            path = rng.choice(files)
             name, arguments = mutation_operations.draw(rng, path)
             edits.append((str(path.relative_to(place)), name, arguments))
-            mutation_operations.apply(path, name, arguments)
+            self._mutate(*edits[-1])
         if rng.random() < 0.4:
             edits += [(file, "sign", []) for file, *_ in edits]
         return Case(kind, call, tuple(edits))
@@ -119,10 +120,8 @@ class Bench:
         """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
         self.lay_out(case.kind)
         call = KINDS[case.kind].calls[case.call]
-        place = self._guard / "IN"
-        for file, name, arguments in case.edits:
-            if os.path.lexists(place / file):
-                mutation_operations.apply(place / file, name, arguments)
+        for edit in case.edits:
+            self._mutate(*edit)
         changed = sorted(self._changed(case.kind, call.notices))
         if not all(name in changed for name, *_ in case.edits):
             changed = []  # what vouches for the others was changed, too
@@ -135,6 +134,12 @@ class Bench:
                 faults.append(f"ended well, and then `{call.then}` did not: {self.ended.err[-300:]}")
             self.ended = ended
         return faults
+
+    def _mutate(self, file: str, name: str, arguments: list[Any]) -> None:
+        """Do an operation to a file, if it is still there."""
+        path = self._guard / "IN" / file
+        if os.path.lexists(path):
+            mutation_operations.apply(path, name, arguments)
 
     def faults_of(
         self,
@@ -149,7 +154,7 @@ class Bench:
 
     def _changed(self, kind: str, patterns: Iterable[str]) -> Iterator[str]:
         """Yield the names of the files whose content is not that of the valid ones."""
-        valid, place = self._valid_folder(kind), self._guard / "IN"
+        valid, place = self._valid_folder(kind) / "IN", self._guard / "IN"
         for pattern in patterns:
             for path in valid.glob(pattern):
                 name = path.relative_to(valid)
@@ -163,27 +168,49 @@ class Bench:
         shutil.rmtree(self._guard, ignore_errors=True)
 
     def lay_out(self, kind: str) -> None:
-        """Lay out the valid files of a kind in a folder that also holds files of other people."""
+        """Lay out the valid files of a kind in a folder that also holds files of other people.
+
+        Only what has changed since the last time is laid out again.
+        """
         valid = self._valid_folder(kind)
-        shutil.rmtree(self._guard)
-        (self._guard / "beside").mkdir(parents=True)
-        (self._guard / "beside" / "notes.txt").write_text("of someone else\n")
-        (self._guard / mutation_operations.VICTIM).write_text("of someone else\n")
-        shutil.copytree(valid, self._guard / "IN", symlinks=True)
+        if kind != self._kind:
+            self._kind, self._clean = kind, {}
+        now = contained.state_of(self._guard)
+        if self._clean and now == self._clean:
+            return
+        for name in sorted(name for name in now if now[name] != self._clean.get(name)):
+            path = self._guard / name
+            if path.is_symlink() or not path.is_dir():
+                path.unlink(missing_ok=True)
+            else:
+                shutil.rmtree(path)
+        for path in sorted(valid.rglob("*")):
+            laid_out = self._guard / path.relative_to(valid)
+            if path.is_dir():
+                laid_out.mkdir(exist_ok=True)
+            elif not os.path.lexists(laid_out):
+                shutil.copy2(path, laid_out)
+        self._clean = contained.state_of(self._guard)
 
     def _valid_folder(self, kind: str) -> Path:
-        """Return the valid folder of a kind, made by a child, by one bench for all."""
+        """Return a folder that holds the valid files of a kind, made by a child, by one bench for all."""
+        if kind in self._made:
+            return self._made[kind]
         seed = KINDS[kind].seed
-        folder = self._valid / f"{kind} {getattr(seed, '__name__', '')}"
+        folder = self._valid / kind
         with (self._valid / f"{kind}.lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not folder.exists():
-                building = folder.with_name(f"{folder.name} unfinished")
+                building = self._valid / f"{kind} unfinished"
                 shutil.rmtree(building, ignore_errors=True)
-                ended = contained.contained(lambda: seed(building) or 0, self._valid, seconds=600.0)
+                (building / "beside").mkdir(parents=True)
+                (building / "beside" / "notes.txt").write_text("of someone else\n")
+                (building / mutation_operations.VICTIM).write_text("of someone else\n")
+                ended = contained.contained(lambda: seed(building / "IN") or 0, self._valid, seconds=600.0)
                 if ended.code != 0:
                     raise RuntimeError(f"{kind}: cannot be made: {ended.err}")
                 building.rename(folder)
+        self._made[kind] = folder
         return folder
 
 

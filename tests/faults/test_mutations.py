@@ -33,8 +33,9 @@ KINDS_HERE = [
 
 BROKEN = {
     "traceback": "traceback: KeyError: 'planes'",
-    "hang": "hang: ran out of time",
-    "hanging_thread": "hang: ran out of time",
+    "hang": "hang: waited too long",
+    "endless_loop": "hang: ran too long",
+    "hanging_thread": "hang: waited too long",
     "crash": "died by signal SIGSEGV",
     "much_memory": "traceback: numpy",
     "other_exit_code": "exit code 3",
@@ -110,7 +111,10 @@ def test_what_was_found_once_stays_mended(case: dict[str, Any], ask: Ask) -> Non
 
 @pytest.mark.parametrize("function", BROKEN)
 def test_a_command_that_misbehaves_is_found_out(function: str, ask: Ask) -> None:
-    found = ask(function=f"tests.faults.broken_commands:{function}", seconds=2.0 if "hang" in function else 60.0)
+    found = ask(
+        function=f"tests.faults.broken_commands:{function}",
+        seconds=2.0 if BROKEN[function].startswith("hang") else 60.0,
+    )
     assert [it for it in found if it.startswith(BROKEN[function])], found
 
 
