@@ -5,7 +5,7 @@ from pathlib import Path
 import msgspec
 
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import ResultDamaged
+from faintfield.pipelines.errors import MissingFile, ResultDamaged
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.results.verification import (
     ResultVerdict,
@@ -45,6 +45,8 @@ def verify(path: Path, /, *, inputs: Path | None = None) -> Verified:
     inputs
         Folder of the session or set that the results were made from; searched for around them by default.
     """
+    if inputs is not None and not inputs.is_dir():
+        raise MissingFile(f"{inputs}: no such folder; name that of the session or set")
     session, known = None, {}
     if has_session(path) or (path / JOURNAL).exists():
         session = _verify_session(path)

@@ -27,6 +27,9 @@ UNFINISHED = ".unfinished"
 
 CACHE_FILE = ".hashes.json"
 
+# A cache of a hundred thousand files is smaller.
+_MAX_CACHE_BYTES = 64_000_000
+
 # In nanoseconds: a file changed this shortly before its hashing could change again with the same time stamp.
 _AT_REST_NS = 2_000_000_000
 
@@ -251,8 +254,10 @@ class Hashes:
         self._folder = folder
         self._known: dict[str, _Known] = {}
         self._changed = False
-        with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError):  # everything is hashed without a whole file
-            self._known = msgspec.json.decode((folder / CACHE_FILE).read_bytes(), type=dict[str, _Known])
+        # Without a whole file everything is hashed
+        with suppress(OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            content = regular_files.read_regular(folder / CACHE_FILE, _MAX_CACHE_BYTES)
+            self._known = msgspec.json.decode(content, type=dict[str, _Known])
 
     def of(self, name: str) -> str:
         """Return the SHA-256 of a file, by its name within the folder."""

@@ -12,6 +12,7 @@ from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
+from faintfield.pipelines.formats.results.result_files import file_within
 from faintfield.pipelines.pages.page import data_uri
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
         SHA-256 of the files that the planes were made from.
     """
     record = read_noise(path)
-    pages = sorted(path.parent.glob("noise_page*.png"))
+    pages = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
     return NoiseSection(
         **_origin(directory, path, inputs),
         pages=[(_link(directory, page), data_uri(page.read_bytes(), ".png")) for page in pages],

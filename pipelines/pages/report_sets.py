@@ -8,7 +8,7 @@ from msgspec import UNSET
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.overview import Overview
-from faintfield.pipelines.formats.results.result_files import read_result
+from faintfield.pipelines.formats.results.result_files import file_within, read_result
 from faintfield.pipelines.pages.page import data_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (
@@ -81,6 +81,8 @@ def set_sections(overviews: list[Path]) -> list[SetSection]:
     distinct: dict[tuple[bytes, ...], tuple[Path, Overview]] = {}
     for path in overviews:
         overview = read_result(path, Overview)
+        for name in (INTEGRAL_IMAGE, REFERENCE_VIEW, NOISE_REFERENCE_VIEW, BRIGHT_VIEW, REGION_OUTLINED):
+            file_within(path.parent, name)
         pictures = [path.with_name(name) for name in (INTEGRAL_IMAGE, REFERENCE_VIEW)]
         key = tuple(picture.read_bytes() for picture in pictures if picture.is_file()) or (path.read_bytes(),)
         rank = PREFERRED_POSES.index(overview.poses)

@@ -1,12 +1,11 @@
 """Tasks of a sweep on dask.distributed: in processes of this machine, or by the workers of a scheduler."""
 
 import logging
-import pickle
 import tempfile
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
 from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
 from faintfield.pipelines.formats.large_arrays import mapped
@@ -102,17 +102,17 @@ def _as_done(
 ) -> Generator[tuple[PlaneTask, list[str]]]:
     """Submit the tasks and yield each when it is done; those of a worker that dies go to another."""
     distributed = _distributed()
-    channels: dict[str, Path] = {}
+    colours: dict[str, _Colour] = {}
     pending: dict[Any, PlaneTask] = {}
     try:
         for task in tasks:
             name = task.layout.name
-            if name not in channels:
-                channels[name] = _share(loaded, task.layout, shared)
+            if name not in colours:
+                colours[name] = _share(loaded, task.layout, shared)
             elsewhere = replace(
                 task, files=tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
             )
-            pending[client.submit(_do, channels[name], elsewhere, pure=False)] = task
+            pending[client.submit(_do, colours[name], elsewhere, pure=False)] = task
         for future in distributed.as_completed(list(pending)):
             messages = future.result()
             future.release()  # otherwise it would be computed again if its worker died
@@ -131,36 +131,73 @@ def _as_done(
             client.run(_opened.cache_clear)
 
 
-def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> Path:
-    """Read a colour into files, one for its electrons and one for its valid pixels, and return the path of the rest."""
-    path = shared / layout.name
+@dataclass(frozen=True)
+class _Colour:
+    """A colour as a task names it: by the path of its arrays, whose suffixes tell them apart.
+
+    Attributes
+    ----------
+    path : Path
+        Path of the arrays, without suffix.
+    shape : tuple of int
+        Of its electrons (view, row, column).
+    loaded : ElementalSet
+        The set without its maps and its noise: what a task says is small.
+    layout : ChannelLayout
+        Position of the colour in the frames.
+    """
+
+    path: Path
+    shape: tuple[int, ...]
+    loaded: ElementalSet = field(compare=False)
+    layout: ChannelLayout = field(compare=False)
+
+    @property
+    def maps(self) -> Path:
+        """Path of the maps of the detector."""
+        return self.path.with_suffix(".npz")
+
+    def pixels(self, dtype: DTypeLike) -> Path:
+        """Return the path of the pixels of a data type: float32 electrons, or whether each is valid."""
+        return self.path.with_suffix(f".{np.dtype(dtype).name}")
+
+
+def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
+    """Read a colour into files that all workers map: its electrons, its valid pixels, and the maps of the detector."""
+    without_maps = replace(loaded, noise=NoiseModel(0.0, 1.0, 0.0), flat=None, unusable=np.zeros((0, 0), bool))
+    shape = (len(loaded.settings.view) * len(layout.lattices), *layout.lattices[0].shape)
+    colour = _Colour(shared / layout.name, shape, without_maps, layout)
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        with translated_write_errors(shared.parent), _pixels_of(path, dtype).open("wb+") as file:
+        with translated_write_errors(shared.parent), colour.pixels(dtype).open("wb+") as file:
             return mapped(file, shape, dtype)
 
     images = load_channel(loaded, layout, allocate)
-    path.write_bytes(
-        pickle.dumps((loaded, layout, images.electrons.shape, images.background_e, images.read_variance_e2))
-    )
-    return path
-
-
-def _pixels_of(path: Path, dtype: DTypeLike) -> Path:
-    """Return the path of a colour's pixels of a data type: float32 electrons, or whether each is valid."""
-    return path.with_suffix(f".{np.dtype(dtype).name}")
+    flat = {} if loaded.flat is None else {"flat": loaded.flat}
+    with translated_write_errors(shared.parent):
+        np.savez(
+            colour.maps,
+            allow_pickle=False,
+            background_e=images.background_e,
+            read_variance_e2=images.read_variance_e2,
+            unusable=loaded.unusable,
+            **flat,
+        )
+    return colour
 
 
 @lru_cache(maxsize=1)
-def _opened(path: Path) -> Channel:
-    """Return the colour of a file of `_share`; a worker keeps the last one."""
-    loaded, layout, shape, background_e, read_variance_e2 = pickle.loads(path.read_bytes())
-    electrons = np.asarray(np.memmap(_pixels_of(path, np.float32), np.float32, "r", shape=shape))
-    mask = _pixels_of(path, np.bool_)
-    valid = np.asarray(np.memmap(mask, np.bool_, "r", shape=shape)) if mask.is_file() else None
-    return Channel(loaded, layout, ElementalImages(electrons, background_e, read_variance_e2, valid))
+def _opened(colour: _Colour) -> Channel:
+    """Return the colour of files of `_share`; a worker keeps the last one."""
+    with np.load(colour.maps, allow_pickle=False) as file:
+        maps: dict[str, Any] = {name: values if values.ndim else float(values) for name, values in file.items()}
+    loaded = replace(colour.loaded, flat=maps.pop("flat", None), unusable=maps.pop("unusable"))
+    electrons = np.asarray(np.memmap(colour.pixels(np.float32), np.float32, "r", shape=colour.shape))
+    mask = colour.pixels(np.bool_)
+    valid = np.asarray(np.memmap(mask, np.bool_, "r", shape=colour.shape)) if mask.is_file() else None
+    return Channel(loaded, colour.layout, ElementalImages(electrons, valid=valid, **maps))
 
 
-def _do(path: Path, task: PlaneTask) -> list[str]:
+def _do(colour: _Colour, task: PlaneTask) -> list[str]:
     """Do a task on a worker."""
-    return _opened(path).do(task)
+    return _opened(colour).do(task)

@@ -101,6 +101,8 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
         remove_leftovers(folder)
     for folder in folders.values():
         remove(folder / RECONSTRUCTION_FILE)
+        if (folder / PARTS).is_symlink():  # parts are written and removed in this folder alone
+            remove(folder / PARTS)
     try:
         sweep.run(runner, out)
     finally:

@@ -9,6 +9,8 @@ import pytest
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, InputError, OutputBusy, OutputExists
 from faintfield.pipelines.formats.files import (
+    CACHE_FILE,
+    Hashes,
     exclusive,
     require_room,
     sha256,
@@ -208,6 +210,16 @@ def test_every_failure_of_writing_is_an_input_error() -> None:
 def test_the_hash_is_that_of_the_standard(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"abc")
     assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"{}x", b'{"file": 3}', b"\xff", None])
+def test_a_cache_of_hashes_that_cannot_be_read_is_none(content: bytes | None, tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"abc")
+    if content is None:
+        os.mkfifo(tmp_path / CACHE_FILE)
+    else:
+        (tmp_path / CACHE_FILE).write_bytes(content)
+    assert Hashes(tmp_path).of("file") == sha256(tmp_path / "file")
 
 
 def test_a_second_writer_of_a_folder_is_refused(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import tifffile
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import grey_levels, white_level
+from tests.pipelines.by_hand import write_by_hand
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -194,7 +195,7 @@ def test_planes_are_called_by_what_came_of_occlusion(kept: bool, planes: Path, d
     for path in (planes / "occlusion" / "reconstruction.json", planes / "metrics.json"):
         content = json.loads(path.read_text())
         content["planes"] = [one | made if one["method"] == "pmlem-osl" else one for one in content["planes"]]
-        path.write_text(json.dumps(content))
+        write_by_hand(path, content)
     done("report", planes)
     page = _Page((planes / "report.html").read_text())
     title = "PMLEM, all planes together" + (", with occlusion" if kept else " (occlusion left out)")
@@ -246,7 +247,7 @@ def test_results_with_the_fewest_keys_are_shown(planes: Path, done: Command) -> 
                 record["planes"] = [_only(plane, NEEDED_OF_PLANES[name]) for plane in record["planes"]]
             if "options" in record:
                 record["options"] = {"method": record["planes"][0]["method"]}
-            path.write_text(json.dumps(record))
+            write_by_hand(path, record)
     done("report", planes)
     text = (planes / "report.html").read_text()
     assert "grey scale: black" not in text
@@ -286,7 +287,7 @@ def test_a_damaged_result_is_named(
     path = planes / name.replace("mlem", "backprojection")
     record = json.loads(path.read_text())
     change(record)
-    path.write_text(json.dumps(record))
+    write_by_hand(path, record)
     before = (planes / "report.html").read_bytes()
     ended = faintfield("report", planes)
     assert ended.returncode == 1

@@ -23,6 +23,7 @@ from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_beside
 from faintfield.pipelines.pages.report_sets import photon_budget
+from tests.pipelines.by_hand import write_by_hand
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -163,7 +164,7 @@ def test_a_page_says_whether_its_planes_were_made_with_the_calibration(session: 
     record = json.loads((folder / "reconstruction.json").read_text())
     for name in ("noise.json", "geometry.json"):
         record["inputs"][name] = hashlib.sha256((session / name).read_bytes()).hexdigest()
-    (folder / "reconstruction.json").write_text(json.dumps(record))
+    write_by_hand(folder / "reconstruction.json", record)
     done("report", folder)
     assert "It is not among the inputs of these planes" not in (folder / "report.html").read_text()
 
@@ -273,7 +274,7 @@ def test_a_page_says_no_photons_where_the_quantum_efficiency_is_unknown(session:
     assert content["brightness"]["photons_from_moments"] > 0
     content["quantum_efficiency"] = None
     content["brightness"] |= {"photons_linear": None, "photons_from_moments": None}
-    path.write_text(json.dumps(content))
+    write_by_hand(path, content)
     done("report", session)
     text = (session / "report.html").read_text()
     assert "photons/px" not in text
@@ -305,7 +306,7 @@ def test_weights_tried_and_certificates_are_shown(session: Path, done: Command) 
         "certificate": certificate,
         "name": "table",
     }
-    path.write_text(json.dumps(content))
+    write_by_hand(path, content)
     done("report", session)
     text = (session / "report.html").read_text()
     part = text[text.index('id="weight"') : text.index('id="noise"')]
@@ -325,7 +326,7 @@ def test_errors_by_poses_stand_side_by_side(session: Path, done: Command) -> Non
     (row,) = content["planes"]
     errors = {"true": 0.0101, "nominal": 0.0404, "measured": 0.0102}
     content["planes"] = [row | {"poses": kind, "mse_bright": error} for kind, error in errors.items()]
-    path.write_text(json.dumps(content))
+    write_by_hand(path, content)
     done("report", folder)
     text = (folder / "report.html").read_text()
     table = text[text.index("Errors by kind of poses") : text.index("All planes")]

@@ -13,13 +13,15 @@ from faintfield.pipelines.commands.geometry import geometry
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.run import run
-from faintfield.pipelines.errors import BadValue, MissingFile, WrongUsage
+from faintfield.pipelines.commands.verify import verify as verify_all
+from faintfield.pipelines.errors import BadValue, MissingFile, ResultDamaged, WrongUsage
 from faintfield.pipelines.formats.exchange.colmap import read_model
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
 from tests.pipelines.sessions import SWEEPS, captured, rig_toml
@@ -139,6 +141,40 @@ class TestRun:
             assert self.ran(copy, 700.0) == ["reconstruct"]
         assert verify(copy).problems == ()
 
+    def test_results_that_were_altered_are_made_again(
+        self, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.ran(session, 700.0)
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+        results = ("noise.json", "geometry.json", "reconstructions/plane_00700.0.json", "reconstructions/overview.json")
+        for name, key in zip(results, ("likelihood", "corners", "sha256", "views"), strict=True):
+            content = json.loads((session / name).read_text())
+            for altered in ({**content, key: 1}, {key: content[key]}):
+                (copy / name).write_text(json.dumps(altered, indent=2))
+                with pytest.raises(ResultDamaged, match=name):
+                    verify_all(copy / name)
+            (copy / name).write_text(json.dumps(content, indent=2).replace("0", "1"))
+        capsys.readouterr()
+        assert self.ran(copy, 700.0) == ["noise", "geometry", "reconstruct"]
+        said = capsys.readouterr().err
+        assert "noise: noise.json: was altered after it was written" in said
+        assert "geometry: geometry.json: was altered after it was written" in said
+        assert verify_all(copy).results is not None
+        for name in results[:3]:
+            assert (copy / name).read_bytes() == (session / name).read_bytes()
+
+    def test_files_beside_a_result_that_were_altered_are_made_again(self, session: Path, tmp_path: Path) -> None:
+        self.ran(session, 700.0)
+        copy = Path(shutil.copytree(session, tmp_path / "copy"))
+        beside = {"reconstruct": "reconstructions/plane_00700.0.tiff", "noise": "noise_maps.npz"}
+        for step, name in beside.items():
+            whole = (copy / name).read_bytes()
+            (copy / name).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+            with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
+                verify_all(copy)
+            assert self.ran(copy, 700.0)[0] == step
+            assert (copy / name).read_bytes() == whole
+
     def test_a_report_of_other_planes_does_not_stay(
         self, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -182,6 +218,23 @@ class TestRun:
     def test_a_folder_without_a_session_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(MissingFile, match="holds no session"):
             run(tmp_path, depth_mm=[500.0])
+
+
+def test_a_session_is_verified_with_its_results(recorded: Path, session: Path, tmp_path: Path) -> None:
+    assert verify_all(recorded).results is None
+    run(session, depth_mm=[700.0], passes=5)
+    found = verify_all(session)
+    assert found.session is not None
+    assert found.results is not None
+    assert found.session.present == found.session.planned
+    assert (found.results.problems, found.results.unchecked) == ((), ())
+    assert found.results.inputs > found.session.planned
+    copy = Path(shutil.copytree(session, tmp_path / "copy"))
+    next((copy / "frames").glob("*_flat_0_*")).write_bytes(b"another")
+    with pytest.raises(ResultDamaged, match=r"was made from another frames/.*_flat_0_.*, which was altered"):
+        verify_all(copy / "noise.json")
+    with pytest.raises(SessionCorrupt, match=r"is damaged: .*_flat_0_.*; restore these files from a copy"):
+        verify_all(copy)
 
 
 def test_repeated_frames_add_up(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Planes that are there stay, whatever ended the run that made them; what is made of something else is made anew."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -11,14 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from msgspec import UNSET
+from msgspec import UNSET, structs
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import PARTS, PlaneFiles
-from faintfield.pipelines.formats.results.records import PlaneRecord
+from faintfield.pipelines.formats.results.records import FocusPoint, PlaneRecord
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.planes import solve
 from faintfield.pipelines.reconstruction.request import Request
@@ -49,7 +51,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
     found = {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     del found["report.html"]
     record = json.loads(found["reconstruction.json"])
-    del record["wall_time_s"]
+    del record["wall_time_s"], record["record_sha256"]
     return found | {"reconstruction.json": json.dumps(record).encode()}
 
 
@@ -147,12 +149,11 @@ def test_what_a_killed_call_with_several_methods_left_goes(scene: Path, tmp_path
     assert not left.exists()
 
 
-def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
-    options = Request([500.0], ["occlusion"]).options("occlusion", "stated")
-    origin = provenance("reconstruct", options, {})
-    files = PlaneFiles(tmp_path, "occlusion", 500.0, ("red", "green", "blue"), origin)
-    one = {"plane": np.ones((4, 5), np.float32)}
-    record = PlaneRecord(
+def _files_of_a_colour_plane(folder: Path) -> tuple[PlaneFiles, PlaneRecord]:
+    """Return where a plane of three colours goes, and the record of its first."""
+    origin = provenance("reconstruct", Request([500.0], ["occlusion"]).options("occlusion", "stated"), {"view": "0"})
+    files = PlaneFiles(folder, "occlusion", 500.0, ("red", "green", "blue"), origin)
+    return files, PlaneRecord(
         depth_mm=500.0,
         method="occlusion",
         channel="red",
@@ -169,10 +170,43 @@ def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
         mean_e=1.0,
         flux_e=20.0,
     )
+
+
+def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
+    files, record = _files_of_a_colour_plane(tmp_path)
+    one = {"plane": np.ones((4, 5), np.float32)}
     files.save_part("red", one | {"sigma": one["plane"], "opacity": one["plane"]}, record, None)
     for colour in ("green", "blue"):
-        files.save_part(colour, one | {"sigma": one["plane"]}, record, None)
+        files.save_part(colour, one | {"sigma": one["plane"]}, structs.replace(record, channel=colour), None)
+    assert files.missing() == []
     for written in files.finish(1.0).planes:
         assert written.sigma_file == "plane_00500.0_sigma.tiff"
         assert written.opacity_file is UNSET
     assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["plane_00500.0.tiff", "plane_00500.0_sigma.tiff"]
+    assert list((tmp_path / PARTS).iterdir()) == []
+
+
+def test_a_colour_that_was_altered_before_the_others_came_is_made_again(tmp_path: Path) -> None:
+    files, record = _files_of_a_colour_plane(tmp_path)
+    files.save_part("red", {"plane": np.arange(20, dtype=np.float32).reshape(4, 5)}, record, FocusPoint(2.0, 3.0))
+    assert files.missing() == ["green", "blue"]
+    for path in sorted((tmp_path / PARTS).iterdir()):
+        whole = path.read_bytes()
+        for place in range(0, len(whole), 7):
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+            assert files.missing() == ["red", "green", "blue"]
+        path.unlink()
+        os.mkfifo(path)
+        assert files.missing() == ["red", "green", "blue"]
+        path.unlink()
+        path.write_bytes(whole)
+    assert files.missing() == ["green", "blue"]
+
+
+def test_a_colour_of_another_size_than_its_record_says_is_refused(tmp_path: Path) -> None:
+    files, record = _files_of_a_colour_plane(tmp_path)
+    for colour in files.channels:
+        said = structs.replace(record, channel=colour, shape=(1_000_000, 1_000_000))
+        files.save_part(colour, {"plane": np.ones((4, 5))}, said, None)
+    with pytest.raises(BadValue, match=r"holds 80 bytes, and its record names 4000000000000; remove the folder .parts"):
+        files.finish(1.0)

@@ -267,6 +267,7 @@ class TestVerify:
         assert "not checked: " in ended.stderr
         assert "not found; name their folder by --inputs" in ended.stderr
         assert faintfield("verify", planes, "--inputs", scene).returncode == 1
+        assert "no such folder" in faintfield("verify", planes, "--inputs", tmp_path / "absent").stderr
 
     def test_hostile_inputs_are_not_touched(self, planes: Path) -> None:
         path = planes / "plane_00500.0.json"
@@ -291,5 +292,5 @@ def test_a_digest_is_of_the_text_without_white_space() -> None:
     assert digest_holds(json.dumps(json.loads(content)).encode()) is True
     assert digest_holds(content.replace(b"1.0", b"1.00")) is False
     assert digest_holds(content.replace(b"x  y", b"x y")) is False
-    assert digest_holds(content[:-1].rstrip() + b', "later": 1}') is False
+    assert digest_holds(content.rstrip()[:-1] + b', "later": 1}') is False
     assert digest_holds(b'{"a": 1.0}') is None

@@ -182,6 +182,8 @@ def write_geometry(out: Path, record: GeometryRecord, beside: Mapping[str, bytes
     geometry.json is removed first and written last: where it stands, it vouches for the files beside it.
     """
     remove(out / GEOMETRY_FILE)
+    if (cameras := (out / CAMERA_FILE).parent).is_symlink():  # files are written and removed in `out` alone
+        remove(cameras)
     for earlier in out.glob(CAMERA_FILE.format("*", "*")):
         remove(earlier)  # the node may not be part of the new geometry
     for name, content in beside.items():

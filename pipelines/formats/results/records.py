@@ -157,6 +157,11 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
     sigma_e2: list[float] | UnsetType = UNSET
     sharp_mm: list[float]
 
+    def __post_init__(self) -> None:
+        lengths = {len(self.depth_mm), len(self.detail_e2), len(self.sigma_e2 or self.depth_mm)}
+        if len(lengths) > 1 or 0 in lengths:
+            raise ValueError(f"the focus curve has {sorted(lengths)} depths and values")
+
 
 class BestFocusRecord(Struct, frozen=True):
     """How `--depth-mm auto` found its depths."""
