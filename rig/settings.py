@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
-from faintfield.rig.plan import CaptureStep, Grid, StepKind
+from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
 
 
@@ -221,6 +221,8 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("there is no [[step]]; say what to capture")
         if not self.board and any(step.kind == "charuco" for step in self.step):
             raise ValueError("there is a charuco step but no [[board]]; describe the printed boards")
+        nodes = self.grid.rows * self.grid.columns
+        check_frame_count(sum(it.frames_per_stop() * (nodes if it.at == "grid" else 1) for it in self.steps()))
 
     @property
     def mosaic(self) -> Mosaic | None:
