@@ -266,11 +266,12 @@ _READ_SET = (
     Call("export colmap IN OUT --binary"),
     Call("export mrcal IN OUT"),
 )
-_READ_SESSION = (Call("verify IN/session", _NOTHING),)
 _RESUME = Call("capture IN/rig.toml IN/session --yes", ("IN/session", "IN/session/*"), then="verify IN/session")
 
 _JOURNAL = "session/journal.sqlite"
 _OF_SESSION = ("session/plan.json", _JOURNAL, _JOURNAL, "session/frames/*", "session/lock", "rig.toml")
+
+_VERIFY = Call("verify IN/session", _NOTHING, notices=("session/plan.json", _JOURNAL, "session/frames/*"))
 
 KINDS: Mapping[str, Kind] = {
     "elemental set": Kind(_simulated, ("elemental.toml",), _READ_SET),
@@ -329,12 +330,11 @@ KINDS: Mapping[str, Kind] = {
         _sealed_session,
         (*_OF_SESSION, "session/SHA256SUMS"),
         (
-            Call("verify IN/session", _NOTHING, notices=("session/plan.json", _JOURNAL, "session/frames/*")),
+            *(_VERIFY, _VERIFY, _VERIFY, _RESUME, _RESUME, _RESUME),
             Call("noise IN/session --out OUT"),
-            _RESUME,
         ),
     ),
-    "open session": Kind(_open_session, _OF_SESSION, (Call("verify IN/session", _NOTHING), _RESUME, _RESUME)),
+    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME)),
     "measured session": Kind(
         _whole_session,
         (

@@ -25,6 +25,7 @@ import tifffile
 import tomli_w
 
 from faintfield.pipelines.formats.digests import DIGEST_KEY, with_digest
+from faintfield.rig.session import chain
 from faintfield.rig.session.session import JOURNAL, PLAN, SUMS
 from tests.faults.contained import FORGED, SCRIPT
 
@@ -757,14 +758,23 @@ def _sign(path: Path) -> None:
     session = next((folder for folder in path.parents if (folder / JOURNAL).is_file()), None)
     if session is None:
         return
-    if path.name == PLAN:
-        with closing(_opened(session / JOURNAL)) as db:
+    with closing(_opened(session / JOURNAL)) as db:
+        if path.name == PLAN:
             digest = json.dumps({"plan_sha256": hashlib.sha256(path.read_bytes()).hexdigest()})
             _attempt(db, "UPDATE event SET detail = ? WHERE kind = 'begun'", [digest])
+        _renew_chain(db)
     if (session / SUMS).is_file():
         names = [line.partition("  ")[2] for line in (session / SUMS).read_text().splitlines()]
         digests = {name: hashlib.sha256((session / name).read_bytes()).hexdigest() for name in names}
         (session / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in digests.items()))
+
+
+def _renew_chain(db: sqlite3.Connection) -> None:
+    """Compute the hashes of a journal's chain anew."""
+    head = chain.START
+    for number, table, first, last in db.execute('SELECT id, "table", first, last FROM chain ORDER BY id').fetchall():
+        head, _ = chain._digest(db, head, table, first, last)  # noqa: SLF001 # as who forges a journal would do
+        _attempt(db, "UPDATE chain SET sha256 = ? WHERE id = ?", [head, number])
 
 
 SIGN = {"sign": Operation(lambda *_: [], _sign)}

@@ -13,10 +13,11 @@ import fcntl
 import json
 import os
 import shutil
+import sqlite3
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import closing, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -158,9 +159,7 @@ class Bench:
         for pattern in patterns:
             for path in valid.glob(pattern):
                 name = path.relative_to(valid)
-                mutated = place / name
-                same = mutated.is_file() and mutated.stat().st_size == path.stat().st_size
-                if not (same and mutated.read_bytes() == path.read_bytes()):
+                if _content(path) != _content(place / name):
                     yield str(name)
 
     def close(self) -> None:
@@ -212,6 +211,22 @@ class Bench:
                 building.rename(folder)
         self._made[kind] = folder
         return folder
+
+
+def _content(path: Path) -> object:
+    """Return what a file holds: of a database its rows, of any other its bytes, None if neither can be read."""
+    if not path.is_file() or path.stat().st_size > contained.MAX_FILE_BYTES:
+        return None
+    if path.suffix != ".sqlite":
+        return path.read_bytes()
+    try:
+        with closing(sqlite3.connect(f"file:{path}?immutable=1", uri=True)) as db:
+            db.text_factory = bytes
+            tables = [row[0].decode() for row in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            kept = sorted(name for name in tables if not name.startswith("sqlite_"))
+            return [db.execute(f'SELECT * FROM "{name}" ORDER BY rowid').fetchall() for name in kept]
+    except (sqlite3.Error, ValueError):
+        return None
 
 
 def warm_up() -> None:
