@@ -330,7 +330,8 @@ KINDS: Mapping[str, Kind] = {
         _sealed_session,
         (*_OF_SESSION, "session/SHA256SUMS"),
         (
-            *(_VERIFY, _VERIFY, _VERIFY, _RESUME, _RESUME, _RESUME),
+            *(_VERIFY, _VERIFY, _VERIFY),
+            Call("capture IN/rig.toml IN/session --yes", _NOTHING),  # there is nothing left to capture
             Call("noise IN/session --out OUT"),
         ),
     ),
