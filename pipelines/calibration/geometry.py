@@ -24,7 +24,6 @@ from faintfield.calib.geometry import (
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import WrongSize
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import (
@@ -159,14 +158,9 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
 def _images(views: Sequence[BoardView], sizes_px: list[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
     """Yield the image of each view, its size added to `sizes_px`; one of another size than the first is refused."""
     for view in views:
-        image = view.image()
+        image = view.image(sizes_px[0] if sizes_px else None)
         height, width = image.shape
         sizes_px.append((width, height))
-        if sizes_px[0] != (width, height):
-            raise WrongSize(
-                f"{view.paths[0]}: is {width} x {height} px, the first image {sizes_px[0][0]} x {sizes_px[0][1]} px; "
-                "all images of one camera have one size; take it again, or leave it out"
-            )
         yield image
 
 

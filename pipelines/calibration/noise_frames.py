@@ -87,7 +87,7 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
     for index, (conditions, path) in enumerate(progress(frames, "reading frames")):
         if index == 0 or conditions != frames[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
-        frame = read_frame(path)
+        frame = read_frame(path, readout.size_px, of="the other frames")
         pixels = _check_frame(frame, path, readout)[readout.rows, readout.columns]
         for phase, phase_sums in zip(readout.phases, sums, strict=True):
             phase_sums.add(str(path), phase.of(pixels))

@@ -22,6 +22,9 @@ from faintfield.rig.session import durable, regular_files
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
 _NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, None}
 
+# Error numbers of a file system that cannot lock folders.
+_NO_LOCKS = {errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL}
+
 # Suffix of temporary names; a file that keeps it was left by a process that was killed.
 UNFINISHED = ".unfinished"
 
@@ -99,8 +102,9 @@ def writing_folder(
     OutputExists
         `out` holds something else, or something that is read.
     """
-    out = out.resolve()
-    check_free(out, replace_if=replace_if, replace_only=replace_only)
+    with translated_write_errors(out):
+        out = out.resolve()
+        check_free(out, replace_if=replace_if, replace_only=replace_only)
     for path in reads:
         # A link counts both where it leads and where it lies
         if any(place.resolve().is_relative_to(out) for place in (path, path.parent)):
@@ -150,10 +154,14 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 def exclusive(folder: Path) -> Iterator[None]:
     """Lock a folder of results while the block runs; it is created if missing, and removed if it stays empty.
 
+    On a file system without locks, such as some network disks, nothing keeps a second command out.
+
     Raises
     ------
     OutputBusy
         Another command is writing there.
+    DiskFull, CannotWrite
+        The folder cannot be created, opened or locked.
     """
     with translated_write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -165,8 +173,12 @@ def exclusive(folder: Path) -> Iterator[None]:
         raise OutputBusy(
             f"{folder}: another faintfield command is writing there; wait for it, or give another --out"
         ) from failure
-    except OSError:
-        pass  # some network file systems cannot lock folders
+    except OSError as failure:
+        if failure.errno not in _NO_LOCKS:
+            os.close(descriptor)
+            raise CannotWrite(
+                f"{folder}: cannot be locked ({failure.strerror}); name a place that can be written"
+            ) from failure
     try:
         yield
     finally:
@@ -207,8 +219,15 @@ def require_room(path: Path, needed_bytes: int) -> None:
 
 def sha256(path: Path) -> str:
     """Return the SHA-256 of a file, in hexadecimal; raise MissingFile if it cannot be read."""
-    try:
+    with _naming_unreadable(path):
         return regular_files.sha256(path)
+
+
+@contextmanager
+def _naming_unreadable(path: Path) -> Iterator[None]:
+    """Turn the system's read errors into MissingFile with the path."""
+    try:
+        yield
     except OSError as failure:
         raise MissingFile(f"{path}: cannot be read ({failure.strerror}); allow it to be read") from failure
 
@@ -234,15 +253,26 @@ def _free_bytes(path: Path) -> int:
 
 
 class _Known(msgspec.Struct, frozen=True):
-    """A hash, with the size and the time of change of the file at that time."""
+    """A hash, with the state of the file at that time.
+
+    Nobody can give a file the inode and the time of its last status change (`ctime`) that they want: hashes that came
+    with a folder from elsewhere never match, whatever they claim.
+    """
 
     size: int
     mtime_ns: int
+    ctime_ns: int
+    inode: int
     sha256: str
+
+    def is_of(self, state: os.stat_result) -> bool:
+        """Return whether the file is as it was."""
+        then = (self.size, self.mtime_ns, self.ctime_ns, self.inode)
+        return then == (state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino)
 
 
 class Hashes:
-    """SHA-256 of the files of a folder, each computed again only if its size or its time of change differs.
+    """SHA-256 of the files of a folder, each computed again only if its size, inode or times of change differ.
 
     Parameters
     ----------
@@ -262,15 +292,17 @@ class Hashes:
     def of(self, name: str) -> str:
         """Return the SHA-256 of a file, by its name within the folder."""
         path = self._folder / name
-        state = path.stat()
+        with _naming_unreadable(path):
+            state = path.stat()
         known = self._known.get(name)
-        if known is not None and (known.size, known.mtime_ns) == (state.st_size, state.st_mtime_ns):
+        if known is not None and known.is_of(state):
             return known.sha256
         begun_ns = time.time_ns()
         digest = sha256(path)
         self._known.pop(name, None)
         if state.st_mtime_ns < begun_ns - _AT_REST_NS:
-            self._known[name] = _Known(state.st_size, state.st_mtime_ns, digest)
+            known = _Known(state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino, digest)
+            self._known[name] = known
         self._changed = True
         return digest
 

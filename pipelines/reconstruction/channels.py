@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
-from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
+from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth
 from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period, read_frame
 from faintfield.pipelines.formats.large_arrays import Allocate
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
@@ -48,7 +48,7 @@ class ChannelLayout:
 def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
     """Return the colours of a set, as its first frame has them."""
     width, height = loaded.settings.camera.size_px
-    frame = read_frame(loaded.image_paths[0])
+    frame = read_frame(loaded.image_paths[0], (width, height))
     mosaic = loaded.settings.camera.mosaic or frame.mosaic
     everything = Lattice((0, 0), (1, 1), (height, width))
     if frame.pixels_dn.ndim == 3:
@@ -130,14 +130,8 @@ def view_electrons(
 
 def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
     """Read a frame, and check that it fits the camera and the noise model of the set."""
-    frame = read_frame(path)
-    width, height = loaded.settings.camera.size_px
+    frame = read_frame(path, loaded.settings.camera.size_px)
     found = frame.pixels_dn
-    if found.shape[:2] != (height, width):
-        raise WrongSize(
-            f"{path}: is {found.shape[1]} x {found.shape[0]} px, the camera {width} x {height} px; "
-            "correct camera.size_px or take the view again"
-        )
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
         raise UnreadableImage(

@@ -1,15 +1,18 @@
 """A set at a glance: how dark it is, where its objects are, and its views as pictures."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.formats.files import write_record
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import contact_sheet, grey_levels, white_level, write_png
+from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
@@ -26,6 +29,9 @@ REGION_OUTLINED = "object_region_outlined.png"
 
 # Width of the sheet of all views, about as wide as the report.
 _SHEET_WIDTH_PX = 1260
+
+# Nodes of a grid per view of it; a sheet of views would show mostly gaps with more.
+_MAX_NODES_PER_VIEW = 10
 
 # Visible on white, grey and black.
 _OUTLINE_RGB = (240, 120, 0)
@@ -45,7 +51,7 @@ def object_region(loaded: ElementalSet, path: Path | None = None) -> tuple[Regio
     """
     path = path or loaded.folder / OBJECT_REGION
     if path.is_file():
-        return read_frame(path).pixels_dn > 127, "object region"
+        return read_frame(path, loaded.settings.camera.size_px).pixels_dn > 127, "object region"
     light_e = bright_electrons(loaded)
     region = None if light_e is None else segmented(light_e, ~loaded.unusable)
     return (None, "whole view") if region is None else (region, "object region of the bright view")
@@ -59,7 +65,7 @@ def bright_electrons(loaded: ElementalSet) -> NDArray[np.float32] | None:
     if loaded.bright_view is None:
         return None
     path, exposure_s = loaded.bright_view
-    frame = read_frame(path)
+    frame = read_frame(path, loaded.settings.camera.size_px)
     pixels = frame.pixels_dn if frame.pixels_dn.ndim == 2 else frame.pixels_dn.mean(axis=2)
     light_e = loaded.noise.electrons(pixels) - np.asarray(loaded.noise.background_e(exposure_s), np.float32)
     mosaic = loaded.settings.camera.mosaic or frame.mosaic
@@ -134,21 +140,43 @@ def _figures(
     )
 
 
-def write_overview(loaded: ElementalSet, out: Path) -> None:
-    """Write the pictures of a set and `overview.json` into `out`; all views share one grey scale."""
-    reference = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
+@dataclass(frozen=True)
+class SetAtAGlance:
+    """A set at a glance: its pictures by file name, as PNG, and their record."""
+
+    pictures: dict[str, bytes]
+    record: Overview
+
+
+def look_at(loaded: ElementalSet) -> SetAtAGlance:
+    """Return a set at a glance; all its views share one grey scale.
+
+    Every file of the set is read, so that one that cannot be used is found before planes are made.
+
+    Raises
+    ------
+    InputError
+        A file cannot be used, or the light of the set is beyond all bounds.
+    """
+    size_px = loaded.settings.camera.size_px
+    reference = read_frame(loaded.image_paths[loaded.reference_view], size_px).pixels_dn
     black, white = grey_scale_dn(reference)
     grid = _grid(loaded)
     columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
-    small = [grey_levels(_every_nth(read_frame(path).pixels_dn, small_px), white, black) for path in loaded.image_paths]
-    write_png(out / INTEGRAL_IMAGE, contact_sheet(small, columns))
-    write_png(out / REFERENCE_VIEW, grey_levels(reference, white, black))
+    small = [
+        grey_levels(_every_nth(read_frame(path, size_px).pixels_dn, small_px), white, black)
+        for path in loaded.image_paths
+    ]
+    pictures = {
+        INTEGRAL_IMAGE: contact_sheet(small, columns),
+        REFERENCE_VIEW: grey_levels(reference, white, black),
+    }
     if loaded.noise_reference:
-        no_light = read_frame(loaded.noise_reference[0]).pixels_dn
-        write_png(out / NOISE_REFERENCE_VIEW, grey_levels(no_light, white, black))
+        no_light = read_frame(loaded.noise_reference[0], size_px).pixels_dn
+        pictures[NOISE_REFERENCE_VIEW] = grey_levels(no_light, white, black)
     region, name = object_region(loaded)
-    _write_bright_view(loaded, region, out)
+    pictures |= _bright_views(loaded, region)
     noise, exposure_s = loaded.noise, loaded.settings.exposure_s
     record = Overview(
         set=loaded.folder.resolve().name,
@@ -165,21 +193,33 @@ def write_overview(loaded: ElementalSet, out: Path) -> None:
         grey_scale_dn=(black, white),
         brightness=brightness_within(loaded, region, name),
     )
-    write_record(out / OVERVIEW_FILE, record)
+    try:
+        msgspec.json.decode(msgspec.json.encode(record), type=Overview)  # null stands for what is not finite
+    except msgspec.ValidationError as failure:
+        raise BadValue(f"{loaded.folder}: its light is not finite ({failure}); correct its noise model") from failure
+    return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
 
 
-def _write_bright_view(loaded: ElementalSet, region: Region | None, out: Path) -> None:
-    """Write the reference view in plenty of light if there is one, and again with the object region outlined."""
+def write_overview(glance: SetAtAGlance, out: Path) -> None:
+    """Write the pictures of a set and `overview.json` into `out`."""
+    for name, picture in glance.pictures.items():
+        write_whole(out / name, picture)
+    write_record(out / OVERVIEW_FILE, glance.record)
+
+
+def _bright_views(loaded: ElementalSet, region: Region | None) -> dict[str, Picture]:
+    """Return the reference view in plenty of light if there is one, and again with the object region outlined."""
     light_e = bright_electrons(loaded)
     if light_e is None:
-        return
+        return {}
     picture = grey_levels(light_e, white_level(light_e))
-    write_png(out / BRIGHT_VIEW, picture)
+    views = {BRIGHT_VIEW: picture}
     if region is not None:
         outlined = np.ascontiguousarray(np.dstack([picture] * 3))
         around, _ = cv2.findContours(region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(outlined, around, -1, _OUTLINE_RGB, max(max(region.shape) // 400, 1))
-        write_png(out / REGION_OUTLINED, outlined)
+        views[REGION_OUTLINED] = outlined
+    return views
 
 
 def grey_scale_dn(reference_dn: NDArray[Any]) -> tuple[float, float]:
@@ -195,9 +235,9 @@ def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
 
 
 def _grid(loaded: ElementalSet) -> tuple[int, int] | None:
-    """Return rows and columns of the grid, None unless every view states its node."""
+    """Return rows and columns of the grid, None unless every view states its node and most nodes have a view."""
     nodes = [view.node for view in loaded.settings.view if view.node is not None]
     if len(nodes) < len(loaded.settings.view):
         return None
-    rows, columns = (np.ptp(places) + 1 for places in zip(*nodes, strict=True))
-    return int(rows), int(columns)
+    rows, columns = (int(np.ptp(places)) + 1 for places in zip(*nodes, strict=True))
+    return (rows, columns) if rows * columns <= _MAX_NODES_PER_VIEW * len(nodes) else None

@@ -28,11 +28,12 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.results.stacks import write_stack
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
 from faintfield.pipelines.reconstruction.depth_map import write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
-from faintfield.pipelines.reconstruction.overview import write_overview
+from faintfield.pipelines.reconstruction.overview import look_at, write_overview
 from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
 from faintfield.pipelines.reconstruction.sweep import Runner, Sweep, run_serially
 from faintfield.recon.operator.grid import PlaneGrid
@@ -64,8 +65,10 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     request = replace(request, depths_mm=depths, methods=methods)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     sweep = _sweep(loaded, folders, request)
+    glance = look_at(loaded)  # here, as what is wrong with a set is to be found before its planes are made
+    read_truth(loaded.folder)
     _make_planes(sweep, folders, out, runner)
-    write_overview(loaded, out)
+    write_overview(glance, out)
     depth_map = None
     if request.with_depth_map:
         depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins, out)

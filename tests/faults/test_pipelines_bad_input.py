@@ -128,15 +128,7 @@ def test_bad_input_is_named_in_one_line_and_leaves_nothing_half_written(
     assert complaint.startswith(f"faintfield: {failure}: ")
     assert words in complaint
     assert len(complaint.splitlines()) == 1
-    # What was done before the fault was met stays, whole, but without a report
-    left = _files(tmp_path) - before
-    assert not {path for path in left if path.name.startswith(".")}
-    assert "report.html" not in {path.name for path in left}
-    assert not left or case in LATE
-
-
-# Found only when a set is shown or judged, after its planes were reconstructed
-LATE = {"damaged truth", "truncated noise reference"}
+    assert _files(tmp_path) == before
 
 
 @pytest.mark.parametrize("depth", ["-500", "0", "nan", "inf"])

@@ -110,7 +110,7 @@ def test_grids_with_gaps_and_doubles_are_refused(
 @pytest.mark.parametrize(
     ("second", "failure", "words"),
     [
-        (_picture(shape=(8, 6)), "WrongSize", "is (8, 6), the first picture (6, 8)"),
+        (_picture(shape=(8, 6)), "WrongSize", "is 6 x 8 px, the first picture 8 x 6 px"),
         (_picture(shape=(6, 8, 3)), "WrongSize", "is (6, 8, 3), the first picture (6, 8)"),
         (_picture().astype(np.float32), "BadValue", "holds float32 pixels"),
         (_picture().astype(np.uint8), "WrongBitDepth", "has 8 bits per pixel, the first picture 16"),

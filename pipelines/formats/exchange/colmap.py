@@ -4,6 +4,7 @@ COLMAP puts the first pixel's centre at (0.5, 0.5), this project at (0, 0); the 
 are this project's. Poses are `x_cam = R(q) x_world + t` with q = (w, x, y, z), in the model's own unit.
 """
 
+import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
 from faintfield.pipelines.formats.files import write_whole
+from faintfield.pipelines.formats.reading import is_file, read_content
+from faintfield.pipelines.formats.toml_files import inside
 
 # Name and number of parameters of a camera model, by COLMAP's number.
 _MODELS = {
@@ -29,6 +32,9 @@ _MODELS = {
 }
 _NUMBERS = {name: number for number, (name, _) in _MODELS.items()}
 _HALF_PX = 0.5
+
+# Size in bytes up to which a file of a model is read: its images file lists the points seen in each image, too.
+_MAX_BYTES = 256_000_000
 
 # Names of all files that a model is written to.
 MODEL_FILES = [f"{part}{suffix}" for part in ("cameras", "images", "points3D") for suffix in (".bin", ".txt")]
@@ -65,7 +71,7 @@ def read_model(folder: Path) -> ColmapModel:
     read_cameras, read_images = _READERS[cameras.suffix]
     try:
         model = ColmapModel(read_cameras(cameras), read_images(images))
-    except (struct.error, ValueError, LookupError, OverflowError, OSError) as failure:
+    except (struct.error, ValueError, LookupError, OverflowError) as failure:
         raise BadValue(f"{folder}: is not a COLMAP model that can be read ({failure}); export it again") from failure
     for image in model.images:
         if image.camera not in model.lenses:
@@ -79,16 +85,20 @@ def read_model(folder: Path) -> ColmapModel:
 def read_posed_images(folder: Path, images: Path) -> PosedModel:
     """Return the images of a model, which are in the folder `images`, with their lenses and poses."""
     model = read_model(folder)
-    posed = [PosedImage(images / it.name, model.lenses[it.camera], it.rt_cam_world) for it in model.images]
-    return PosedModel(list(model_files(folder)), posed)
+    files = list(model_files(folder))
+    posed = [
+        PosedImage(inside(images, it.name, f"{files[1]}: name"), model.lenses[it.camera], it.rt_cam_world)
+        for it in model.images
+    ]
+    return PosedModel(files, posed)
 
 
 def model_files(folder: Path) -> tuple[Path, Path]:
     """Return the files of a model that are read, its cameras and its images: binary where there are both."""
     for suffix in (".bin", ".txt"):
         cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-        if cameras.is_file():
-            if not images.is_file():
+        if is_file(cameras):
+            if not is_file(images):
                 raise MissingFile(f"{images}: no such file; export the whole model")
             return cameras, images
     raise MissingFile(f"{folder}: holds no cameras.bin or cameras.txt; name the folder of a COLMAP sparse model")
@@ -165,7 +175,8 @@ def _model_name(path: Path, model: str | int) -> str:
 
 
 def _lines(path: Path) -> list[str]:
-    return [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    text = read_content(path, _MAX_BYTES).decode()
+    return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 def _cameras_text(path: Path) -> dict[int, Lens]:
@@ -189,26 +200,28 @@ def _images_text(path: Path) -> list[ColmapImage]:
 
 def _cameras_binary(path: Path) -> dict[int, Lens]:
     lenses = {}
-    with path.open("rb") as file:
-        for _ in range(int(_take(file, "Q")[0])):
-            number, model, width, height = _take(file, "iiQQ")
-            name = _model_name(path, int(model))
-            numbers = _take(file, f"{_MODELS[int(model)][1]}d")
-            lenses[int(number)] = _lens(name, int(width), int(height), list(numbers))
+    file = io.BytesIO(read_content(path, _MAX_BYTES))
+    for _ in range(int(_take(file, "Q")[0])):
+        number, model, width, height = _take(file, "iiQQ")
+        name = _model_name(path, int(model))
+        numbers = _take(file, f"{_MODELS[int(model)][1]}d")
+        lenses[int(number)] = _lens(name, int(width), int(height), list(numbers))
     return lenses
 
 
 def _images_binary(path: Path) -> list[ColmapImage]:
     images = []
-    with path.open("rb") as file:
-        for _ in range(int(_take(file, "Q")[0])):
-            _, *numbers, camera = _take(file, "i7di")
-            name = b""
-            while (letter := file.read(1)) not in (b"\0", b""):
-                name += letter
-            points = int(_take(file, "Q")[0])
-            file.seek(points * struct.calcsize("<ddq"), 1)
-            images.append(ColmapImage(name.decode(), int(camera), _pose(tuple(numbers[:4]), tuple(numbers[4:]))))
+    content = read_content(path, _MAX_BYTES)
+    file = io.BytesIO(content)
+    for _ in range(int(_take(file, "Q")[0])):
+        _, *numbers, camera = _take(file, "i7di")
+        end = content.index(b"\0", file.tell())
+        name = file.read(end - file.tell()).decode()
+        file.seek(1, io.SEEK_CUR)
+        points = int(_take(file, "Q")[0])
+        if file.seek(points * struct.calcsize("<ddq"), io.SEEK_CUR) > len(content):
+            raise ValueError(f"{name} states {points} points, more than the file holds")
+        images.append(ColmapImage(name, int(camera), _pose(tuple(numbers[:4]), tuple(numbers[4:]))))
     return images
 
 

@@ -12,7 +12,10 @@ from pathlib import Path, PureWindowsPath
 import msgspec
 
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S
+from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
+from faintfield.pipelines.formats.toml_files import inside
 
 _NS_PER_S = 1e9
 
@@ -36,12 +39,12 @@ def read_descriptor(path: Path) -> Descriptor:
     BadValue
         A line is not of the format; the message gives its number.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise MissingFile(f"{path}: no such file; name an EMVA 1288 descriptor file")
     read = Descriptor()
     current: NoiseFrame | None = None
     levels: dict[float, int] = {}
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split(maxsplit=1)
         if not words or words[0].startswith("#"):
             continue
@@ -53,7 +56,7 @@ def read_descriptor(path: Path) -> Descriptor:
                 _add(read, current, keyword, rest.strip())
         except ValueError as failure:
             raise BadValue(
-                f"{path}: line {number}: '{line.strip()}' cannot be read ({failure}); correct it"
+                f"{path}: line {number}: '{line.strip():.80}' cannot be read ({failure}); correct it"
             ) from failure
     if not read.frames or not 1 <= read.bits <= 32:
         raise BadValue(
@@ -86,6 +89,8 @@ def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFram
     if not all(0 <= number < math.inf for number in numbers):
         raise ValueError("exposures and photons are finite and not negative")
     exposure_s = numbers[0] / _NS_PER_S
+    if exposure_s > MAX_EXPOSURE_S:
+        raise ValueError(f"an exposure of {exposure_s:g} s is longer than {MAX_EXPOSURE_S:g} s")
     if keyword == "d" or numbers[1] == 0:
         return NoiseFrame("", "dark", exposure_s)
     level = levels.setdefault(numbers[1], len(levels))
@@ -94,7 +99,7 @@ def _measurement(keyword: str, rest: str, levels: dict[float, int]) -> NoiseFram
 
 def image_path(descriptor: Path, stated: str) -> Path:
     """Return the path of an image that a descriptor names with slashes of either kind."""
-    path = descriptor.parent / PureWindowsPath(stated).as_posix()
-    if not path.is_file():
+    path = inside(descriptor.parent, PureWindowsPath(stated).as_posix(), f"{descriptor}: image")
+    if not is_file(path):
         raise MissingFile(f"{path}: is named by {descriptor} but missing; unpack all of the data set")
     return path

@@ -8,10 +8,14 @@ from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
+from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 
 # Largest ratio of missing pictures to those found; beyond it, the numbers in the names are not rows and columns.
 _MAX_MISSING_RATIO = 10
+
+# Digits of the largest row or column: times and serial numbers have more.
+_MAX_DIGITS = 9
 
 type Node = tuple[int, int]
 
@@ -74,9 +78,9 @@ def find_grid(folder: Path, rows: int | None = None, columns: int | None = None)
     BadValue
         A name has no row and column, or two pictures have the same.
     """
-    if not folder.is_dir():
+    if not is_folder(folder):
         raise MissingFile(f"{folder}: no such folder; name the folder that holds the pictures")
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and is_file(path))
     if not paths:
         raise MissingFile(f"{folder}: holds no pictures; formats read are {', '.join(sorted(IMAGE_SUFFIXES))}")
     if rows is not None or columns is not None:
@@ -85,9 +89,14 @@ def find_grid(folder: Path, rows: int | None = None, columns: int | None = None)
         return ImageGrid({(0, 0): paths[0]})
     named: dict[Node, Path] = {}
     for path in paths:
-        numbers = re.findall(r"\d+", path.stem)
+        numbers = re.findall(r"[0-9]+", path.stem)
         if len(numbers) < 2:
             raise BadValue(f"{path}: its name has no row and column; give --rows and --columns to take files in order")
+        if max(map(len, numbers[-2:])) > _MAX_DIGITS:
+            raise BadValue(
+                f"{path}: its name has a number of more than {_MAX_DIGITS} digits, which is no row or column; "
+                "give --rows and --columns to take files in order"
+            )
         node = int(numbers[-2]), int(numbers[-1])
         if node in named:
             raise BadValue(f"{path}: is at node {node} like {named[node].name}; keep one of the two")

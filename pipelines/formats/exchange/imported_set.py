@@ -18,7 +18,9 @@ from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, Wr
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, sound_pose
 from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 
@@ -66,7 +68,9 @@ def import_posed(
     MissingFile, BadValue
         An image is missing, a pose is not finite, or the reference is none of the images.
     """
-    _check_images(model.images)
+    if not model.images:
+        raise BadValue(f"{model.files[-1]}: names no image; export a model of the images")
+    _check_images(model.images, mm_per_unit)
     scale = np.repeat([1.0, mm_per_unit], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
@@ -88,16 +92,17 @@ def import_posed(
     return ImportedSet(str(out), len(images), images[index].path.name)
 
 
-def _check_images(images: Sequence[PosedImage]) -> None:
-    """Refuse images that are missing, and poses that are not finite."""
+def _check_images(images: Sequence[PosedImage], mm_per_unit: float) -> None:
+    """Refuse images that are missing, and poses that are not finite or too large."""
     for image in images:
-        if not image.path.is_file():
+        if not is_file(image.path):
             raise MissingFile(
                 f"{image.path}: has a pose but is missing; put it there, or name its folder with --images"
             )
-        if not np.isfinite(image.rt_cam_world).all():
+        if not sound_pose(image.rt_cam_world * [1, 1, 1, mm_per_unit, mm_per_unit, mm_per_unit]):
             raise BadValue(
-                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite; calibrate again, or remove it"
+                f"{image.path}: its pose {image.rt_cam_world.tolist()} is not finite, or beyond {MAX_ANGLE_RAD:g} rad "
+                f"or {MAX_LENGTH_MM:g} mm; calibrate again, or remove it"
             )
 
 
@@ -114,7 +119,7 @@ def _reference(images: Sequence[PosedImage], name: str | None) -> int:
 
 def _nodes(images: Sequence[PosedImage]) -> Sequence[tuple[int, int] | None]:
     """Return the rows and columns in names such as view_r3_c12.tiff; None for each if the names are not of a grid."""
-    found = [re.search(r"r(\d+)_c(\d+)$", image.path.stem) for image in images]
+    found = [re.search(r"r([0-9]{1,5})_c([0-9]{1,5})$", image.path.stem) for image in images]
     nodes = [(int(numbers[1]), int(numbers[2])) for numbers in found if numbers is not None]
     return nodes if len(set(nodes)) == len(images) else [None] * len(images)
 
@@ -185,9 +190,9 @@ def _complete_noise(noise: Noise, first: Frame) -> Noise:
     )
 
 
-def read_picture(path: Path) -> Frame:
-    """Read a picture; only pixels of 8 or 16 bits are accepted."""
-    frame = read_frame(path)
+def read_picture(path: Path, expected_px: tuple[int, int] | None = None) -> Frame:
+    """Read a picture, of the size of the first one if that is given; only pixels of 8 or 16 bits are accepted."""
+    frame = read_frame(path, expected_px, of="the first picture")
     if frame.pixels_dn.dtype not in (np.uint8, np.uint16):
         raise BadValue(
             f"{path}: holds {frame.pixels_dn.dtype} pixels; 8- or 16-bit whole numbers are needed; convert it"
@@ -228,7 +233,7 @@ def _view(name: str, image: PosedImage, reference: PosedImage) -> View:
 
 def _copy(path: Path, folder: Path, first: Frame) -> str:
     """Copy a picture as it is, or as 16-bit TIFF when it has 8 bits; return its name in the set."""
-    pixels = read_picture(path).pixels_dn
+    pixels = read_picture(path, first.pixels_dn.shape[1::-1]).pixels_dn
     if pixels.shape != first.pixels_dn.shape:
         raise WrongSize(
             f"{path}: is {pixels.shape}, the first picture {first.pixels_dn.shape} (rows, columns, colours); "

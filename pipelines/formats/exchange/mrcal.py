@@ -1,8 +1,12 @@
 """mrcal's camera models, `.cameramodel` files: a lens and a pose each, lengths in metres as mrcal's tools have them."""
 
+import ast
 import io
+import re
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -11,6 +15,7 @@ from faintfield.calib.mrcal_loader import load_mrcal
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
 from faintfield.pipelines.formats.frames import IMAGE_SUFFIXES
+from faintfield.pipelines.formats.reading import is_file, read_content
 
 SUFFIX = ".cameramodel"
 
@@ -21,6 +26,31 @@ _LENS_MODELS = {
     "opencv5": ("LENSMODEL_OPENCV5", 5),
     "opencv8": ("LENSMODEL_OPENCV8", 8),
 }
+
+
+# Size in bytes up to which a camera model is read, without the measurements that it was calibrated from.
+_MAX_LITERAL_BYTES = 1_000_000
+
+type _Pose = tuple[float, float, float, float, float, float]
+
+
+class _CameraModel(msgspec.Struct, frozen=True):
+    """What is read of a .cameramodel; `extrinsics` is the older name of the pose."""
+
+    lensmodel: str
+    intrinsics: Annotated[tuple[float, ...], msgspec.Meta(min_length=4)]
+    imagersize: tuple[int, int]
+    rt_cam_ref: _Pose | None = None
+    extrinsics: _Pose | None = None
+
+    def __post_init__(self) -> None:
+        if self.pose is None:
+            raise ValueError("it states no rt_cam_ref")
+
+    @property
+    def pose(self) -> _Pose | None:
+        """The camera's pose, Rodrigues rad and mrcal's unit of length."""
+        return self.rt_cam_ref if self.rt_cam_ref is not None else self.extrinsics
 
 
 def lens_model_of(lens: Lens) -> str:
@@ -75,30 +105,47 @@ def read_camera_models(folder: Path, images: Path) -> PosedModel:
 
 def _read(path: Path, images: Path) -> PosedImage:
     """Return the image of a camera model with its lens and pose."""
-    mrcal = load_mrcal()
-    try:
-        model = mrcal.cameramodel(str(path))
-    except Exception as failure:  # mrcal raises exceptions of many types
+    model = _literal(path)
+    known = dict(sorted(_LENS_MODELS.values()))
+    if model.lensmodel not in known:
         raise BadValue(
-            f"{path}: is not a camera model that can be read ({failure}); write it with mrcal again".replace("\n", " ")
-        ) from failure
-    name, numbers = model.intrinsics()
-    known = sorted(name for name, _ in _LENS_MODELS.values())
-    if name not in known:
-        raise BadValue(f"{path}: its lens is {name}; convert it with mrcal-convert-lensmodel to one of {known}")
-    fx_px, fy_px, cx_px, cy_px, *distortion = numbers.tolist()
-    width, height = model.imagersize().tolist()
+            f"{path}: its lens is {model.lensmodel}; convert it with mrcal-convert-lensmodel to one of {list(known)}"
+        )
+    fx_px, fy_px, cx_px, cy_px, *distortion = model.intrinsics
+    if len(distortion) != known[model.lensmodel]:
+        raise BadValue(
+            f"{path}: states {len(distortion)} coefficients of distortion, {model.lensmodel} has "
+            f"{known[model.lensmodel]}; write it with mrcal again"
+        )
     try:
-        lens = Lens((width, height), fx_px, fy_px, cx_px, cy_px, tuple(distortion))
+        lens = Lens(model.imagersize, fx_px, fy_px, cx_px, cy_px, tuple(distortion))
     except ValueError as failure:
         raise BadValue(f"{path}: {failure}; calibrate again") from failure
-    return PosedImage(_image_of(path, images), lens, model.rt_cam_ref())
+    return PosedImage(_image_of(path, images), lens, np.array(model.pose))
+
+
+def _literal(path: Path) -> _CameraModel:
+    """Return the content of a camera model, which is the text of a Python dictionary; nothing in it is executed."""
+    # The measurements that mrcal's own tools store may be megabytes of text without quotes
+    content = re.sub(rb"b'[^'\\\n]*+'", b"b''", read_content(path))
+    if len(content) > _MAX_LITERAL_BYTES:
+        raise BadValue(
+            f"{path}: has {len(content)} bytes besides its optimization_inputs, {_MAX_LITERAL_BYTES} are read at most; "
+            "write it with mrcal again"
+        )
+    try:
+        return msgspec.convert(ast.literal_eval(content.decode()), _CameraModel)
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError) as failure:  # MemoryError: nested too deep
+        reason = " ".join(str(failure).split()) or type(failure).__name__
+        raise BadValue(
+            f"{path}: is not a camera model that can be read ({reason}); write it with mrcal again"
+        ) from failure
 
 
 def _image_of(path: Path, folder: Path) -> Path:
     """Return the image that has the name of a camera model."""
     for suffix in sorted(IMAGE_SUFFIXES):
         image = folder / f"{path.stem}{suffix}"
-        if image.is_file():
+        if is_file(image):
             return image
     raise MissingFile(f"{folder}: holds no image named {path.stem}; put it there, or name its folder with --images")

@@ -1,6 +1,5 @@
 """Planes of a sweep as OME-Zarr 0.5, chunked and at several resolutions, for stacks too large for memory."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import progress
-from faintfield.pipelines.errors import BadValue, MissingPackage
+from faintfield.pipelines.errors import BadValue, InputError, MissingPackage
 from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
 
@@ -141,9 +141,11 @@ def require_zarr() -> Any:
 def _is_export(folder: Path) -> bool:
     """Return whether a folder is an earlier export: every Zarr group has a zarr.json, ours says who wrote it."""
     try:
-        return "faintfield" in json.loads((folder / "zarr.json").read_bytes())["attributes"]
-    except (OSError, ValueError, LookupError, TypeError):
+        group = read_json(folder / "zarr.json", dict[str, Any], what="a Zarr group", remedy="export again")
+    except InputError:
         return False
+    attributes = group.get("attributes")
+    return isinstance(attributes, dict) and "faintfield" in attributes
 
 
 def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:

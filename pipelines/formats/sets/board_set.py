@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
 from faintfield.calib.geometry import Node
-from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
+from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import at_phase, mosaic_period, read_frame
 from faintfield.pipelines.formats.limits import MAX_NODE, sound_node
@@ -65,22 +65,21 @@ class BoardView:
     paths: tuple[Path, ...]
     mosaic: tuple[str, ...] | None = None
 
-    def image(self) -> NDArray[np.float32]:
+    def image(self, expected_px: tuple[int, int] | None = None) -> NDArray[np.float32]:
         """Return the mean of the frames (row, column), the colours of RGB frames averaged.
 
         Raises
         ------
         WrongSize
-            The frames are not of one size.
+            The frames are not of one size, or not of the one that is expected.
         """
         total: NDArray[Any] | None = None
         for path in self.paths:
-            frame = read_frame(path)
+            frame = read_frame(path, expected_px, of="the first image")
             pixels = frame.pixels_dn.astype(np.float32)
             grey = pixels.mean(axis=2) if pixels.ndim == 3 else _without_filters(pixels, self.mosaic or frame.mosaic)
-            if total is not None and grey.shape != total.shape:
-                raise WrongSize(f"{path}: is {grey.shape[::-1]} px, its repeats {total.shape[::-1]}; take it again")
             total = grey if total is None else total + grey
+            expected_px = grey.shape[::-1]
         assert total is not None
         return np.asarray(total / len(self.paths), np.float32)
 

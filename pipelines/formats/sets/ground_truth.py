@@ -46,9 +46,8 @@ def read_truth(folder: Path) -> Truth | None:
     if not is_file(path):
         return None
     truth = read_json(path, Truth, what="the truth of a simulated set", remedy="simulate the set again, or remove it")
-    for plane in truth.planes:
-        for name in (plane.texture, plane.visible):
-            inside(folder, name, f"{path}: file")
+    for name in (truth.noise_free, *(name for plane in truth.planes for name in (plane.texture, plane.visible))):
+        inside(folder, name, f"{path}: file")
     return truth
 
 
