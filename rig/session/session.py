@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -262,7 +263,7 @@ def valid_frames(
 
 def has_session(folder: Path) -> bool:
     """Return whether `folder` holds a session."""
-    return (folder / PLAN).exists()
+    return os.path.lexists(folder / PLAN)
 
 
 def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]]:
