@@ -9,8 +9,9 @@ from typing import Annotated, Literal
 import msgspec
 from cyclopts import App, Parameter
 from rich.table import Table
+from rich.text import Text
 
-from faintfield.pipelines.console import console, inform
+from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
 from faintfield.pipelines.formats.toml_files import read_toml
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
@@ -159,7 +160,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
         for check in check_conformance(stage):
             inform(f"tried: {check.name}")
             mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
-            table.add_row(mark, check.name, check.measured, check.limit)
+            table.add_row(mark, *(Text(visible(it)) for it in (check.name, check.measured, check.limit)))
             checks.append(check)
     console.print(table)
     failed = [check for check in checks if not check.passed]

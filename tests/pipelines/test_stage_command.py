@@ -128,6 +128,14 @@ def test_the_conformance_list(shell: Shell, stage: str) -> None:
     assert "repeatability" in shell.words
 
 
+def test_what_a_controller_says_is_shown_as_it_is(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    check = Check("settings", True, "[bold]MSG[/bold]\x1b[2K\n", "[red]")
+    monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: [check])
+    assert shell.run("test", "--port", "simulated:grbl") == 0
+    assert r"[bold]MSG[/bold]\x1b[2K\n" in shell.words
+    assert "[red]" in shell.words
+
+
 def test_a_stage_that_fails_a_check_ends_with_a_named_failure(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Check("homing", True, "2 s", "60 s"), Check("speed", False, "3 mm/s", "at least 50 mm/s")]
     monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: iter(found))
