@@ -651,6 +651,7 @@ def _cell(path: Path, table: str, column: str, row: int, how: str, value: Any) -
 def _opened(path: Path) -> sqlite3.Connection:
     """Open a database for any change."""
     db = sqlite3.connect(path, isolation_level=None)
+    db.execute("PRAGMA synchronous = OFF")
     db.execute("PRAGMA foreign_keys = OFF")
     db.execute("PRAGMA ignore_check_constraints = ON")
     db.execute("PRAGMA writable_schema = ON")

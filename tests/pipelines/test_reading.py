@@ -1,4 +1,4 @@
-"""One place reads each kind of file: all that can go wrong is one named failure with the path, whatever a file holds."""
+"""One place reads each kind of file: all that can go wrong is one named failure with the path, whatever it holds."""
 
 import errno
 import fcntl
