@@ -61,8 +61,9 @@ _UNSEEN_CALLS = {"cast", "TypeVar", "NewType"}
 _UNSEEN_NAMES = {"__all__", "__slots__", "__repr__", "__str__"}
 _BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases", "decorator_list")
 _SMALL_INTEGER = 10
-# A message in a name would only make it long.
-_LONG_TEXT = re.compile(r"""f?(["'])(?:(?!\1).){20,}\1""")
+# A literal string; a long one in a name would only make the name long.
+_TEXT = re.compile(r"""f?(["'])(?:\\.|(?!\1).)*\1""")
+_LONG_TEXT = 22
 
 
 @dataclass(frozen=True)
@@ -292,7 +293,7 @@ def _header(statement: Node) -> str:
         if hasattr(bare, block):
             setattr(bare, block, [])
     text = " ".join(ast.unparse(bare).split())
-    return _LONG_TEXT.sub(r"\1…\1", text)
+    return _TEXT.sub(lambda found: found[0] if len(found[0]) < _LONG_TEXT else f"{found[1]}…{found[1]}", text)
 
 
 def _lines(statement: Node) -> range:

@@ -53,10 +53,11 @@ _PYTEST = (
     "timeout=0",
 )
 # CPU seconds of the tests that a mutant may take, those of the unchanged files; tests are taken from the fastest on.
-_BUDGET_S = 30.0
+_BUDGET_S = 15.0
 # A mutant counts as hung when it needs ten times as long as the unchanged file, and this for imports or compiling.
 _SLOWER, _IMPORTS_S, _COMPILING_S = 10, 30, 150
 _MEMORY_BYTES = 8 << 30
+_NOT_LINKED = shutil.ignore_patterns(".hypothesis", "output-*", "temporary-*")
 
 
 @dataclass(frozen=True)
@@ -200,6 +201,7 @@ def _imports(package: str) -> dict[str, set[str]]:
 
 def judged(mutants: Iterable[Mutant], known: Known, jobs: int) -> Iterator[tuple[Mutant, Verdict, str]]:
     """Yield each mutant with its verdict and the test that found it."""
+    shutil.rmtree(WORK / "copies", ignore_errors=True)
     tree, processes, running = WORK / "tree", Processes(jobs), {}
     for mutant in mutants:
         tests = known.tests_of(mutant)
@@ -212,7 +214,7 @@ def judged(mutants: Iterable[Mutant], known: Known, jobs: int) -> Iterator[tuple
         limit_s += _COMPILING_S if is_compiled(mutant.file) else 0
         files = list(dict.fromkeys(name.partition("::")[0] for name in tests))
         running[mutant.name] = mutant, place
-        processes.start(mutant.name, place, files, partial(Selection, tests, place / "failed"), limit_s)
+        processes.start(mutant.name, place, ["-x", *files], partial(Selection, tests, place / "failed"), limit_s)
         yield from (_verdict(ended, running) for ended in processes.ended(wait_for_all=False))
     yield from (_verdict(ended, running) for ended in processes.ended())
 
@@ -233,7 +235,7 @@ def _copy_with(mutant: Mutant, tree: Path, place: Path) -> None:
     numba compiles a file again when it has changed, but not when a file has changed from which it imports functions.
     """
     shutil.rmtree(place, ignore_errors=True)
-    shutil.copytree(tree, place, symlinks=True, copy_function=os.link, ignore=shutil.ignore_patterns(".hypothesis"))
+    shutil.copytree(tree, place, symlinks=True, copy_function=os.link, ignore=_NOT_LINKED)
     path = place / mutant.file
     source = path.read_text()
     path.unlink()
@@ -257,14 +259,14 @@ class Processes:
         self._running: dict[int, tuple[str, float]] = {}
         self._done: list[tuple[str, int, bool]] = []
 
-    def start(self, name: str, tree: Path, files: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
+    def start(self, name: str, tree: Path, arguments: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
         """Start pytest in a tree, once fewer than `jobs` processes run."""
         while len(self._running) >= self._jobs:
             self._reap()
         sys.stdout.flush()
         pid = os.fork()
         if not pid:
-            _run_tests(tree, files, plugin, cpu_s)
+            _run_tests(tree, arguments, plugin, cpu_s)
         # Other work on the machine slows a process down but costs it no CPU time.
         self._running[pid] = name, time.monotonic() + 8 * cpu_s + 120
 
@@ -295,13 +297,13 @@ class Processes:
                 self._done.append((name, status, hung or by_limit))
 
 
-def _run_tests(tree: Path, files: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
+def _run_tests(tree: Path, arguments: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
     """Run tests of a tree in this process, and end it."""
     code = 70
     try:
         os.setsid()
         os.chdir(tree)
-        output = os.open("output", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        output = os.open(f"output-{os.getpid()}", os.O_WRONLY | os.O_CREAT)
         for stream in (1, 2):
             os.dup2(output, stream)
         resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), int(cpu_s) + 5))
@@ -311,7 +313,7 @@ def _run_tests(tree: Path, files: list[str], plugin: Callable[[], Any], cpu_s: f
         made = plugin()
         for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
             del sys.modules[name]
-        code = pytest.main([*_PYTEST, f"--basetemp={tree / 'temporary'}", *files], plugins=[made])
+        code = pytest.main([*_PYTEST, f"--basetemp={tree / f'temporary-{os.getpid()}'}", *arguments], plugins=[made])
         if not str(sys.modules["faintfield"].__file__).startswith(str(tree)):
             code = 70
     finally:
