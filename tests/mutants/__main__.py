@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tests.mutants.changes import Mutant, mutants_of
-from tests.mutants.judge import PACKAGES, ROOT, WORK, digest, judged, preload, recorded, tests_digest
+from tests.mutants.judge import PACKAGES, ROOT, WORK, digest, judge, preload, recorded, tests_digest
 
 MODULES = ("recon", "calib", "rig/session", "rig/capture", "rig/stages")
 _VERDICTS = WORK / "verdicts.jsonl"
@@ -60,22 +60,27 @@ def known_verdicts() -> dict[str, str]:
     return verdicts
 
 
-def judge(mutants: list[Mutant], jobs: int) -> dict[str, str]:
+def verdicts_of(mutants: list[Mutant], jobs: int) -> dict[str, str]:
     """Return the verdict of each mutant; those not yet known are found out, and kept."""
     verdicts = known_verdicts()
     waiting = [mutant for mutant in mutants if mutant.name not in verdicts]
     if waiting:
+        sources = {file: digest([ROOT / file]) for file in {mutant.file for mutant in waiting}}
+        tests = {package: tests_digest(package) for package in PACKAGES}
+        terminal = os.dup(1)  # tests write elsewhere
+
+        def keep(mutant: Mutant, verdict: str, by: str) -> None:
+            row = {"name": mutant.name, "file": mutant.file, "verdict": verdict, "by": by}
+            row |= {"source": sources[mutant.file], "tests": tests[mutant.file.partition("/")[0]]}
+            with _VERDICTS.open("a") as out:
+                out.write(json.dumps(row) + "\n")
+            if verdict not in _FOUND:
+                os.write(terminal, f"{verdict}: {mutant.name}\n".encode())
+
         preload()
         known = recorded(sorted({mutant.file.partition("/")[0] for mutant in waiting}), jobs)
-        with _VERDICTS.open("a") as out:
-            for mutant, verdict, by in judged(waiting, known, jobs):
-                row = {"name": mutant.name, "file": mutant.file, "verdict": verdict, "by": by}
-                tests = tests_digest(mutant.file.partition("/")[0])
-                out.write(json.dumps(row | {"source": digest([ROOT / mutant.file]), "tests": tests}) + "\n")
-                out.flush()
-                verdicts[mutant.name] = verdict
-                if verdict not in _FOUND:
-                    print(f"{verdict}: {mutant.name}", flush=True)
+        judge(waiting, known, jobs, keep)
+        verdicts = known_verdicts()
     return {mutant.name: verdicts[mutant.name] for mutant in mutants}
 
 
@@ -105,7 +110,7 @@ def main() -> int:
     same = equivalent()
     every = [mutant for mutant in all_mutants(options.modules) if mutant.name not in same]
     mutants = sampled(every, options.sample, options.seed)
-    verdicts = judge(mutants, options.jobs)
+    verdicts = verdicts_of(mutants, options.jobs)
     print(*table(mutants, verdicts, every), sep="\n")
     found = 100 * sum(verdict in _FOUND for verdict in verdicts.values()) / len(mutants)
     if found < options.least:

@@ -78,6 +78,8 @@ class Mutant:
         Path from the top of the repository.
     place : int
         Its number among the changes of the file.
+    function : tuple of str
+        Names of the classes and functions that hold it, the outermost first.
     lines : range
         Lines of the changed statement without the block that it heads; empty outside functions.
     """
@@ -85,6 +87,7 @@ class Mutant:
     name: str
     file: str
     place: int
+    function: tuple[str, ...]
     lines: range
 
 
@@ -123,7 +126,8 @@ def mutants_of(file: str, source: str) -> list[Mutant]:
         name = f"{file} {'.'.join(place.function) or '(module)'}: {_header(place.statement)} ⇒ {after}"
         seen[name] += 1
         name += f" ({seen[name]})" if seen[name] > 1 else ""
-        found.append(Mutant(name, file, number, _lines(place.statement) if place.inside else range(0)))
+        lines = _lines(place.statement) if place.inside else range(0)
+        found.append(Mutant(name, file, number, place.function, lines))
     return found
 
 

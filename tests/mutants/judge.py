@@ -6,23 +6,15 @@ import hashlib
 import importlib
 import json
 import os
-import resource
 import shutil
-import signal
-import sys
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Literal
-
-import pytest
 
 from tests.mutants.changes import Mutant, mutated
-from tests.mutants.plugins import Recorder, Selection
-
-type Verdict = Literal["killed", "timed out", "survived", "not run by any test"]
+from tests.mutants.plugins import InPlace, Keep, Recorder, Selection, Task, verdict
+from tests.mutants.processes import Processes, run_pytest
 
 ROOT = Path(__file__).parents[2]
 WORK = ROOT / "build" / "mutants"
@@ -53,10 +45,9 @@ _PYTEST = (
     "timeout=0",
 )
 # CPU seconds of the tests that a mutant may take, those of the unchanged files; tests are taken from the fastest on.
-_BUDGET_S = 15.0
+_BUDGET_S = 8.0
 # A mutant counts as hung when it needs ten times as long as the unchanged file, and this for imports or compiling.
 _SLOWER, _IMPORTS_S, _COMPILING_S = 10, 30, 150
-_MEMORY_BYTES = 8 << 30
 _NOT_LINKED = shutil.ignore_patterns(".hypothesis", "output-*", "temporary-*")
 
 
@@ -67,10 +58,13 @@ class Known:
     seconds: dict[str, float]
     lines: dict[str, dict[str, frozenset[int]]]
 
+    def runs(self, mutant: Mutant) -> set[str]:
+        """Return the tests that run the lines of a mutant."""
+        return {name for name, lines in self.lines.items() if lines.get(mutant.file, frozenset()) & {*mutant.lines}}
+
     def tests_of(self, mutant: Mutant) -> list[str]:
         """Return the tests that may see a change, file by file, the fastest first."""
-        files = {mutant.file}
-        running = {name for name, lines in self.lines.items() if lines.get(mutant.file, frozenset()) & {*mutant.lines}}
+        files, running = {mutant.file}, self.runs(mutant)
         if is_compiled(mutant.file) and not running:
             files |= importers(mutant.file)
         if not running and (not mutant.lines or is_compiled(mutant.file)):
@@ -142,7 +136,9 @@ def recorded(packages: Iterable[str], jobs: int) -> Known:
             waiting[record] = path.relative_to(tree)
     processes = Processes(jobs)
     for record, path in waiting.items():
-        processes.start(path.as_posix(), tree, [path.as_posix()], partial(Recorder, tree, record), 3600)
+        processes.start(
+            path.as_posix(), partial(run_pytest, tree, [path.as_posix()], partial(Recorder, tree, record)), 3600
+        )
     for name, status, _ in processes.ended():
         if status:
             print(f"{name}: tests fail without any change; they are left out")
@@ -199,34 +195,59 @@ def _imports(package: str) -> dict[str, set[str]]:
     return found
 
 
-def judged(mutants: Iterable[Mutant], known: Known, jobs: int) -> Iterator[tuple[Mutant, Verdict, str]]:
-    """Yield each mutant with its verdict and the test that found it."""
-    shutil.rmtree(WORK / "copies", ignore_errors=True)
-    tree, processes, running = WORK / "tree", Processes(jobs), {}
+def judge(mutants: Iterable[Mutant], known: Known, jobs: int, keep: Keep) -> None:
+    """Have each mutant judged, and `keep` called with its verdict.
+
+    A change of a Python function is made in a process that has loaded everything. Any other needs a copy of the tree.
+    """
+    waiting: dict[str, Task] = {}
     for mutant in mutants:
         tests = known.tests_of(mutant)
-        if not tests:
-            yield mutant, "not run by any test", ""
-            continue
-        place = WORK / "copies" / hashlib.sha256(mutant.name.encode()).hexdigest()[:16]
-        _copy_with(mutant, tree, place)
-        limit_s = _SLOWER * sum(known.seconds[name] for name in tests) + _IMPORTS_S
-        limit_s += _COMPILING_S if is_compiled(mutant.file) else 0
-        files = list(dict.fromkeys(name.partition("::")[0] for name in tests))
-        running[mutant.name] = mutant, place
-        processes.start(mutant.name, place, ["-x", *files], partial(Selection, tests, place / "failed"), limit_s)
-        yield from (_verdict(ended, running) for ended in processes.ended(wait_for_all=False))
-    yield from (_verdict(ended, running) for ended in processes.ended())
+        if tests:
+            limit_s = _SLOWER * sum(known.seconds[name] for name in tests)
+            waiting[mutant.name] = Task(mutant, tests, limit_s)
+        else:
+            keep(mutant, "not run by any test", "")
+    tree = WORK / "tree"
+    in_place = [task for task in waiting.values() if task.mutant.lines and known.runs(task.mutant)]
+    if in_place:
+        files = sorted({name.partition("::")[0] for task in in_place for name in task.tests})
+        done = WORK / "done"
+        done.unlink(missing_ok=True)
+        for left in [*WORK.glob("temporary-*"), *tree.glob("temporary-*")]:
+            shutil.rmtree(left, ignore_errors=True)
+        alone = Processes(1)
+        alone.start("functions", partial(run_pytest, tree, files, partial(InPlace, in_place, jobs, keep, done)), 1e6)
+        list(alone.ended())
+        for name in json.loads(done.read_text()):
+            del waiting[name]
+    _judge_in_copies(list(waiting.values()), tree, jobs, keep)
 
 
-def _verdict(ended: tuple[str, int, bool], running: dict[str, tuple[Mutant, Path]]) -> tuple[Mutant, Verdict, str]:
-    """Return a verdict from how a process ended, and remove its copy."""
-    name, status, hung = ended
-    mutant, place = running.pop(name)
-    failed = place / "failed"
-    by = failed.read_text() if failed.exists() else ""
-    shutil.rmtree(place, ignore_errors=True)
-    return mutant, "timed out" if hung else "killed" if status else "survived", by
+def _judge_in_copies(tasks: Iterable[Task], tree: Path, jobs: int, keep: Keep) -> None:
+    """Judge mutants one by one in copies of the tree."""
+    copies = WORK / "copies"
+    shutil.rmtree(copies, ignore_errors=True)
+    processes = Processes(jobs)
+    running: dict[str, tuple[Task, Path]] = {}
+
+    def conclude(name: str, status: int, hung: bool) -> None:
+        task, place = running.pop(name)
+        keep(task.mutant, *verdict(status, hung, place / "failed"))
+        shutil.rmtree(place, ignore_errors=True)
+
+    for task in tasks:
+        place = copies / hashlib.sha256(task.mutant.name.encode()).hexdigest()[:16]
+        _copy_with(task.mutant, tree, place)
+        limit_s = task.limit_s + (_COMPILING_S if is_compiled(task.mutant.file) else _IMPORTS_S)
+        files = list(dict.fromkeys(name.partition("::")[0] for name in task.tests))
+        running[task.mutant.name] = task, place
+        plugin = partial(Selection, task.tests, place / "failed")
+        processes.start(task.mutant.name, partial(run_pytest, place, ["-x", *files], plugin), limit_s)
+        for ended in processes.ended(wait_for_all=False):
+            conclude(*ended)
+    for ended in processes.ended():
+        conclude(*ended)
 
 
 def _copy_with(mutant: Mutant, tree: Path, place: Path) -> None:
@@ -243,78 +264,3 @@ def _copy_with(mutant: Mutant, tree: Path, place: Path) -> None:
     for file in importers(mutant.file) | {mutant.file}:
         for stale in (place / file).parent.glob(f"__pycache__/{Path(file).stem}.*.nb[ci]"):
             stale.unlink()
-
-
-class Processes:
-    """Runs pytest in forked processes, a few at a time.
-
-    Parameters
-    ----------
-    jobs : int
-        Most processes at a time.
-    """
-
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-        self._running: dict[int, tuple[str, float]] = {}
-        self._done: list[tuple[str, int, bool]] = []
-
-    def start(self, name: str, tree: Path, arguments: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
-        """Start pytest in a tree, once fewer than `jobs` processes run."""
-        while len(self._running) >= self._jobs:
-            self._reap()
-        sys.stdout.flush()
-        pid = os.fork()
-        if not pid:
-            _run_tests(tree, arguments, plugin, cpu_s)
-        # Other work on the machine slows a process down but costs it no CPU time.
-        self._running[pid] = name, time.monotonic() + 8 * cpu_s + 120
-
-    def ended(self, wait_for_all: bool = True) -> Iterator[tuple[str, int, bool]]:
-        """Yield name, exit status, and whether it was stopped, of every process that has ended."""
-        while wait_for_all and self._running:
-            self._reap()
-            yield from self._taken()
-        yield from self._taken()
-
-    def _taken(self) -> list[tuple[str, int, bool]]:
-        done, self._done = self._done, []
-        return done
-
-    def _reap(self) -> None:
-        """Wait a little for processes to end, and end those that hang, with all that they started."""
-        time.sleep(0.02)
-        for pid, (name, end) in list(self._running.items()):
-            hung = time.monotonic() > end
-            if hung:
-                os.kill(pid, signal.SIGKILL)
-            gone, status = os.waitpid(pid, 0 if hung else os.WNOHANG)
-            if gone:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(pid, signal.SIGKILL)
-                del self._running[pid]
-                by_limit = os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU
-                self._done.append((name, status, hung or by_limit))
-
-
-def _run_tests(tree: Path, arguments: list[str], plugin: Callable[[], Any], cpu_s: float) -> None:
-    """Run tests of a tree in this process, and end it."""
-    code = 70
-    try:
-        os.setsid()
-        os.chdir(tree)
-        output = os.open(f"output-{os.getpid()}", os.O_WRONLY | os.O_CREAT)
-        for stream in (1, 2):
-            os.dup2(output, stream)
-        resource.setrlimit(resource.RLIMIT_CPU, (int(cpu_s), int(cpu_s) + 5))
-        resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
-        os.environ["PYTHONPATH"] = str(tree)
-        sys.path[:] = [str(tree), *(entry for entry in sys.path if entry not in ("", str(ROOT)))]
-        made = plugin()
-        for name in [name for name in sys.modules if name.partition(".")[0] == "tests"]:
-            del sys.modules[name]
-        code = pytest.main([*_PYTEST, f"--basetemp={tree / f'temporary-{os.getpid()}'}", *arguments], plugins=[made])
-        if not str(sys.modules["faintfield"].__file__).startswith(str(tree)):
-            code = 70
-    finally:
-        os._exit(code)

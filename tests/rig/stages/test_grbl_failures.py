@@ -70,6 +70,16 @@ def test_an_alarm_is_told_again_until_it_is_cleared() -> None:
     assert stage.position().trusted
 
 
+def test_an_alarm_cleared_by_hand_without_a_reset_still_loses_the_position() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    grbl(bench).alarm(4)
+    bench.firmware.receive(b"$X\n")
+    assert grbl(bench).state == "Idle"
+    stage.recover()
+    assert not stage.trusted
+
+
 @pytest.mark.parametrize("motion", [b"G53 G1 X-100 F6000\n", b"$J=G53 G90 X-100 F6000\n"])
 def test_recovery_in_mid_motion_stops_it_and_keeps_the_position(motion: bytes) -> None:
     bench = Bench(SimulatedGrbl)

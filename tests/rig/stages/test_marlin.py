@@ -135,6 +135,15 @@ def test_hold_stops_dead_and_so_loses_the_position() -> None:
     assert not stage.trusted
 
 
+def test_closed_switches_are_told_by_axis() -> None:
+    stage = homed(Bench(SimulatedMarlin))
+    stage.move_to(0.0, 100.0)
+    assert stage.switches() == {0}
+    stage.home()
+    stage.move_to(100.0, 0.0)
+    assert stage.switches() == {1}
+
+
 def test_one_axis_can_be_homed_alone() -> None:
     bench = Bench(SimulatedMarlin)
     stage = bench.stage()
