@@ -3,13 +3,13 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.faults.command_trials import COMMANDS, Bench, assert_survives, bench_in, faults_of
+from tests.faults.command_trials import COMMANDS, Bench, assert_survives, faults_of
 from tests.faults.io_faults import CRASHED, ROOT, Ended, Fault, Trial, compiled
 from tests.patience import HANG_S
 
@@ -18,12 +18,6 @@ _SAMPLE = {"capture": 20, "noise": 15, "geometry": 15, "reconstruct": 12, "run":
 
 # Of the faults that can meet a command, the slow test takes every one of this many: 1 would take hours.
 _STRIDE = {"capture": 7, "noise": 4, "geometry": 7, "reconstruct": 11, "run": 90}
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with bench_in(tmp_path_factory.mktemp("io")) as opened:
-        yield opened
 
 
 def assert_all_survived(bench: Bench, name: str, faults: list[Fault]) -> None:
