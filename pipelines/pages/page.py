@@ -2,12 +2,13 @@
 
 import base64
 import io
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from jinja2 import Template
+    from jinja2 import Environment, Template
     from matplotlib.figure import Figure
 
 # Colour of lines and text in drawings; in the SVG it is replaced by the page's own text colour, light or dark.
@@ -16,6 +17,12 @@ INK = "#010203"
 
 def template(name: str) -> "Template":
     """Return a page's template; its filter `figure` writes a number to three digits."""
+    return _environment().get_template(name)
+
+
+@cache
+def _environment() -> "Environment":
+    """Return the templates, each of which is compiled once."""
     from jinja2 import Environment, PackageLoader, StrictUndefined  # only pages need it
 
     environment = Environment(
@@ -26,7 +33,7 @@ def template(name: str) -> "Template":
         lstrip_blocks=True,
     )
     environment.filters["figure"] = figure
-    return environment.get_template(name)
+    return environment
 
 
 def figure(value: float | None, digits: int = 3) -> str:

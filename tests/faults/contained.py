@@ -1,0 +1,265 @@
+"""Run a call in a child process with little memory and time, and judge how it ended and what it touched.
+
+The child is forked, so that nothing is imported again: this process must have no threads.
+"""
+
+import atexit
+import json
+import math
+import os
+import re
+import resource
+import select
+import signal
+import sys
+import threading
+import time
+import traceback
+import zipfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from hashlib import blake2b
+from pathlib import Path
+
+# What a child may use beyond the memory that this process has already when it is forked.
+MAX_EXTRA_BYTES = 2 << 30
+MAX_FILE_BYTES = 1 << 30
+MAX_SECONDS = 30.0
+
+# Share of a processor that a child has even on a busy machine, unless it waits.
+_LEAST_RUNNING = 0.02
+
+# Begins a line that only a name in a file can have brought about, and a script that must never reach a page as such.
+FORGED = "faintfield-forged:"
+SCRIPT = "<script>forged()</script>"
+
+# Files up to this size are compared by their content, others by their times.
+_MAX_DIGESTED = 1 << 16
+_UNFINISHED = ("*.unfinished", "*.part", ".*.????????")
+_FAILURE = re.compile(r"faintfield: [A-Za-z ]+: .")
+_PYTHON_WARNING = re.compile(r":\d+: \w*Warning: |^\w*Warning: ", re.MULTILINE)
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x80-\x9f\u202a-\u202e\u2066-\u2069\u2028\u2029]")
+
+type State = Mapping[str, tuple[object, ...]]
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a child ended: its exit code or its signal, what it printed, and whether it left no process behind."""
+
+    code: int | None
+    signal: int | None
+    out: str
+    err: str
+    alone: bool
+    seconds: float
+
+
+def contained(
+    call: Callable[[], int], place: Path, *, seconds: float = MAX_SECONDS, extra_bytes: int = MAX_EXTRA_BYTES
+) -> Ended:
+    """Run `call` in a child whose working folder is `place`; its result is the exit code.
+
+    The child may compute for `seconds`, and wait for as long.
+    """
+    out, err = (os.memfd_create(name) for name in ("out", "err"))
+    limit = _data_bytes() + extra_bytes
+    begun = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        _be_child(call, place, (out, err), seconds, limit)
+    status = _wait(child, seconds)
+    alone = _group_is_gone(child)
+    texts = [_content(file).decode(errors="replace") for file in (out, err)]
+    killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
+    code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
+    return Ended(code, killed, texts[0], texts[1], alone, time.monotonic() - begun)
+
+
+def _wait(child: int, seconds: float) -> int:
+    """Return the status of a child at its end; end it if it waits for something that never comes.
+
+    On a busy machine it may take long, but it then still runs now and then.
+    """
+    ended = select.poll()
+    watched = os.pidfd_open(child)
+    ended.register(watched, select.POLLIN)
+    used = 0.0
+    while not ended.poll(1000 * seconds):
+        before, used = used, _cpu_seconds(child)
+        if used - before < _LEAST_RUNNING * seconds:
+            os.kill(child, signal.SIGALRM)
+    os.close(watched)
+    return os.waitpid(child, 0)[1]
+
+
+def _cpu_seconds(process: int) -> float:
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seconds: float, limit: int) -> None:
+    code = 1
+    try:
+        os.setsid()
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        os.dup2(files[0], 1)
+        os.dup2(files[1], 2)
+        # pytest and others put other objects in their places
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)
+        os.chdir(place)
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+        resource.setrlimit(resource.RLIMIT_FSIZE, (MAX_FILE_BYTES, MAX_FILE_BYTES))
+        whole_seconds = math.ceil(seconds)
+        resource.setrlimit(resource.RLIMIT_CPU, (whole_seconds, whole_seconds + 1))
+        for number in (signal.SIGALRM, signal.SIGTERM, signal.SIGXCPU):
+            signal.signal(number, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        code = call()
+        # What Python does at its end: it waits for threads, and lets libraries clean up
+        threading._shutdown()  # type: ignore[attr-defined]  # noqa: SLF001
+        atexit._run_exitfuncs()  # noqa: SLF001
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    finally:
+        with suppress(BaseException):
+            sys.stdout.flush()
+        with suppress(BaseException):
+            sys.stderr.flush()
+        os._exit(code)
+
+
+def _group_is_gone(leader: int) -> bool:
+    """Return whether nothing is left of the session of a child that has ended; end what is."""
+    try:
+        os.killpg(leader, signal.SIGKILL)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def _content(file: int) -> bytes:
+    os.lseek(file, 0, os.SEEK_SET)
+    with open(file, "rb") as opened:
+        return opened.read(1 << 20)
+
+
+def _data_bytes() -> int:
+    """Return the private memory that this process has mapped, as RLIMIT_DATA counts it."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmData:"):
+            return int(line.split()[1]) * 1024
+    raise OSError("/proc/self/status has no VmData")
+
+
+def state_of(folder: Path) -> State:
+    """Return what all files below a folder are like: kind, size, times, and the content of small ones."""
+    found: dict[str, tuple[object, ...]] = {}
+    waiting = [str(folder)]
+    while waiting:
+        inside = waiting.pop()
+        with os.scandir(inside) as entries:
+            for entry in entries:
+                stat = entry.stat(follow_symlinks=False)
+                name = os.path.relpath(entry.path, folder)
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(entry.path)
+                    found[name] = (stat.st_mode,)
+                    continue
+                digest = b""
+                if entry.is_file(follow_symlinks=False) and stat.st_size <= _MAX_DIGESTED:
+                    digest = blake2b(Path(entry.path).read_bytes(), digest_size=16).digest()
+                found[name] = (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns, digest)
+    return found
+
+
+def faults_of(ended: Ended, folder: Path, before: State, may_change: tuple[str, ...]) -> list[str]:
+    """Return what is wrong with how a child ended, and with what it left in the folder around all of its files.
+
+    Parameters
+    ----------
+    ended : Ended
+        The end of the child.
+    folder : Path
+        The folder.
+    before : State
+        The state of the folder before the child was started.
+    may_change : tuple of str
+        Patterns of the files that it may change, add or remove.
+    """
+    after = state_of(folder)
+    changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
+    faults = [*_ended_badly(ended)]
+    for name in sorted(changed):
+        if not any(fnmatchcase(name, pattern) for pattern in may_change):
+            faults.append(f"outside its folder: {name!r} was {_what_became(name, before, after)}")
+        elif name not in after:
+            continue
+        elif any(fnmatchcase(os.path.basename(name), pattern) for pattern in _UNFINISHED):
+            faults.append(f"half-written: {name!r} was left")
+        elif flaw := _flaw(folder / name):
+            faults.append(f"half-written: {name!r} {flaw}")
+    return faults
+
+
+def _ended_badly(ended: Ended) -> list[str]:
+    faults = []
+    lines = ended.err.splitlines()
+    said = [line for line in lines if _FAILURE.match(line)]
+    if ended.signal in (signal.SIGALRM, signal.SIGXCPU):
+        faults.append(f"hang: {'waited' if ended.signal == signal.SIGALRM else 'ran'} too long")
+    elif ended.signal is not None:
+        faults.append(f"died by signal {signal.Signals(ended.signal).name}")
+    elif "Traceback (most recent call last)" in ended.err:
+        faults.append(f"traceback: {lines[-1][:300]}")
+    elif ended.code not in (0, 1, 2):
+        faults.append(f"exit code {ended.code}")
+    elif ended.code == 0 and said:
+        faults.append(f"exit code 0 after a failure: {said[0][:300]}")
+    elif ended.code and (len(said) != 1 or lines[-1:] != said):
+        faults.append(f"exit code {ended.code} without one line of failure at the end: {ended.err[-300:]!r}")
+    if ended.code and ended.out:
+        faults.append(f"printed a result and failed: {ended.out[:100]!r}")
+    if any(line.lstrip().startswith(FORGED) for line in [*lines, *ended.out.splitlines()]):
+        faults.append("a name made a line of its own")
+    if found := _CONTROL.search(ended.err):
+        faults.append(f"the control character {found[0]!r} reached the terminal")
+    if found := _PYTHON_WARNING.search(ended.err):
+        faults.append(f"a warning of Python: {ended.err[found.start() : found.start() + 200]!r}")
+    if not ended.alone:
+        faults.append("left a process running")
+    return faults
+
+
+def _what_became(name: str, before: State, after: State) -> str:
+    return "made" if name not in before else "removed" if name not in after else "changed"
+
+
+def _flaw(path: Path) -> str | None:
+    """Return why a written file is not whole, None if it is."""
+    if path.is_symlink() or not path.is_file():
+        return None
+    match path.suffix:
+        case ".json":
+            try:
+                json.loads(path.read_bytes())
+            except ValueError as failure:
+                return f"is no JSON ({failure})"
+        case ".npz" if not zipfile.is_zipfile(path):
+            return "is no archive"
+        case ".html":
+            text = path.read_text(errors="replace")
+            if SCRIPT in text:
+                return "holds a script that came in a name"
+            if not text.rstrip().endswith("</html>"):
+                return "has no end"
+        case ".png" if not path.read_bytes().endswith(b"IEND\xaeB`\x82"):
+            return "has no end"
+        case ".tiff" if path.read_bytes()[:4] not in (b"II*\0", b"II+\0"):
+            return "is no TIFF"
+    return None

@@ -1,0 +1,390 @@
+"""The kinds of files that commands read: a small valid folder of each, made by the commands, and the commands."""
+
+import os
+import shutil
+import tomllib
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import tomli_w
+
+from faintfield.calib.board import Board
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.toml_files import write_toml
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.session.resume import open_session
+from faintfield.rig.session.session import FrozenPlan
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from tests.calib.noise.darkroom import specimen
+from tests.faults.capturing import SMALL_RIG, Unattended
+from tests.pipelines.noise_sets import take_set, write_frames
+from tests.pipelines.sessions import captured, rig_toml
+from tests.simulated_boards import simulate_board_set
+
+_SIDES_PX = (24, 18)
+_BOARD_PX = (320, 240)
+_SMALL_RIG = msgspec.structs.replace(SMALL_RIG, camera=SimulatedSettings(size_px=_SIDES_PX))
+
+
+@dataclass(frozen=True)
+class Call:
+    """A command that reads a case's files, in words of which `IN` and `OUT` stand for folders.
+
+    Parameters
+    ----------
+    words : str
+        The command and its arguments.
+    may_change : tuple of str
+        Patterns of the files that it may change, in the folder that holds IN and OUT.
+    then : str
+        A command that must end well after this one did.
+    notices : tuple of str
+        Patterns of files within IN whose every change of content must make the command fail.
+    """
+
+    words: str
+    may_change: tuple[str, ...] = ("OUT", "OUT/*")
+    then: str = ""
+    notices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of files, and what reads it.
+
+    Parameters
+    ----------
+    seed : callable
+        Writes the valid files into a folder.
+    files : tuple of str
+        Patterns of the files within it that are mutated.
+    calls : tuple of Call
+        The commands that read them; each case runs one.
+    usual, many : int
+        Number of cases in `make test` and in `.ci/run`.
+    """
+
+    seed: Callable[[Path], None]
+    files: tuple[str, ...]
+    calls: tuple[Call, ...]
+    usual: int = 300
+    many: int = 600
+
+
+def _done(*words: object) -> None:
+    code = run([str(word) for word in words])
+    if code != 0:
+        raise RuntimeError(f"{' '.join(map(str, words))}: exit code {code}")
+
+
+def _simulated(folder: Path, sides_px: tuple[int, int] = _SIDES_PX) -> None:
+    _done("simulate", folder, "--size-px", *sides_px, "--rows", 3, "--columns", 3)
+
+
+def _dark_room(folder: Path) -> None:
+    """Write dark and flat frames of 24 x 18 px, with their noise.toml."""
+    chip, rng = specimen(11, shape=_SIDES_PX[::-1])
+    write_frames(folder, take_set(chip, rng, frames=3, photons=(2000.0, 8000.0)))
+
+
+def _measured_noise(folder: Path) -> None:
+    """Write a set whose noise was measured by `faintfield noise`."""
+    _simulated(folder)
+    _dark_room(folder / "frames")
+    _done("noise", folder / "frames", "--out", folder)
+    shutil.rmtree(folder / "frames")
+    settings = tomllib.loads((folder / "elemental.toml").read_text())
+    settings["noise"] = "noise.json"
+    (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
+
+
+def _boards(folder: Path) -> None:
+    """Write photographs of boards from 3 x 3 nodes, with their charuco.toml."""
+    _simulated(folder / "scene", _BOARD_PX)
+    paper = paper_experiment(*_BOARD_PX)
+    experiment = SimulatedExperiment(paper.planes, paper.optics, paper.sensor, 3, 3, 100.0)
+    truth = read_truth(folder / "scene")
+    assert truth is not None
+    boards = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for index in range(4)]
+    simulate_board_set(folder, experiment, np.array(truth.true_rt_cam_ref), boards, np.random.default_rng(1))
+
+
+def _measured_geometry(folder: Path) -> None:
+    """Write a set with the geometry that `faintfield geometry` measured of its camera."""
+    _boards(folder)
+    _done("geometry", folder, "--out", folder, "--limit-px", 100)
+    for path in [*folder.glob("b*.tiff"), folder / "charuco.toml"]:
+        path.unlink()
+
+
+def _pictures(folder: Path) -> None:
+    """Write four pictures of a grid: TIFF, PNG of 8 and 16 bits, JPEG; and a raw one if there is one at hand."""
+    rng = np.random.default_rng(5)
+    grey = rng.integers(0, 4000, _SIDES_PX[::-1]).astype(np.uint16)
+    for depth in ("8_bits", "16_bits"):
+        (folder / depth).mkdir(parents=True)
+    write_frame(folder / "16_bits" / "view_r0_c0.tiff", grey)
+    cv2.imwrite(str(folder / "16_bits" / "view_r0_c1.png"), grey)
+    cv2.imwrite(str(folder / "8_bits" / "view_r0_c0.png"), (grey >> 4).astype(np.uint8))
+    cv2.imwrite(str(folder / "8_bits" / "view_r0_c1.jpg"), (grey >> 4).astype(np.uint8))
+
+
+def _raw_picture(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    raw = Path(os.environ["FAINTFIELD_DATA"]) / "raw" / "colorchart.dng"
+    shutil.copyfile(raw, folder / "view_r0_c0.dng")
+
+
+def _exported(*words: str) -> Callable[[Path], None]:
+    """Return what writes a model of a simulated set by `faintfield export`, beside the set's images."""
+
+    def write(folder: Path) -> None:
+        _simulated(folder)
+        _done("export", words[0], folder, folder / "model", *words[1:])
+        (folder / "elemental.toml").unlink()
+
+    return write
+
+
+def _emva1288(folder: Path) -> None:
+    """Write EMVA 1288 reference data: a descriptor and its images."""
+    (folder / "images").mkdir(parents=True)
+    lines = ["v 4.0", "n 12 24 18"]
+    rng = np.random.default_rng(3)
+    for number, measurement in enumerate(("b 100000000,0 1000.0", "b 100000000.0 6000.0", "d 100000000.0", "d 3e10")):
+        lines.append(measurement)
+        for repeat in range(2):
+            name = f"{number}_{repeat}.png"
+            cv2.imwrite(str(folder / "images" / name), rng.integers(0, 4000, _SIDES_PX[::-1]).astype(np.uint16))
+            lines.append(f"i images\\{name}")
+    (folder / "descriptor.txt").write_text("\n".join(lines) + "\n")
+
+
+def _rig(folder: Path) -> None:
+    """Write a rig.toml, as `faintfield init` does, and what `faintfield check` stores beside it."""
+    folder.mkdir(parents=True)
+    _done("init", folder / "rig.toml")
+    _done("check", folder / "rig.toml", "--remember")
+
+
+def _sealed_session(folder: Path) -> None:
+    """Capture a session of 16 frames of 16 x 12 px."""
+    write_toml(folder / "rig.toml", _SMALL_RIG)
+    _done("capture", folder / "rig.toml", folder / "session", "--yes")
+
+
+def _open_session(folder: Path) -> None:
+    """Capture a session, and let it be as it was before its last frames."""
+    write_toml(folder / "rig.toml", _SMALL_RIG)
+    frozen = FrozenPlan(survey(open_rig(_SMALL_RIG), _SMALL_RIG).plan, _SMALL_RIG)
+    with suppress(_Stopped), open_session(folder / "session", frozen) as session:
+        Capture(session, open_rig(_SMALL_RIG, session.journal), _Leaving(), lambda _: None).run()
+
+
+class _Stopped(Exception):
+    """Ends a capture."""
+
+
+class _Leaving(Unattended):
+    """Ends the capture after ten frames."""
+
+    shown = 0
+
+    def show_frame(self, *_: Any) -> None:
+        self.shown += 1
+        if self.shown == 10:
+            raise _Stopped
+
+
+def _whole_session(folder: Path) -> None:
+    """Capture a session with boards, and make everything of it."""
+    captured(folder, rig_toml())
+    _done("run", folder / "session", "--depth-mm", 700, "--method", "backprojection")
+
+
+def _results(folder: Path) -> None:
+    """Reconstruct planes of a simulated set by two methods, with its errors and a depth map."""
+    _simulated(folder / "set")
+    _done("reconstruct", folder / "set", "--out", folder / "planes", *_PLANES.split())
+    _done("reconstruct", folder / "set", "--out", folder / "sweep", *_SWEEP.split())
+
+
+_PLANES = "--depth-mm 500 --depth-mm 700 --passes 2 --penalty-weight 0.1"
+_SWEEP = "--sweep-mm 400:800:5 --depth-map --method backprojection"
+_PLANE_POSE = """
+format = 1
+
+[[plane]]
+name = "wall"
+rt_ref_plane = [0.0, 0.1, 0.0, 0.0, 0.0, 600.0]
+size_mm = [100.0, 80.0]
+
+[[plane]]
+name = "floor"
+point_mm = [0.0, 0.0, 700.0]
+normal = [0.0, 0.5, 1.0]
+"""
+
+
+def _plane_poses(folder: Path) -> None:
+    _simulated(folder)
+    (folder / "poses.toml").write_text(_PLANE_POSE)
+
+
+def _zarr(folder: Path) -> None:
+    """Export planes as OME-Zarr, to be replaced by another export."""
+    _results(folder)
+    shutil.rmtree(folder / "planes")
+    _done("export", "zarr", folder / "sweep", folder / "sweep.ome.zarr")
+
+
+def _figures(folder: Path) -> None:
+    """Make figure 2, to whose page another call of `figures` adds."""
+    _done("figures", folder, "--only", 2, "--size-px", 32, 24)
+
+
+_NOTHING = ("",)
+_RECONSTRUCT = "reconstruct IN --out OUT --depth-mm 500 --passes 2 --penalty-weight 0.1"
+_BACKPROJECT = "reconstruct IN --out OUT --depth-mm 500 --method backprojection"
+
+_READ_SET = (
+    Call(_RECONSTRUCT),
+    Call(_BACKPROJECT),
+    Call("darken IN OUT"),
+    Call("export colmap IN OUT"),
+    Call("export colmap IN OUT --binary"),
+    Call("export mrcal IN OUT"),
+)
+_RESUME = Call("capture IN/rig.toml IN/session --yes", ("IN/session", "IN/session/*"), then="verify IN/session")
+
+_JOURNAL = "session/journal.sqlite"
+_OF_SESSION = ("session/plan.json", _JOURNAL, _JOURNAL, "session/frames/*", "session/lock", "rig.toml")
+
+_VERIFY = Call("verify IN/session", _NOTHING, notices=("session/plan.json", _JOURNAL, "session/frames/*"))
+
+KINDS: Mapping[str, Kind] = {
+    "elemental set": Kind(_simulated, ("elemental.toml",), _READ_SET),
+    "frames": Kind(_simulated, ("view_*.tiff", "noise_reference.tiff"), _READ_SET[:3]),
+    "truth": Kind(_simulated, ("truth.json", "truth/*"), (Call(_RECONSTRUCT), Call(_BACKPROJECT))),
+    "plane poses": Kind(_plane_poses, ("poses.toml",), (Call(f"{_BACKPROJECT} --plane-pose IN/poses.toml"),)),
+    "pictures": Kind(_pictures, ("*/view_*",), (Call("import grid IN/8_bits OUT"), Call("import grid IN/16_bits OUT"))),
+    "raw picture": Kind(_raw_picture, ("view_*",), (Call("import grid IN OUT"),), usual=12, many=150),
+    "rig": Kind(
+        _rig,
+        ("rig.toml", "rig*.json"),
+        (Call("check IN/rig.toml", _NOTHING), Call("check IN/rig.toml --remember", ("IN/rig*",))),
+    ),
+    "boards": Kind(
+        _boards,
+        ("charuco.toml", "charuco.toml", "b*.tiff"),
+        (Call("geometry IN --out OUT --limit-px 100"),),
+        usual=20,
+        many=150,
+    ),
+    "noise set": Kind(
+        _dark_room, ("noise.toml", "noise.toml", "*.tiff"), (Call("noise IN --out OUT"),), usual=60, many=300
+    ),
+    "noise": Kind(
+        _measured_noise,
+        ("noise.json", "noise_maps.npz"),
+        (
+            Call(_RECONSTRUCT),
+            Call(_BACKPROJECT),
+            Call("darken IN OUT"),
+            Call("verify IN", _NOTHING, notices=("noise_maps.npz",)),
+        ),
+    ),
+    "geometry": Kind(
+        _measured_geometry,
+        ("geometry.json", "geometry.json", "*.npz", "cameras/*"),
+        (
+            Call("reconstruct IN/scene --geometry IN --out OUT --depth-mm 500 --method backprojection"),
+            Call("reconstruct IN/scene --geometry IN/geometry.json --out OUT --depth-mm 500 --method backprojection"),
+            Call("verify IN", _NOTHING, notices=("*.npz", "cameras/*")),
+        ),
+    ),
+    "COLMAP text": Kind(_exported("colmap"), ("model/*.txt",), (Call("import colmap IN/model OUT --images IN"),)),
+    "COLMAP binary": Kind(
+        _exported("colmap", "--binary"), ("model/*.bin",), (Call("import colmap IN/model OUT --images IN"),)
+    ),
+    "camera models": Kind(
+        _exported("mrcal"), ("model/*.cameramodel",), (Call("import mrcal IN/model OUT --images IN"),)
+    ),
+    "EMVA 1288": Kind(
+        _emva1288,
+        ("descriptor.txt", "descriptor.txt", "images/*"),
+        (Call("import emva1288 IN/descriptor.txt OUT"),),
+    ),
+    "complete session": Kind(
+        _sealed_session,
+        (*_OF_SESSION, "session/SHA256SUMS"),
+        (
+            *(_VERIFY, _VERIFY, _VERIFY),
+            Call("capture IN/rig.toml IN/session --yes", _NOTHING),  # there is nothing left to capture
+            Call("noise IN/session --out OUT"),
+        ),
+    ),
+    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME)),
+    "measured session": Kind(
+        _whole_session,
+        (
+            *("session/*.json", "session/*.npz", _JOURNAL, "session/SHA256SUMS", "session/.hashes.json"),
+            *("session/reconstructions/*", "session/cameras/*"),
+        ),
+        (
+            Call("run IN/session --depth-mm 700 --method backprojection", ("IN/session", "IN/session/*")),
+            Call("report IN/session", ("IN/session/report.html",)),
+            Call("reconstruct IN/session --out OUT --depth-mm 700 --method backprojection"),
+            Call("verify IN/session", _NOTHING),
+            Call("export colmap IN/session OUT"),
+        ),
+        usual=30,
+        many=200,
+    ),
+    "results": Kind(
+        _results,
+        ("planes/*", "planes/*.json", "sweep/*", "sweep/*.json"),
+        (
+            Call("report IN/planes", ("IN/planes/report.html",)),
+            Call("report IN/sweep", ("IN/sweep/report.html",)),
+            Call("report IN", ("IN/report.html",)),
+            Call(
+                f"reconstruct IN/set --out IN/planes {_PLANES}", ("IN/planes", "IN/planes/*"), then="verify IN/planes"
+            ),
+            Call(f"reconstruct IN/set --out IN/sweep {_SWEEP}", ("IN/sweep", "IN/sweep/*"), then="verify IN/sweep"),
+            Call("verify IN/planes", _NOTHING, notices=("planes/plane_*.tiff",)),
+            Call("verify IN/sweep", _NOTHING, notices=("sweep/plane_*.tiff",)),
+            Call("export zarr IN/sweep OUT"),
+        ),
+    ),
+    "zarr": Kind(
+        _zarr,
+        ("sweep.ome.zarr/*", "sweep.ome.zarr/zarr.json", "sweep.ome.zarr/*/zarr.json"),
+        (Call("export zarr IN/sweep IN/sweep.ome.zarr --overwrite", ("IN/sweep.ome.zarr", "IN/sweep.ome.zarr/*")),),
+        usual=60,
+        many=200,
+    ),
+    "figures": Kind(
+        _figures,
+        ("*.json", "*.png", "*.csv"),
+        (Call("figures IN --only 2 --size-px 32 24", ("IN", "IN/*")),),
+        usual=8,
+        many=60,
+    ),
+}
+
+
+def in_force(kind: str) -> bool:
+    """Return whether a kind can be made here: raw pictures need the real data."""
+    return kind != "raw picture" or "FAINTFIELD_DATA" in os.environ
