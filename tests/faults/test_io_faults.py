@@ -39,7 +39,7 @@ def test_a_command_survives_faults_of_the_system(bench: Bench, name: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(HANG_S)
+@pytest.mark.timeout(10 * HANG_S)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_survives_many_faults_of_the_system(bench: Bench, name: str) -> None:
     assert_all_survived(bench, name, faults_of(bench.calls(name))[:: _STRIDE[name]])
@@ -154,3 +154,14 @@ def test_a_careful_command_is_not_blamed(tmp_path: Path) -> None:
     bench = Bench(tmp_path, Careless(_named))
     assert bench.calls("noise") == ["write"]
     assert assert_survives(bench, "noise", Fault("write", "fail once", 1, "ENOSPC"))
+
+
+@pytest.mark.parametrize("error", ["EACCES", "EIO"])
+def test_a_colour_that_cannot_be_read_back_is_a_named_failure(bench: Bench, error: str) -> None:
+    bench.undisturbed("reconstruct")
+    diary = bench.folder("reconstruct").with_suffix(".calls").read_text().splitlines()
+    opened = [line for line in diary if line.split()[0] == "0"]
+    back = [nth for nth, line in enumerate(opened, 1) if "/.parts/" in line and not line.endswith(".unfinished")]
+    assert back
+    for nth in back:
+        assert_survives(bench, "reconstruct", Fault("open", "fail once", nth, error))
