@@ -106,13 +106,13 @@ class Bench:
         edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
             pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
-            files = sorted(it for it in place.glob(pattern) if it.is_file() and not it.is_symlink())
+            files = sorted(it for it in place.glob(pattern) if mutation_operations.can_be_mutated(it))
             if not files:
                 continue  # an earlier operation removed them
             path = rng.choice(files)
             name, arguments = mutation_operations.draw(rng, path)
             edits.append((str(path.relative_to(place)), name, arguments))
-            self._mutate(*edits[-1])
+            mutation_operations.apply(path, name, arguments)
         if rng.random() < 0.4:
             edits += [(file, "sign", []) for file, *_ in edits]
         return Case(kind, call, tuple(edits))
@@ -121,8 +121,8 @@ class Bench:
         """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
         self.lay_out(case.kind)
         call = KINDS[case.kind].calls[case.call]
-        for edit in case.edits:
-            self._mutate(*edit)
+        for file, name, arguments in case.edits:
+            mutation_operations.apply(self._guard / "IN" / file, name, arguments)
         changed = sorted(self._changed(case.kind, call.notices))
         if not all(name in changed for name, *_ in case.edits):
             changed = []  # what vouches for the others was changed, too
@@ -135,12 +135,6 @@ class Bench:
                 faults.append(f"ended well, and then `{call.then}` did not: {self.ended.err[-300:]}")
             self.ended = ended
         return faults
-
-    def _mutate(self, file: str, name: str, arguments: list[Any]) -> None:
-        """Do an operation to a file, if it is still there."""
-        path = self._guard / "IN" / file
-        if os.path.lexists(path):
-            mutation_operations.apply(path, name, arguments)
 
     def faults_of(
         self,
@@ -215,7 +209,7 @@ class Bench:
 
 def _content(path: Path) -> object:
     """Return what a file holds: of a database its rows, of any other its bytes, None if neither can be read."""
-    if not path.is_file() or path.stat().st_size > contained.MAX_FILE_BYTES:
+    if not path.is_file() or not mutation_operations.can_be_mutated(path.resolve()):
         return None
     if path.suffix != ".sqlite":
         return path.read_bytes()
