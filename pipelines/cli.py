@@ -6,7 +6,8 @@ commands by name, so that a module is imported only when its command runs.
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from json import dumps
 from pathlib import Path
@@ -16,7 +17,7 @@ import msgspec
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
 from faintfield.pipelines.console import framed_console, inform, visible
-from faintfield.pipelines.errors import NAMED_FAILURES, WrongUsage
+from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, WrongUsage
 from faintfield.pipelines.log_file import logged
 from faintfield.pipelines.registry import register_commands
 
@@ -62,12 +63,12 @@ def _launch(
     log
         Append to this file: the command, versions, all messages with their times, and how the command ended.
     """
-    with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)):
+    with logged(log, tokens, one_line=(CycloptsError, WrongUsage, *NAMED_FAILURES)), _named_system_errors():
         result: object = app(tokens, exit_on_error=False, print_error=True)
-    if json and result is not None:
-        _print_bytes(_json(result))
-    elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
-        _print_bytes(os.fsencode(visible(str(report)) if sys.stdout.isatty() else report))
+        if json and result is not None:
+            _print_bytes(_json(result))
+        elif report := result.get("report") if isinstance(result, dict) else getattr(result, "report", None):
+            _print_bytes(os.fsencode(visible(str(report)) if sys.stdout.isatty() else report))
 
 
 def _json(result: object) -> bytes:
@@ -83,6 +84,18 @@ def _print_bytes(line: bytes) -> None:
     sys.stdout.flush()
     sys.stdout.buffer.write(line + b"\n")
     sys.stdout.buffer.flush()
+
+
+@contextmanager
+def _named_system_errors() -> Iterator[None]:
+    """Name an error of the system that met a command where it expects none: a disk or a network can fail anywhere."""
+    try:
+        yield
+    except OSError as failure:
+        raise FileFailed(
+            f"{failure.filename or 'a file'}: {failure.strerror or failure}; see to its disk and its permissions, and "
+            "run the same command again"
+        ) from failure
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

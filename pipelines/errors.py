@@ -13,6 +13,7 @@ InputError
 ├── MissingPackage
 ├── ClusterFailed
 ├── MemoryShort
+├── FileFailed
 └── CannotWrite
     └── DiskFull
 
@@ -76,6 +77,10 @@ class ClusterFailed(InputError):
 
 class MemoryShort(InputError):
     """A task needs more memory than is free."""
+
+
+class FileFailed(InputError):
+    """The system could not read, write or find out about a file where no command expects it."""
 
 
 class CannotWrite(InputError):

@@ -39,6 +39,8 @@ type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "d
 
 # A plan has at most this many frames: their names give the number five digits.
 MAX_FRAMES = 100_000
+# No exposure is longer: a day, and more.
+MAX_EXPOSURE_S = 100_000.0
 # No quantity of a rig is larger, and computing with numbers up to it does not overflow.
 MAX_NUMBER = 1e12
 
@@ -131,8 +133,10 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     at: Literal["grid", "centre"] = "grid"
 
     def __post_init__(self) -> None:
-        if not self.exposure_s or not min(self.exposure_s) > 0.0 or self.frames_per_node < 1:
+        if not self.exposure_s or not all(it > 0.0 for it in self.exposure_s) or self.frames_per_node < 1:
             raise ValueError(f"a step needs exposure times above 0 s and at least one frame; got {self}")
+        if max(self.exposure_s) > MAX_EXPOSURE_S:
+            raise ValueError(f"exposure_s = {max(self.exposure_s):g}; an exposure lasts {MAX_EXPOSURE_S:g} s at most")
 
     def frames_per_stop(self) -> int:
         """Return the number of frames at each stop."""

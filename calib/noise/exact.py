@@ -132,7 +132,7 @@ def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _
         step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         if best[1] @ step < _MIN_GAIN:
             covariance = np.zeros_like(best[2])
-            covariance[np.ix_(free, free)] = np.linalg.pinv(best[2][np.ix_(free, free)])
+            covariance[np.ix_(free, free)] = _inverse(best[2][np.ix_(free, free)])
             return _Maximum(x, covariance, best[0])
         length = 1.0
         while (tried := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
@@ -142,6 +142,15 @@ def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _
         f"the likelihood of the dark values did not settle in {_MAX_STEPS} steps; check that the darks were taken "
         "with the lens covered, or record flats, which fix the gain"
     )
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of the information, where that of one parameter may be much smaller than that of others.
+
+    The logarithm of a dark current near zero has next to none, but the dark current itself has an error.
+    """
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    return np.asarray(np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale))
 
 
 def _flat_part(x: Array, flats: FlatMoments, freedom: float) -> tuple[float, Array, Array]:

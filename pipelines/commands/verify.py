@@ -106,4 +106,4 @@ def _list(label: str, lines: tuple[str, ...]) -> None:
     for line in lines[:_MAX_SHOWN]:
         inform(f"{label}: {line}")
     if len(lines) > _MAX_SHOWN:
-        inform(f"{label}: and {len(lines) - _MAX_SHOWN} more")
+        inform(f"  and {len(lines) - _MAX_SHOWN} more")

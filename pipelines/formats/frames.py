@@ -1,6 +1,7 @@
 """Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their colour mosaic."""
 
 import contextlib
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from io import BufferedReader
@@ -20,6 +21,9 @@ TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
 IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
+
+# Complaints about damaged EXIF are dropped: such a file states no exposure.
+logging.getLogger("exifread").addHandler(logging.NullHandler())
 
 # Masked pixels this close to the active area are not used, px: they catch a little of its light.
 _MASKED_GUARD_PX = 4

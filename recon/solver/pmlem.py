@@ -43,9 +43,9 @@ class Certificate:
     """A bound on the distance of a plane from the optimum, relative to its norm, ‖x‖² = Σ w x² in the metric w.
 
     With ρ = ∇L + β ∇ᵀp, `a² = Σ w (f − (f − ρ/w)₊)²` and `e = β Σ( φ(|∇f|) + φ*(p) − p·∇f ) + Σ f (ρ − w f)₊`,
-    convexity gives `‖f − f*‖ ≤ ( a + √(a² + 2 m e) )/m`, where the curvature of L between f and
-    the optimum f* is at least m w. The bound is given for m = 1: the metric is the row sums of the Hessian, which equal
-    that curvature for all that is smooth, and penalties leave little else.
+    convexity gives `‖f − f*‖ ≤ ( a + √(a² + 4 m e) )/2m`, where the curvature of L between f and
+    the optimum f* is at least m w. The bound is given for m = ½: the metric is the row sums of the Hessian, which equal
+    that curvature for all that is smooth (m = 1), and penalties leave little else.
 
     Attributes
     ----------

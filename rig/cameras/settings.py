@@ -131,6 +131,8 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
             )
         if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
+        if min(self.lit_photons_per_s, self.unlit_photons_per_s, self.seed) < 0 or not 0 < self.saturation_dn < 2**16:
+            raise ValueError("camera: light and seed are not negative, and saturation_dn is 1 to 65535; correct them")
         if self.mosaic is not None and (not self.mosaic or set("".join(self.mosaic)) - set("RGB")):
             raise ValueError(f"camera.mosaic = {list(self.mosaic)}; give rows of the letters R, G and B")
 

@@ -45,8 +45,6 @@ class Verdict(Struct, frozen=True):
         Names of frames that were kept although the next check of the stage failed.
     sealed : bool
         Whether the session is complete.
-    interrupted : tuple of str
-        Names of the files of an exposure that was interrupted, which are no damage.
     """
 
     problems: tuple[str, ...]
@@ -57,7 +55,6 @@ class Verdict(Struct, frozen=True):
     superseded: int
     suspect: tuple[str, ...]
     sealed: bool
-    interrupted: tuple[str, ...] = ()
 
 
 def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = iter) -> Verdict:
@@ -98,7 +95,9 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     names = list_names(folder / FRAMES)
     digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
     interrupted = find_interrupted(frames, uncommitted, set(names) - {it.file for it in committed})
-    problems = [] if begun == [plan_sha256] else [f"{PLAN}: is not the plan that the session was begun with"]
+    problems: list[str] = []
+    if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
+        problems.append(f"{PLAN}: is not the plan that the session was begun with")
     problems += find_strangers(frames, committed)
     problems += _compare(committed, digests, set(interrupted))
     if is_sealed(folder):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, plane_from_ray
 
 poses = st.integers(0, 2**32 - 1).map(
     lambda seed: np.random.default_rng(seed).uniform(-1, 1, (3, 6)) * np.repeat([0.5, 200.0], 3)
@@ -76,3 +76,14 @@ def test_a_view_with_a_principal_point_of_its_own_sees_what_the_camera_matrix_sa
         rays = np.column_stack([(pixels - centre) / f_px, np.ones(len(pixels))])  # as the shared ray map has them
         mapped = rays @ homography.T
         np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], POINTS_MM, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("size_px", [(640, 480), (5, 3)])
+@pytest.mark.parametrize("across", [1, 4, 5])
+def test_the_lattice_of_an_image_holds_the_middles_of_equal_parts_of_its_pixels(
+    size_px: tuple[int, int], across: int
+) -> None:
+    """Pixel 0 reaches from −½ to ½: cut into 20 pieces each, the pixels of a part have their mean in its middle."""
+    columns, rows = ((-0.5 + (np.arange(20 * size) + 0.5) / 20).reshape(across, -1).mean(axis=1) for size in size_px)
+    expected = [(column, row) for row in rows for column in columns]
+    np.testing.assert_allclose(image_lattice(size_px, across), expected, atol=1e-12)

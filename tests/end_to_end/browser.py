@@ -10,13 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from tests.patience import HANG_S
+
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 # Chromium expects the pipes at descriptors 3 and 4; the detour by 103 and 104 helps if they are 3 or 4 already.
 _LAUNCH = (
     "import os, sys; os.dup2(int(sys.argv[1]), 103); os.dup2(int(sys.argv[2]), 104); os.dup2(103, 3); "
     "os.dup2(104, 4); os.execv(sys.argv[3], sys.argv[3:])"
 )
-_MAX_WAIT_MS = 30_000
 
 
 class Tab:
@@ -62,7 +63,7 @@ class Tab:
                 const look = () => {{
                     let holds = false;
                     try {{ holds = Boolean({condition}); }} catch {{}}
-                    if (holds || Date.now() - begun > {_MAX_WAIT_MS}) resolve(holds);
+                    if (holds || Date.now() - begun > {1000 * HANG_S}) resolve(holds);
                     else setTimeout(look, 20);
                 }};
                 look();

@@ -41,6 +41,7 @@ from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 from tests.faults.besieging import besiege
 from tests.faults.capturing import FRAMES, SMALL_RIG, in_process
+from tests.patience import HANG_S
 
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
@@ -70,7 +71,7 @@ class Running:
         self._stack.close()
 
     def ended(self) -> RigError | None:
-        self._thread.join(60.0)
+        self._thread.join(HANG_S)
         assert not self._thread.is_alive()
         return self.failure
 

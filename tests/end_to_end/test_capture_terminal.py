@@ -11,8 +11,7 @@ import pytest
 
 from faintfield.pipelines import cli
 from faintfield.rig.session.verify import verify
-
-_MAX_WAIT_S = 60.0
+from tests.patience import HANG_S
 
 
 class Terminal:
@@ -41,11 +40,11 @@ class Terminal:
         while self._more():
             pass
         os.close(self._near)
-        return self._process.wait(_MAX_WAIT_S)
+        return self._process.wait(HANG_S)
 
     def _more(self) -> bool:
         """Read new output; return False at its end."""
-        ready, _, _ = select.select([self._near], [], [], _MAX_WAIT_S)
+        ready, _, _ = select.select([self._near], [], [], HANG_S)
         try:
             data = os.read(self._near, 1 << 16) if ready else b""
         except OSError:  # the other end is closed

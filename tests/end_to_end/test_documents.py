@@ -29,7 +29,6 @@ def test_there_are_examples_for_the_shell_and_for_python(document: str) -> None:
     assert {kind for kind, _ in _blocks(document, "sh", "python")} == {"sh", "python"}
 
 
-@pytest.mark.timeout(240)
 @pytest.mark.parametrize(
     "document", [pytest.param(it, marks=() if it == "docs/api.md" else pytest.mark.slow) for it in DOCUMENTS]
 )

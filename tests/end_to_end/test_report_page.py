@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
+from tests.patience import HANG_S
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
@@ -166,7 +167,7 @@ def test_it_prints_with_the_plane_that_it_opens_with(report: Path, tmp_path: Pat
     assert CHROMIUM is not None
     options = ["--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
     command = [CHROMIUM, *options, f"--print-to-pdf={tmp_path / 'report.pdf'}", report.as_uri()]
-    subprocess.run(command, check=True, capture_output=True, timeout=60)
+    subprocess.run(command, check=True, capture_output=True, timeout=HANG_S)
     assert (tmp_path / "report.pdf").read_bytes().startswith(b"%PDF")
     reader = shutil.which("pdftotext")
     if reader is not None:

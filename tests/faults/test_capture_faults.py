@@ -28,6 +28,7 @@ from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, in_process
 from tests.faults.stage_faults import Fault, faults_of
+from tests.patience import HANG_S
 
 CONTROLLERS = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
 ORIGIN = {"grbl": Point(-350.0, -350.0), "marlin": Point(50.0, 50.0)}
@@ -123,6 +124,22 @@ def test_stage_faults_in_mid_capture(tmp_path: Path, protocol: str, fault: Fault
     lab.assert_true_positions()
 
 
+@pytest.mark.parametrize("feed_mm_per_min", [300, 6000], ids=["it still moves afterwards", "it stands elsewhere"])
+def test_a_stage_that_somebody_jogs_during_an_exposure_has_the_frame_taken_again(
+    tmp_path: Path, feed_mm_per_min: int
+) -> None:
+    lab = Lab(tmp_path / "session", "grbl")
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        camera.on_exposure = {3: lambda: bench.firmware.receive(b"$J=G91 G21 X-0.5 F%d\n" % feed_mm_per_min)}
+
+    assert lab.run(prepare) is None
+    lab.assert_true_positions()
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        assert [frame for _, frame in journal.uncommitted()] == [2]
+        assert len(journal.events("stage_failed")) == 1
+
+
 def make_slip(bench: Bench, camera: TruthfulCamera) -> None:
     """Let an axis lose steps in the second step of the plan."""
 
@@ -208,7 +225,7 @@ def limited_capture(folder: Path, room_bytes: int) -> None:
 def test_a_full_disk(tmp_path: Path, room_bytes: int) -> None:
     folder = tmp_path / "session"
     process = in_process(limited_capture, folder, room_bytes)
-    process.join(60.0)
+    process.join(HANG_S)
     assert process.exitcode == 0
     assert not list(folder.glob("frames/*.part"))
     capture_small(folder)
@@ -244,7 +261,7 @@ def capture_read_only(folder: Path, place: str) -> None:
 def test_a_folder_made_read_only(tmp_path: Path) -> None:
     folder = tmp_path / "session"
     process = in_process(capture_read_only, folder, "frames")
-    process.join(60.0)
+    process.join(HANG_S)
     assert process.exitcode == 0
     (folder / "frames").chmod(0o700)
     assert 0 < len(list((folder / "frames").iterdir())) < FRAMES

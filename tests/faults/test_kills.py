@@ -9,9 +9,7 @@ import pytest
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, STEPS, capture_and_die, capture_small, in_process
-
-# A process that captures the small session ends long before this.
-_MAX_LIFE_S = 60.0
+from tests.patience import HANG_S
 
 
 def assert_whole(folder: Path, kills: int) -> None:
@@ -34,7 +32,7 @@ def assert_whole(folder: Path, kills: int) -> None:
 def capture_until_killed(folder: Path, step: str, *, after: bool, countdown: int) -> None:
     """Let a process capture until it is killed at a step."""
     process = in_process(capture_and_die, folder, step, after=after, countdown=countdown)
-    process.join(_MAX_LIFE_S)
+    process.join(HANG_S)
     assert process.exitcode == -signal.SIGKILL
 
 
@@ -72,7 +70,6 @@ def test_killed_at_random_instants(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_killed_at_a_hundred_random_instants(tmp_path: Path) -> None:
     assert _random_kills(tmp_path, kills=100, seed=2) == 100
 

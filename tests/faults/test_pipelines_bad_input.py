@@ -1,5 +1,6 @@
 """Bad input: a one-line named error, exit code 1, nothing on standard output, and nothing half-written."""
 
+import os
 import shutil
 import sys
 import tomllib
@@ -14,6 +15,7 @@ import tifffile
 import tomli_w
 
 from faintfield.pipelines.cli import run
+from tests.patience import HANG_S
 
 type Damage = Callable[[Path], object]
 
@@ -84,6 +86,42 @@ DAMAGED: dict[str, tuple[Damage, str, str]] = {
     "truncated view": (_content("view_r2_c1.tiff", lambda b: b[: len(b) // 2]), "UnreadableImage", "view_r2_c1.tiff"),
     "empty view": (_content("view_r2_c1.tiff", lambda b: b""), "UnreadableImage", "view_r2_c1.tiff"),
     "damaged first view": (_content("view_r0_c0.tiff", lambda b: b[:8]), "UnreadableImage", "view_r0_c0.tiff"),
+    "detector larger than any": (
+        _settings(lambda s: s["camera"].update(size_px=[200_000, 200_000])),
+        "BadValue",
+        "size_px is at most 65535 a side and 250 million pixels, got (200000, 200000)",
+    ),
+    "detector larger than the views": (
+        _settings(lambda s: s["camera"].update(size_px=[15_000, 15_000])),
+        "WrongSize",
+        "is 48 x 36 px, the camera 15000 x 15000 px",
+    ),
+    "pose beyond all bounds": (
+        _settings(lambda s: s["view"][7].update(rt_cam_ref=[0.0, 0.0, 0.0, 1e12, 0.0, 0.0])),
+        "BadValue",
+        "view[7] has the pose",
+    ),
+    "node beyond all bounds": (_settings(lambda s: s["view"][7].update(node=[0, 10**12])), "BadValue", "view[7] has"),
+    "exposure beyond all bounds": (_settings(lambda s: s.update(exposure_s=1e9)), "BadValue", "exposure_s = 10000000"),
+    "gain that overflows": (
+        _settings(lambda s: s["noise"].update(gain_dn_per_e=1e-12)),
+        "BadValue",
+        "gain_dn_per_e must lie within [1e-06, 1e+06]",
+    ),
+    "name longer than any": (_settings(lambda s: s["view"][7].update(image="x" * 5000)), "MissingFile", "xxx is named"),
+    "pipe among the views": (
+        lambda folder: ((folder / "view_r2_c1.tiff").unlink(), os.mkfifo(folder / "view_r2_c1.tiff")),
+        "MissingFile",
+        "view_r2_c1.tiff is named",
+    ),
+    "truth that leads outside": (
+        _content(
+            "truth.json",
+            lambda b: b.replace(b': "noise_free"', b': "../../else"'),
+        ),
+        "BadValue",
+        "leaves the folder",
+    ),
     "damaged truth": (_content("truth.json", lambda b: b[:50]), "BadValue", "truth.json"),
     "truncated noise reference": (_content("noise_reference.tiff", lambda b: b[:99]), "UnreadableImage", "noise_ref"),
 }
@@ -94,6 +132,7 @@ ONLY_RECONSTRUCTED = {
     "blind pixels",
     "lens that folds the image",
     "damaged truth",
+    "truth that leads outside",
     "truncated noise reference",
 }
 
@@ -159,7 +198,7 @@ def test_decoders_add_no_words_of_their_own(name: str, whole_set: Path, tmp_path
     (folder / name).write_bytes(content)
     words = ["reconstruct", str(folder), "--out", str(tmp_path / "out"), "--depth-mm", "500"]
     code = f"from faintfield.pipelines.cli import main; main({words!r})"
-    ended = run_process([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=False)
+    ended = run_process([sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG_S, check=False)
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.startswith("faintfield: UnreadableImage: ")
     assert len(ended.stderr.splitlines()) == 1

@@ -16,12 +16,12 @@ from faintfield.pipelines.formats.files import UNFINISHED
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.pipelines.formats.sets.elemental_set import load_set
+from tests.patience import HANG_S
 
 # A test may run in the background, where interrupts are ignored and stay so in children
 _LAUNCH = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {before}; " + (
     "from faintfield.pipelines.cli import main; main({words!r})"
 )
-_DEADLINE_S = 60.0
 
 # Permissions do not apply to root unless it gives up its capabilities (Linux: capset of version 3, none of them)
 _WITHOUT_PRIVILEGES = (
@@ -39,7 +39,7 @@ def _python(words: Sequence[object], before: str = "pass") -> list[str]:
 
 def _finished(words: Sequence[object], before: str = "pass") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        _python(words, before), capture_output=True, text=True, timeout=_DEADLINE_S, check=False, cwd=_root()
+        _python(words, before), capture_output=True, text=True, timeout=HANG_S, check=False, cwd=_root()
     )
 
 
@@ -61,7 +61,7 @@ def _started(words: Sequence[object]) -> Iterator[subprocess.Popen[str]]:
 
 def _wait_until(process: subprocess.Popen[str], condition: Callable[[], bool]) -> None:
     """Return as soon as a condition holds, or the process has ended."""
-    deadline = time.monotonic() + _DEADLINE_S
+    deadline = time.monotonic() + HANG_S
     while process.poll() is None and not condition():
         assert time.monotonic() < deadline, "the process never came so far"
         time.sleep(0.002)
@@ -88,7 +88,7 @@ def test_ctrl_c_in_the_middle_of_a_simulation_leaves_nothing(tmp_path: Path) -> 
     with _started(["simulate", tmp_path / "set", *SLOW]) as process:
         _wait_until(process, lambda: any(tmp_path.glob(".set.*")))
         process.send_signal(signal.SIGINT)
-        said, complaint = process.communicate(timeout=_DEADLINE_S)
+        said, complaint = process.communicate(timeout=HANG_S)
     assert (process.returncode, said) == (1, "")
     assert complaint.startswith("faintfield: Interrupted: ")
     assert len(complaint.splitlines()) == 1
@@ -100,7 +100,7 @@ def test_ctrl_c_in_the_middle_of_a_reconstruction_keeps_what_was_finished(small_
     with _started(["reconstruct", small_set, "--out", out, "--sweep-mm", "400:900:500"]) as process:
         _wait_until(process, lambda: (out / "plane_00401.0.tiff").exists())
         process.send_signal(signal.SIGINT)
-        said, complaint = process.communicate(timeout=_DEADLINE_S)
+        said, complaint = process.communicate(timeout=HANG_S)
     assert (process.returncode, said) == (1, "")
     assert complaint.startswith("faintfield: Interrupted: ")
     assert len(complaint.splitlines()) == 1
@@ -119,7 +119,7 @@ def test_a_simulation_that_is_killed_leaves_no_set_that_looks_whole(reached: str
     with _started(["simulate", out, *SLOW]) as process:
         _wait_until(process, lambda: any(tmp_path.glob(f".set.*/{reached}")))
         process.kill()
-        process.communicate(timeout=_DEADLINE_S)
+        process.communicate(timeout=HANG_S)
     # Killed late, it may have put the set in place: then it must be whole
     assert not out.exists() or _is_whole(out)
     assert reached == "truth.json" or not out.exists()
@@ -134,7 +134,7 @@ def test_a_set_that_is_being_replaced_stays_until_the_new_one_is_whole(
     with _started(["simulate", out, *SLOW, "--overwrite"]) as process:
         _wait_until(process, lambda: any(tmp_path.glob(f".set.*/{reached}")))
         process.kill()
-        process.communicate(timeout=_DEADLINE_S)
+        process.communicate(timeout=HANG_S)
     assert not out.exists() or _is_whole(out)
     if reached != "truth.json":
         assert _files(out) == before

@@ -1,4 +1,4 @@
-"""One place reads each kind of file: all that can go wrong is one named failure with the path, whatever it holds."""
+"""Whatever a file holds, it is read or refused by a named failure; what is larger than expected is never decoded."""
 
 import errno
 import fcntl
@@ -64,6 +64,7 @@ def test_a_pipe_is_refused_at_once(read: Callable[[Path], object], tmp_path: Pat
         ("format = '1'", "format = '1'|format: "),
         ("#" * 8_000_001, "at most 8000000 are read"),
     ],
+    ids=range(8),
 )
 def test_toml_that_no_one_writes_is_refused(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(content)
@@ -112,24 +113,23 @@ def _read_map(path: Path) -> dict[str, Any]:
         (_npz(_header((3, -4))), "are no numbers"),
         (_npz(_header((3, 4)), bytes(47)), "does not have the 48 bytes"),
         (_npz(_header((3, 4)), bytes(49)), "does not have the 48 bytes"),
-        (_npz(_header((3, 4)), bytes(500_000_000), compression=zipfile.ZIP_DEFLATED), "does not have the 48 bytes"),
+        (_npz(_header((3, 4)), bytes(20_000_000), compression=zipfile.ZIP_DEFLATED), "does not have the 48 bytes"),
         (_npz(_header((3, 4)), bytes(48), compression=zipfile.ZIP_LZMA), "compressed by method 14"),
-        (_npz(b"(" * 200, bytes(48)), "cannot be read"),
-        (_npz(b"{'descr': [[", bytes(48)), "cannot be read"),
+        (_npz(b"(" * 200, bytes(48)), ""),
+        (_npz(b"{'descr': [[", bytes(48)), ""),
         (bytes(1_100_000), "holds 1100000 bytes"),
     ],
+    ids=range(10),
 )
 def test_arrays_that_are_not_what_they_state_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "maps.npz").write_bytes(content)
-    with pytest.raises(BadValue, match=rf"maps\.npz: cannot be read \(.*{words}|cannot be read .*; make it again"):
+    with pytest.raises(BadValue, match=rf"maps\.npz: cannot be read \(.*{words}.*; make it again"):
         _read_map(tmp_path / "maps.npz")
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_arrays_are_read_as_they_were_written(
-    save: Callable[..., None], order: Literal["C", "F"], tmp_path: Path
-) -> None:
+def test_arrays_are_read_as_written(save: Callable[..., None], order: Literal["C", "F"], tmp_path: Path) -> None:
     written = np.array(np.random.default_rng(20110919).normal(size=(3, 4)), order=order)
     save(tmp_path / "maps.npz", map=written, unread=np.zeros(3))
     found = _read_map(tmp_path / "maps.npz")

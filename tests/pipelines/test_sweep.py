@@ -203,10 +203,11 @@ def test_a_colour_that_was_altered_before_the_others_came_is_made_again(tmp_path
     assert files.missing() == ["green", "blue"]
 
 
-def test_a_colour_of_another_size_than_its_record_says_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shape", [(1_000_000, 1_000_000), (0, 0), (5, 4)])
+def test_a_colour_of_another_size_than_its_record_says_is_refused(shape: tuple[int, int], tmp_path: Path) -> None:
     files, record = _files_of_a_colour_plane(tmp_path)
     for colour in files.channels:
-        said = structs.replace(record, channel=colour, shape=(1_000_000, 1_000_000))
+        said = structs.replace(record, channel=colour, shape=(4, 5) if colour == "red" else shape)
         files.save_part(colour, {"plane": np.ones((4, 5))}, said, None)
-    with pytest.raises(BadValue, match=r"holds 80 bytes, and its record names 4000000000000; remove the folder .parts"):
+    with pytest.raises(BadValue, match=r"holds 80 bytes, .* remove the folder .parts and reconstruct again"):
         files.finish(1.0)

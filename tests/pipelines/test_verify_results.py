@@ -16,6 +16,7 @@ from faintfield.pipelines.errors import BadValue, ResultDamaged
 from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds, with_digest
 from faintfield.pipelines.formats.results.result_files import results_below
 from faintfield.pipelines.formats.results.verification import records_of, verify_results
+from tests.pipelines.by_hand import write_by_hand
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -119,6 +120,7 @@ DAMAGES: dict[str, Callable[[dict[str, Any]], Any]] = {
     "no planes": lambda it: it.pop("planes"),
     "no colours": lambda it: it.update(planes=[], focus=[]),
     "planes of a wrong type": lambda it: it.update(planes={"a": 1}),
+    "no file": lambda it: it.update(sha256={}),
     "a device among the files": lambda it: it.update(sha256={"/dev/zero": "0" * 64}),
     "a device by a wrong digest": lambda it: it.update(sha256={"/dev/zero": "0"}),
     "a file elsewhere": lambda it: it["planes"][0].update(file="../plane_00500.0.tiff"),
@@ -180,9 +182,8 @@ class TestReading:
     def test_a_name_that_leads_elsewhere_is_refused(self, name: str, key: str, planes: Path) -> None:
         path = planes / "reconstruction.json"
         content = json.loads(path.read_bytes())
-        del content[DIGEST_KEY]
         content["planes"][0][key] = name
-        path.write_text(json.dumps(content))
+        write_by_hand(path, content)
         with pytest.raises(BadValue, match="is not a result that can be shown"):
             results_below(planes)
 
@@ -207,9 +208,7 @@ class TestReading:
 
     def test_a_record_without_a_digest_is_shown(self, planes: Path, done: Command) -> None:
         for path in planes.glob("*.json"):
-            content = json.loads(path.read_bytes())
-            content.pop(DIGEST_KEY, None)
-            path.write_text(json.dumps(content, indent=2))
+            write_by_hand(path, json.loads(path.read_bytes()))
         done("report", planes)
         said = done("verify", planes).stderr
         assert "not checked: " in said
@@ -252,8 +251,17 @@ class TestVerify:
         del content[DIGEST_KEY]
         path.write_bytes(with_digest(json.dumps(content).encode()))
         assert _problems(planes) == (f"{planes / 'reconstruction.json'}: does not say what plane_00500.0.json says",)
+        _altered(planes / "reconstruction.json", ("planes", 0, "flux_e"), lambda it: it + 2)
+        content = json.loads((planes / "reconstruction.json").read_bytes())
+        write_by_hand(planes / "reconstruction.json", content)
+        assert _problems(planes) == (f"{planes / 'reconstruction.json'}: does not say what plane_00500.0.json says",)
+
+    def test_a_record_that_is_gone_or_lost_its_digest_is_missed(self, planes: Path) -> None:
+        path = planes / "plane_00500.0.json"
+        write_by_hand(path, json.loads(path.read_bytes()))
+        assert any("plane_00500.0.json, which it repeats, is missing" in problem for problem in _problems(planes))
         path.unlink()
-        assert _problems(planes) == (f"{planes / 'reconstruction.json'}: plane_00500.0.json is missing or damaged",)
+        assert any("plane_00500.0.json, which it repeats, is missing" in problem for problem in _problems(planes))
 
     def test_inputs_are_compared_where_they_are(self, planes: Path, faintfield: Command, tmp_path: Path) -> None:
         view = planes.with_name("scene") / "view_r0_c0.tiff"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
@@ -65,6 +65,28 @@ def test_the_weight_is_nearly_as_good_as_the_best_for_the_truth(seed: int) -> No
     assert min(scores) < chosen.weight < max(scores)
     assert min(scores.values()) < min(scores[min(scores)], scores[max(scores)])
     assert chosen.passes < 60 * 7  # seven folds, because these views have few pixels
+
+
+def test_candidates_weigh_the_penalty_by_the_root_of_the_share_of_views_that_they_learn_from() -> None:
+    """Two halves without noise: under a penalty each level moves by (length of the edge)/(weight of the half).
+
+    Two of four views are held out at a time, so a weight β for four views is β/√2 for two.
+    """
+    rows, left, right, variance_e2, views = 16, 5, 15, 4.0, 4
+    truth = np.repeat([2.0, 8.0], [left, right]) * np.ones((rows, 1))
+    rays = np.stack(np.meshgrid(np.arange(float(left + right)), np.arange(float(rows))), axis=-1)
+    operator = PlaneOperator(np.stack([np.eye(3)] * views), rays, PlaneGrid(truth.shape, 1.0, (0.0, 0.0)))
+    images = ElementalImages(
+        np.stack([truth.astype(np.float32)] * views), 0.0, 1.0, likelihood=PixelLikelihood("least-squares", level_e=3.0)
+    )
+    guess = 4.0
+    chosen = cross_validated_weight(SceneProblem(operator, images), guess, Penalty())
+    large = {weight: loss for weight, loss in chosen.candidates.items() if weight >= guess}
+    assert len(large) >= 2
+    for weight, loss in large.items():
+        trained = weight / np.sqrt(2)
+        moved = np.repeat([trained / left, trained / right], [left, right]) * variance_e2 / 2
+        assert loss == pytest.approx(views * rows * np.sum(moved**2) / (2 * variance_e2), rel=0.2)
 
 
 def test_too_few_views_are_refused() -> None:

@@ -130,3 +130,17 @@ def test_binned_images_are_sums_and_valid_where_all_their_pixels_are() -> None:
     assert found.read_variance_e2 == 12.0
     assert found.valid is not None
     assert np.argwhere(~found.valid).tolist() == [[1, 1, 2]]
+
+
+def test_a_depth_that_few_views_see_does_not_win_because_these_agree_by_chance() -> None:
+    """Of 20 views 3 see the second plane, and agree there perfectly; all see the others, and agree at the fourth."""
+    shape, depths_mm = (24, 24), np.array([400.0, 450.0, 500.0, 550.0, 600.0])
+    seen_by, reduced = [20, 3, 20, 20, 20], [3.0, 0.0, 3.0, 1.0, 3.0]
+    planes = [
+        Agreement(
+            np.full(shape, (views - 1) * squares), np.full(shape, float(views)), np.full(shape, 50.0), np.ones(shape)
+        )
+        for views, squares in zip(seen_by, reduced, strict=True)
+    ]
+    found = depth_map(planes, depths_mm)
+    np.testing.assert_allclose(found.index, 3.0, atol=0.5)

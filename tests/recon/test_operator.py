@@ -123,6 +123,13 @@ def test_a_pixel_beside_the_plane_sees_its_edge_only_within_the_tolerance(oversh
     assert edge == (1.0 if abs(overshoot) < 1 else 0.0)
 
 
+@pytest.mark.parametrize("beyond", [0.005, 0.02, 0.3])
+def test_a_point_a_visible_distance_outside_the_samples_is_not_seen_on_any_side(beyond: float) -> None:
+    columns, rows = [-beyond, 20.0, 49 + beyond], [-beyond, 1.0, 3 + beyond]
+    seen = looking_at(columns, rows).forward(np.ones((4, 50)))[0]
+    np.testing.assert_array_equal(seen, [[0, 0, 0], [0, 1, 0], [0, 0, 0]])
+
+
 @pytest.mark.parametrize("depth_mm", [500.0, 613.3, 700.0])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_plane_that_overlays_a_view_is_seen_up_to_its_border_whatever_the_rounding(

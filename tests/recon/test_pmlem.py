@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from faintfield.recon.errors import NotConverged
-from faintfield.recon.likelihood.images import Image, LikelihoodName
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import smooth_start
-from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.pmlem import PmlemIterate, norm, pmlem
+from faintfield.recon.solver.proximal import DualField
 from tests.recon.small_problems import (
     SHAPE,
     DenseProblem,
@@ -102,6 +103,48 @@ def test_no_plane_is_further_from_the_optimum_than_its_certificate_says(likeliho
         assert iterate.certificate.distance <= tolerance
 
 
+def halves(light_e: float, contrast_e: float) -> Image:
+    """Two rows of two samples: the left column is darker than the right one."""
+    return np.array([[light_e - contrast_e, light_e + contrast_e]] * 2)
+
+
+@pytest.mark.parametrize("from_tension", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("contrast_e", [0.1, 1.0])
+def test_the_certificate_is_the_distance_where_the_likelihood_is_curved_half_as_much_as_its_metric(
+    contrast_e: float, from_tension: float
+) -> None:
+    """Pixels on the samples and a quarter from them see a contrast with half the curvature that they see light with.
+
+    The penalty is just large enough for a level optimum. A plane with some contrast, and a dual field between the one
+    that gives this plane and that of the optimum, are as far away as convexity allows.
+    """
+    light_e, true_contrast_e, variance_e2 = 20.0, 2.0, 4.0
+    columns = np.array([[0.0, 1.0], [0.25, 0.75]])
+    rays = np.stack([np.stack(np.meshgrid(of_lattice, [0.0, 1.0]), axis=-1) for of_lattice in columns])
+    grid, lattices = PlaneGrid((2, 2), 1.0, (0.0, 0.0)), np.array([0, 1, 1])
+    operator = PlaneOperator(np.stack([np.eye(3)] * 3), rays, grid, lattice_of_view=lattices, dtype=np.float64)
+    seen = halves(light_e, true_contrast_e) @ np.array([[[1, 0], [0, 1]], *[[[0.75, 0.25], [0.25, 0.75]]] * 2])
+    likelihood = PixelLikelihood("least-squares", level_e=3.0)
+    fit = DataFit(operator, ElementalImages(seen, 0.0, variance_e2 - 3.0, likelihood=likelihood), 3.0)
+    metric = np.full((2, 2), 3 / variance_e2)
+    np.testing.assert_allclose(fit.metric(halves(light_e, contrast_e)), metric, rtol=1e-12)
+
+    def objective(plane: Image) -> float:
+        return fit.value_and_gradient(plane)[0] + weight * float(np.hypot(*differences(plane)).sum())
+
+    weight = 0.5 * 3 / variance_e2 * true_contrast_e
+    best = halves(light_e, 0.0)
+    generator = np.random.default_rng(1)
+    assert all(objective(best) <= objective(best + generator.normal(0, 1e-3, (2, 2))) for _ in range(1000))
+
+    tension = 1 - (1 - from_tension) * contrast_e / true_contrast_e
+    dual = DualField([np.array([np.zeros((2, 2)), [[tension, 0.0]] * 2])])
+    found = next(pmlem(fit, halves(light_e, contrast_e), penalty_weight=weight, dual=dual))
+    far = norm(found.plane - best, metric) / norm(found.plane, metric)
+    assert far <= found.certificate.distance * (1 + 1e-9)
+    assert found.certificate.distance == pytest.approx(far, rel=1e-9)
+
+
 @pytest.mark.parametrize(
     ("background_e", "variance_e2", "low", "high", "reached"),
     [
@@ -126,6 +169,19 @@ def test_the_objective_never_rises(
         assert after.objective <= before.objective + 1e-6 * abs(before.objective)
     assert iterates[-1].certificate.distance < reached
     assert (iterates[-1].plane >= 0).all()
+
+
+@pytest.mark.parametrize("response", [1.0, 0.3])
+def test_the_metric_of_even_light_is_the_row_sums_of_the_hessian_under_any_response(response: float) -> None:
+    """Σ over pixels of (response)²/(response · light + b + σ²), which an even plane lets one count by hand."""
+    posed, light_e = problem(), 4.0
+    grid, flat = PlaneGrid(SHAPE, 1.0, (0.0, 0.0)), np.full(posed.rays.shape[:2], response)
+    operator = PlaneOperator(posed.homographies, posed.rays, grid, flat=flat, dtype=np.float64)
+    fit = DataFit(operator, posed.images, light_e)
+    counted = posed.matrix[posed.counted()].sum(axis=0).reshape(SHAPE)
+    known_e2 = float(posed.images.background_e) + float(posed.images.read_variance_e2)
+    expected = counted * response**2 / (response * light_e + known_e2)
+    np.testing.assert_allclose(fit.metric(np.full(SHAPE, light_e)), expected, rtol=1e-9)
 
 
 def test_a_metric_that_is_too_small_is_made_larger_until_the_objective_falls() -> None:

@@ -1,7 +1,7 @@
 """A plane as files: TIFFs, a preview and the record that vouches for them; its colours, until all are there."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,7 @@ class PlaneFiles:
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
         record = read_current(self.path.with_suffix(".json"), PlaneFileRecord, self.origin)
-        return record if record is not None and self._is_of(record.planes, record.focus) else None
+        return record if record is not None and self._is_of(record) else None
 
     def missing(self) -> list[str]:
         """Return the colours that are still to be reconstructed."""
@@ -130,7 +130,7 @@ class PlaneFiles:
         """
         paths = [self._part(channel) for channel in self.channels]
         entries = [read_json(path.with_suffix(".json"), _Part, what=_A_COLOUR, remedy=_ANEW) for path in paths]
-        parts = [_arrays(*pair) for pair in zip(paths, entries, strict=True)]
+        parts = [_arrays(path, entry, entries[0].record.shape) for path, entry in zip(paths, entries, strict=True)]
         plane = _joined(parts, "plane")
         write_plane(self.path, plane, pitch_mm)
         preview = self.path.with_suffix(".png")
@@ -172,11 +172,12 @@ class PlaneFiles:
         part = read_current(path.with_suffix(".json"), _Part, self.origin)
         return part is not None and list(part.sha256) == [path.name] and part.record.channel == channel
 
-    def _is_of(self, planes: Sequence[PlaneRecord], focus: Sequence[FocusPoint | None]) -> bool:
-        """Return whether a record has an entry for each colour of this plane, and no other."""
-        stated = [(plane.method, plane.channel, plane.file) for plane in planes]
+    def _is_of(self, record: PlaneFileRecord) -> bool:
+        """Return whether a record has an entry for each colour of this plane, and vouches for the files of each."""
+        stated = [(plane.method, plane.channel, plane.file) for plane in record.planes]
         expected = [(self.method, channel, self.path.name) for channel in self.channels]
-        return stated == expected and len(focus) == len(expected)
+        named = {name for plane in record.planes for name in plane.files}
+        return stated == expected and len(record.focus) == len(expected) and named <= record.sha256.keys()
 
 
 def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, _Part)](
@@ -206,13 +207,14 @@ def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, _Part)](
     return None
 
 
-def _arrays(path: Path, part: _Part) -> dict[str, NDArray[np.float32]]:
-    """Return the arrays (row, column) of one colour by name."""
-    shape = (len(part.arrays), *part.record.shape)
-    found, needed = path.stat().st_size, math.prod(shape) * _STORED.itemsize
-    if found != needed or "plane" not in part.arrays:
-        raise BadValue(f"{path}: holds {found} bytes, and its record names {needed}; {_ANEW}")
-    arrays = np.frombuffer(read_content(path, needed), _STORED).reshape(shape)
+def _arrays(path: Path, part: _Part, shape: tuple[int, int]) -> dict[str, NDArray[np.float32]]:
+    """Return the arrays of one colour by name, all of one shape (row, column)."""
+    found, needed = path.stat().st_size, len(part.arrays) * math.prod(shape) * _STORED.itemsize
+    if found != needed or not needed or part.record.shape != shape or "plane" not in part.arrays:
+        raise BadValue(
+            f"{path}: holds {found} bytes, for {part.arrays} of {part.record.shape} instead of {shape} samples; {_ANEW}"
+        )
+    arrays = np.frombuffer(read_content(path, needed), _STORED).reshape(-1, *shape)
     return dict(zip(part.arrays, arrays, strict=True))
 
 

@@ -3,7 +3,7 @@
 Nothing is changed. Inputs are compared where they are found; a verdict says which were not.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -142,12 +142,13 @@ def verify_results(
     work.compare_records()
     if find_inputs is not None:
         work.look_for_inputs(find_inputs)
-    inputs = sum(one.is_input for one in work.named)
-    for one, path in zip(work.named, progress([one.folder / one.name for one in work.named]), strict=True):
+    named = work.named
+    for one, path in zip(named, progress([one.folder / one.name for one in named]), strict=True):
         work.compare(one, path, hashed)
+    inputs = sum(one.is_input for one in named)
     return ResultVerdict(
         records=len(work.content),
-        files=len(work.named) - inputs,
+        files=len(named) - inputs,
         inputs=inputs,
         problems=tuple(work.problems),
         unchecked=tuple(work.unchecked),
@@ -159,7 +160,7 @@ class _Verification:
 
     def __init__(self) -> None:
         self.content: dict[Path, Struct] = {}
-        self.named: list[_Named] = []
+        self._named: dict[tuple[Path, str], _Named] = {}  # each file is compared once, though many records name it
         self.problems: list[str] = []
         self.unchecked: list[str] = []
         self._vouching: set[Path] = set()
@@ -182,36 +183,51 @@ class _Verification:
             self.unchecked.append(f"{path}: has no digest: an earlier version wrote it, or a person")
         else:
             self.problems.append(f"{path}: was altered after it was written")
-        self.named += [_Named(path, path.parent, name, known, is_input=False) for name, known in _beside(record)]
+        beside = _beside(record)
+        self._name(path, path.parent, beside, is_input=False)
+        self.problems += [f"{path}: has no SHA-256 of {name}" for name in _named_by(record) if name not in beside]
 
     def compare_records(self) -> None:
         """Compare each reconstruction.json with the records of its planes and of its depth map, which it repeats."""
         for path, record in self.content.items():
             if isinstance(record, ReconstructionRecord):
-                faults = [f"{path}: {fault}" for fault in self._disagreements(path, record)]
-                (self.problems if path in self._vouching else self.unchecked).extend(faults)
+                for name, part in _repeated(record).items():
+                    self._compare_part(path, path.with_name(name), part)
 
-    def _disagreements(self, path: Path, record: ReconstructionRecord) -> Iterator[str]:
-        """Yield in words where a reconstruction.json is not what the records beside it say."""
-        for name, part in _repeated(record).items():
-            own = path.with_name(name)
-            if own not in self.content:
-                yield f"{name} is missing or damaged"
-            elif own not in self._vouching:
-                yield f"{name} does not vouch for what it repeats"
-            elif msgspec.json.encode(_own_part(self.content[own])) != msgspec.json.encode(part):
-                yield f"does not say what {name} says"
+    def _compare_part(self, path: Path, own: Path, part: object) -> None:
+        """Compare a part of a reconstruction.json with the record that holds it, too."""
+        if own in self.content and msgspec.json.encode(_own_part(self.content[own])) != msgspec.json.encode(part):
+            self.problems.append(f"{path}: does not say what {own.name} says")
+        elif path in self._vouching and own not in self._vouching:
+            self.problems.append(f"{path}: {own.name}, which it repeats, is missing, damaged, or has no digest")
+        elif own not in self.content:
+            self.unchecked.append(f"{path}: {own.name}, which it repeats, is missing or damaged")
 
     def look_for_inputs(self, find: FindInputs) -> None:
         """Note the inputs of every record that are found, and name the others."""
+        folders: dict[tuple[object, ...], Path | None] = {}
         for path, record in self.content.items():
-            inputs = _inputs_of(record)
-            folder = find(path, inputs) if inputs else None
+            if not (inputs := _inputs_of(record)):
+                continue
+            key = (path.parent, *next(iter(inputs.items())))
+            if key not in folders:
+                folders[key] = find(path, inputs)
+            folder = folders[key]
             there = {name: known for name, known in inputs.items() if folder and _exists(folder / name)}
-            self.named += [_Named(path, folder, *it, is_input=True) for it in there.items() if folder]
+            if folder:
+                self._name(path, folder, there, is_input=True)
             if absent := [name for name in inputs if name not in there]:
                 more = f" and {len(absent) - 1} other inputs" if len(absent) > 1 else ""
                 self.unchecked.append(f"{path}: {absent[0]}{more} not found; name their folder by --inputs")
+
+    def _name(self, record: Path, folder: Path, sha256_by_name: Mapping[str, str], *, is_input: bool) -> None:
+        for name, known in sha256_by_name.items():
+            self._named.setdefault((folder / name, known), _Named(record, folder, name, known, is_input))
+
+    @property
+    def named(self) -> list[_Named]:
+        """All files that are to be compared."""
+        return list(self._named.values())
 
     def compare(self, one: _Named, path: Path, hashed: Callable[[Path], str]) -> None:
         """Compare one file with the SHA-256 by which a record names it."""
@@ -258,15 +274,26 @@ def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
     return next((kinds for pattern, kinds in _KINDS.items() if fnmatchcase(path.name, pattern)), ())
 
 
-def _beside(record: Struct) -> Iterable[tuple[str, str]]:
-    """Return the name and the SHA-256 of each file beside a record for which it vouches."""
+def _beside(record: Struct) -> Mapping[str, str]:
+    """Return the SHA-256 of each file beside a record for which it vouches, by name."""
     match record:
         case PlaneFileRecord() | DepthMapFileRecord():
-            return record.sha256.items()
+            return record.sha256
         case GeometryRecord():
-            return (record.sha256 or {}).items()
+            return record.sha256 or {}
         case NoiseRecord() if record.maps_sha256:
-            return [(record.maps, record.maps_sha256)]
+            return {record.maps: record.maps_sha256}
+        case _:
+            return {}
+
+
+def _named_by(record: Struct) -> list[str]:
+    """Return the names of the files for which a record of a plane or a depth map has to vouch."""
+    match record:
+        case PlaneFileRecord():
+            return [name for plane in record.planes for name in plane.files]
+        case DepthMapFileRecord():
+            return record.depth_map.files
         case _:
             return []
 

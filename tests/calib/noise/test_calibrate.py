@@ -275,3 +275,72 @@ def test_histograms_follow_the_fitted_mass_function() -> None:
             share = histogram.count[common] / histogram.expected[common]
             assert np.abs(share - 1).max() < 0.25
             assert histogram.count.sum() == pytest.approx(histogram.expected.sum(), rel=0.01)
+
+
+def test_a_black_level_that_moves_from_series_to_series_is_no_pixels_offset() -> None:
+    """The same frames with levels off the straight line: the map must keep the pixels' differences from its mean."""
+    chip, rng = specimen(20, dsnu_e=0.5)
+    moved_dn = {0.1: 12, 1.0: 0, 10.0: 14, 60.0: 4}
+    series = take(chip, rng)
+    moved = [replace(s, levels_dn=s.levels_dn + moved_dn[s.conditions.exposure_s]) for s in series]
+    still, jittery = calibrate(series), calibrate(moved)
+    here, there = (one.maps.offset_dn - value(one, "offset_dn") for one in (jittery, still))
+    np.testing.assert_allclose(here, there, atol=0.05)
+    error_dn = jittery.maps.offset_dn - value(jittery, "offset_dn") - (chip.offset_dn - chip.sensor.offset_dn)
+    assert abs(error_dn.mean()) < 0.1
+
+
+def test_rounding_to_whole_numbers_is_part_of_the_noise_of_flats() -> None:
+    """At a tenth of a DN per electron rounding is a fifth of a dim flat's variance, and none of the gain."""
+    chip, rng = specimen(21, shape=(128, 128), gain_dn_per_e=0.1, read_noise_e=5.0, dark_current_e_per_s=0.02)
+    flats = [light(chip, rng, photons, 8, level) for level, photons in enumerate((20.0, 30.0, 40.0))]
+    result = calibrate([*take(chip, rng, (0.1, 1.0)), *flats])
+    assert value(result, "gain_dn_per_e") == pytest.approx(0.1, rel=0.05)
+    for point in result.points[2:]:
+        assert point.variance_dn2 == pytest.approx(0.25 + 1 / 12 + 0.1 * (point.mean_dn - 100.0), rel=0.02)
+        assert point.model_variance_dn2 == pytest.approx(point.variance_dn2, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [21, 22, 24])
+def test_a_dark_current_of_zero_has_an_error_also_where_single_values_are_fitted(seed: int) -> None:
+    chip, rng = specimen(seed, gain_dn_per_e=0.1, read_noise_e=4.5, dark_current_e_per_s=0.0)
+    flats = [light(chip, rng, photons, 8, level) for level, photons in enumerate((20.0, 40.0))]
+    result = calibrate([*take(chip, rng, (0.1, 1.0)), *flats])
+    assert result.likelihood is NoiseLikelihood.EXACT
+    # The level of ten frames of 4096 pixels, of read noise and rounding, at two exposures 0.9 s apart
+    expected_se = np.sqrt(2 * (4.5**2 + 100 / 12) / (10 * 64 * 64)) / 0.9
+    current = result.estimates["dark_current_e_per_s"]
+    assert current.se == pytest.approx(expected_se, rel=0.2)
+    assert current.value is not None
+    assert abs(current.value) < 3 * expected_se
+
+
+def test_electrons_of_the_dark_are_no_electrons_of_the_light() -> None:
+    """Flats of 10 s, in which a third of the charge is dark current, give the quantum efficiency of the sensor."""
+    chip, rng = specimen(26, dark_current_e_per_s=100.0)
+    series = take(chip, rng, (0.1, 10.0))
+    for level, photons in enumerate((4000.0, 8000.0)):
+        frames: Frames = [(f"flat_{level}_{k}", expose(chip, 10.0, rng, photons)) for k in range(8)]
+        series.append(measure_series(frames, Conditions("flat", 10.0, level, photons)))
+    assert value(calibrate(series), "quantum_efficiency") == pytest.approx(0.5, rel=0.05)
+
+
+def test_the_error_of_row_noise_is_that_of_as_many_rows_as_there_are() -> None:
+    """The variance of R rows in n frames has 2/(R (n − 1)) of relative variance, four series add their freedom."""
+    banding_dn, rows, frames, exposures = 2.0, 64, 10, len(EXPOSURES_S)
+    result = calibrate(take(*specimen(27, banding_dn=banding_dn), frames=frames))
+    row_noise = result.estimates["row_noise_dn"]
+    assert row_noise.value == pytest.approx(banding_dn, rel=0.15)
+    expected_se = banding_dn * np.sqrt(2 / (rows * (frames - 1) * exposures)) / 2
+    assert row_noise.se == pytest.approx(expected_se, rel=0.25)
+
+
+def test_uneven_dark_current_in_long_flats_is_no_response_to_light() -> None:
+    """A third of the charge is dark current, which differs by a fifth between pixels; all respond alike."""
+    chip, rng = specimen(29, dark_current_e_per_s=100.0, dcnu=0.2)
+    series = take(chip, rng, (0.1, 10.0))
+    frames: Frames = [(f"flat_{k}", expose(chip, 10.0, rng, 4000.0)) for k in range(8)]
+    result = calibrate([*series, measure_series(frames, Conditions("flat", 10.0))])
+    response = result.maps.relative_response
+    assert response is not None
+    assert response[~result.maps.unusable].std() < 0.02

@@ -38,6 +38,16 @@ def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
     assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
 
 
+@pytest.mark.parametrize(("slight_px", "ends_s"), [(0.6, 1.2), (0.3, 1.2), (0.05, 0.4)])
+def test_the_rig_swings_as_long_as_the_picture_is_off_by_more_than_the_limit(slight_px: float, ends_s: float) -> None:
+    """A large shift until 0.4 s and a slight one until 1.2 s; the limit is 0.1 px."""
+    clock = SimulatedClock()
+    expose = shifting(lambda now_s: 2.0 if now_s < 0.4 else slight_px if now_s < 1.2 else 0.0, clock, light=2e5)
+    found = measure_settling(expose, clock, SettleSettings(exposure_s=0.05, limit_px=0.1))
+    assert found.settled
+    assert ends_s <= found.wait_s <= ends_s + 0.2
+
+
 @pytest.mark.parametrize(
     ("shift_px", "light"),
     [(lambda now_s: 0.5 * np.sin(9.0 * now_s), 2e4), (lambda now_s: 0.0, 0.0)],

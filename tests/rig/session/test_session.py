@@ -23,6 +23,7 @@ from faintfield.rig.session.resume import check_same_rig, open_session
 from faintfield.rig.session.session import FrozenPlan, read_plan
 from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
+from tests.patience import HANG_S
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +130,7 @@ def test_verify_reads_a_write_protected_session(session: Path) -> None:
     for path in (*session.rglob("*"), session):
         path.chmod(0o500 if path.is_dir() else 0o400)
     process = in_process(verify_without_rights, session)
-    process.join(60.0)
+    process.join(HANG_S)
     assert process.exitcode == 0
 
 
@@ -155,7 +156,7 @@ def test_a_second_capture_is_refused(unsealed: Path) -> None:
     with open_session(unsealed, None):
         for _ in range(2):
             process = in_process(refused, unsealed)
-            process.join(60.0)
+            process.join(HANG_S)
             assert process.exitcode == 0
         with pytest.raises(SessionBusy, match=f"process {os.getpid()}"):
             verify(unsealed)

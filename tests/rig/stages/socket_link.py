@@ -3,9 +3,7 @@
 import socket
 
 from faintfield.rig.stages.transport import Port, SerialPort
-
-# Timeout of socket operations in s of real time; only a defect reaches it.
-_SOCKET_TIMEOUT_S = 10.0
+from tests.patience import HANG_S
 
 
 class SocketLink:
@@ -29,7 +27,7 @@ class SocketLink:
         if self._listener is not None:
             self._hang_up()
             self._far, _ = self._listener.accept()
-            self._far.settimeout(_SOCKET_TIMEOUT_S)
+            self._far.settimeout(HANG_S)
             self._far.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return port
 
@@ -49,7 +47,7 @@ class SocketLink:
         """Plug the cable in."""
         if self._listener is None:
             self._listener = socket.create_server(self._address, reuse_port=True)
-            self._listener.settimeout(_SOCKET_TIMEOUT_S)
+            self._listener.settimeout(HANG_S)
             self._address = self._listener.getsockname()[:2]
 
     def unplug(self) -> None:

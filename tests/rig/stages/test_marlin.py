@@ -5,9 +5,10 @@ from functools import partial
 
 import pytest
 
-from faintfield.rig.errors import NotHomed, StageAlarm, StageLost, StageTimeout, WrongFirmware
+from faintfield.rig.errors import NotHomed, StageAlarm, StageLost, StageRejected, StageTimeout, WrongFirmware
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
+from faintfield.rig.stages.marlin.controller import MarlinController
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
 from tests.rig.stages.benches import homed
 
@@ -198,3 +199,21 @@ def test_the_wrong_firmware_is_refused() -> None:
     kept_running.clock.sleep_s(5.0)
     with pytest.raises(WrongFirmware, match="use protocol 'marlin'"):
         kept_running.stage(StageSettings(protocol="grbl", port="simulated")).connect()
+
+
+def test_a_refusal_half_way_along_a_path_loses_the_position_because_stopping_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The refused line moves nothing, but the one before it did, and Marlin stops dead."""
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+
+    def refuse_the_second(controller: MarlinController, *path: object) -> Point:
+        raise StageRejected("the controller refused the second motion; nothing moved by it; home the stage first")
+
+    monkeypatch.setattr(MarlinController, "follow", refuse_the_second)
+    with pytest.raises(StageRejected):
+        stage.move_to(100.0, 100.0)
+    assert not stage.trusted
+    with pytest.raises(NotHomed):
+        stage.verify_at(*bench.true_position())

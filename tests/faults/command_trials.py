@@ -1,0 +1,289 @@
+"""Commands on small inputs, each tried with a fault and without; what its results must be, to the byte.
+
+What may differ between two runs: the times that `reconstruction.json` and `report.html` state, and hence the digests of
+records; the hidden cache of hashes, which holds times; in a captured session the journal and the lock (times, process
+number) and the sum of the journal. A frame that is exposed again has another number in its name, and another noise.
+"""
+
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import pytest
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.digests import DIGEST_KEY
+from faintfield.pipelines.formats.files import CACHE_FILE, UNFINISHED
+from faintfield.pipelines.formats.results.plane_files import PARTS
+from faintfield.rig.session.disk import PART
+from faintfield.rig.session.session import JOURNAL, SUMS
+from faintfield.rig.session.verify import verify
+from tests.faults.io_faults import KINDS, Action, Ended, Fault, Trial, compiled, faults
+from tests.patience import HANG_S
+
+_RIG = """
+[stage]
+protocol = "simulated"
+
+[camera]
+backend = "simulated"
+size_px = [{size_px}]
+
+[grid]
+rows = {rows}
+columns = 2
+pitch_mm = 100.0
+origin_mm = [-350.0, -350.0]
+
+[settle]
+measure = false
+wait_s = 3.0
+
+[drift]
+check = false
+
+[[board]]
+name = "large"
+columns = 9
+rows = 7
+square_mm = 40.0
+marker_mm = 30.0
+dictionary = "DICT_4X4_50"
+"""
+_STEP = """
+[[step]]
+kind = "{}"
+exposure_s = {}
+frames_per_node = {}
+"""
+_FEW = (("dark_scene", 0.1, 1), ("dark", 0.1, 1))
+_ENOUGH = (*(("charuco", 0.05, 1),) * 3, ("dark_scene", 0.1, 1), ("dark", [0.1, 60.0], 2), ("flat", 0.1, 2))
+_PLANE = ["--depth-mm", "500", "--passes", "1", "--penalty-weight", "0.1"]
+
+_TIMES = re.compile(
+    rb'"wall_time_s": [^,\n]+|<th scope="row">(?:written|wall time, s)</th><td>[^<]*</td>|'
+    rb'"%s": "\w+"' % DIGEST_KEY.encode()
+)
+_EXPOSURE = re.compile(r"_x\d+")
+
+# Names of what is not finished: files, and folders
+_TEMPORARY = re.compile(rf"{re.escape(UNFINISHED)}$|{re.escape(PART)}$|^\.\w+\.\w{{8}}$")
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command, its inputs and its results, in a folder of its own.
+
+    Attributes
+    ----------
+    name : str
+        Name of the command.
+    words : callable
+        Returns the command's words, given the folder.
+    out : str
+        Where in the folder the results are, beside the inputs or among them.
+    """
+
+    name: str
+    words: Callable[[Path], list[str]]
+    out: str = "out"
+
+
+COMMANDS = {
+    command.name: command
+    for command in (
+        Command("capture", lambda at: ["capture", str(at / "rig.toml"), str(at / "out"), "--yes"]),
+        Command("noise", lambda at: ["noise", str(at / "session"), "--out", str(at / "out")]),
+        Command("geometry", lambda at: ["geometry", str(at / "session"), "--out", str(at / "out")]),
+        Command("reconstruct", lambda at: ["reconstruct", str(at / "set"), "--out", str(at / "out"), *_PLANE]),
+        Command("run", lambda at: ["run", str(at / "session"), *_PLANE], "session"),
+    )
+}
+
+
+def rig_toml(*, few: bool) -> str:
+    """Return a rig.toml of few frames of few pixels, or of enough for all that follows a capture."""
+    steps = _FEW if few else _ENOUGH
+    text = _RIG.format(size_px="16, 12" if few else "240, 180", rows=1 if few else 2)
+    return text + "".join(_STEP.format(*step) for step in steps)
+
+
+def prepare_inputs(folder: Path) -> None:
+    """Write the inputs of all commands, each into a folder of the command's name."""
+    for name in COMMANDS:
+        (folder / name).mkdir(parents=True)
+    (folder / "capture" / "rig.toml").write_text(rig_toml(few=True))
+    rig, session = folder / "rig.toml", folder / "noise" / "session"
+    rig.write_text(rig_toml(few=False))
+    assert run(["capture", str(rig), str(session), "--yes"]) == 0
+    for name in ("geometry", "run"):
+        shutil.copytree(session, folder / name / "session")
+    small = ["--size-px", "48", "36", "--rows", "2", "--columns", "2"]
+    assert run(["simulate", str(folder / "reconstruct" / "set"), *small]) == 0
+
+
+def results(folder: Path) -> dict[str, bytes]:
+    """Return the content of all files within a folder by name, without what may differ between two runs."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        name = str(path.relative_to(folder))
+        if path.is_file() and path.name != CACHE_FILE:
+            content = path.read_bytes()
+            found[name] = _TIMES.sub(b"", content) if path.suffix in (".json", ".html") else content
+    return found
+
+
+def _frames(found: dict[str, bytes]) -> set[str]:
+    return {_EXPOSURE.sub("", name) for name in found if name.startswith("out/frames/")}
+
+
+class Server(Protocol):
+    """Runs trials, as `Faults` does."""
+
+    def run(self, trial: Trial) -> Ended: ...
+
+
+class Bench:
+    """Where commands are tried: each finds its own inputs, untouched, at the same place every time."""
+
+    def __init__(self, folder: Path, server: Server) -> None:
+        self._inputs, self._trials, self._server = folder / "inputs", folder / "trials", server
+        self._undisturbed: dict[str, dict[str, bytes]] = {}
+        self._calls: dict[str, list[str]] = {}
+
+    def folder(self, name: str) -> Path:
+        """Return the folder in which a command is tried."""
+        return self._trials / name
+
+    def renew(self, name: str) -> Path:
+        """Put the inputs of a command in place anew, and return the folder."""
+        shutil.rmtree(self.folder(name), ignore_errors=True)
+        return Path(shutil.copytree(self._inputs / name, self.folder(name)))
+
+    def run(self, name: str, fault: Fault | None = None, diary: Path | None = None, limit_s: float = HANG_S) -> Ended:
+        """Run a command, perhaps with a fault, on what is in its folder; kill it after `limit_s`."""
+        folder = self.folder(name)
+        words = COMMANDS[name].words(folder)
+        return self._server.run(Trial(words, str(folder), fault or Fault(), str(diary) if diary else None, limit_s))
+
+    def undisturbed(self, name: str) -> dict[str, bytes]:
+        """Return inputs and results of a command after an undisturbed run."""
+        if name not in self._undisturbed:
+            diary = self.renew(name).with_suffix(".calls")
+            ended = self.run(name, diary=diary)
+            assert (ended.code, ended.stray) == (0, ""), ended
+            self._calls[name] = [KINDS[int(line.split(maxsplit=1)[0])] for line in diary.read_text().splitlines()]
+            self._undisturbed[name] = results(self.folder(name))
+        return self._undisturbed[name]
+
+    def calls(self, name: str) -> list[str]:
+        """Return the kinds of all calls that an undisturbed run makes, in order."""
+        self.undisturbed(name)
+        return self._calls[name]
+
+    def assert_finished(self, name: str) -> None:
+        """Assert that inputs and results are those of an undisturbed run, and that nothing else is left."""
+        wanted, found = self.undisturbed(name), results(self.folder(name))
+        if name != "capture":
+            assert found.keys() == wanted.keys(), f"not both there: {found.keys() ^ wanted.keys()}"
+            self._assert_none_differs(name, found)
+            return
+        verdict = verify(self.folder(name) / "out")
+        assert (verdict.problems, verdict.missing, verdict.superseded, verdict.sealed) == ((), (), 0, True), verdict
+        assert _frames(found) == _frames(wanted), f"not both there: {_frames(found) ^ _frames(wanted)}"
+        self._assert_none_differs(name, found)
+
+    def assert_nothing_half_written(self, name: str, *, leftovers: bool) -> None:
+        """Assert that each file is as an undisturbed run leaves it; `leftovers`: or has a temporary name."""
+        found = results(self.folder(name))
+        if not leftovers:
+            temporary = [file for file in found if _is_temporary(file)]
+            assert temporary == [], f"left: {temporary}"
+        finished = {file: content for file, content in found.items() if not (_is_temporary(file) or PARTS in file)}
+        self._assert_none_differs(name, finished)
+
+    def _assert_none_differs(self, name: str, found: dict[str, bytes]) -> None:
+        wanted = self.undisturbed(name)
+        changing = {
+            f"out/{file}" for file in ("lock", SUMS, JOURNAL, f"{JOURNAL}-wal", f"{JOURNAL}-shm", f"{JOURNAL}-journal")
+        }
+        for file, content in found.items():
+            if name == "capture" and (file in changing or file not in wanted):
+                assert file in changing or _EXPOSURE.search(file), f"unknown file: {file}"
+                continue
+            assert wanted.get(file) == content, f"differs: {file}"
+
+
+def _is_temporary(file: str) -> bool:
+    return any(_TEMPORARY.search(part) for part in file.split("/"))
+
+
+@contextmanager
+def bench_in(folder: Path) -> Iterator[Bench]:
+    """Prepare the inputs, and start the process that runs the trials."""
+    library = compiled(folder)
+    if library is None:
+        pytest.skip("there is no C compiler, cc, to compile io_faults.c with")
+    prepare_inputs(folder / "inputs")
+    shutil.copytree(folder / "inputs", folder / "trials")
+    warm_up = [command.words(folder / "trials" / name) for name, command in COMMANDS.items()]
+    with faults(library, warm_up) as server:
+        yield Bench(folder, server)
+
+
+# What each kind of call may meet: an error once, as of a cable or a signal, or from then on, as of a full disk
+FAULTS: dict[str, tuple[tuple[Action, str], ...]] = {
+    "open": (("fail once", "EACCES"), ("fail once", "EIO"), ("fail once", "EINTR")),
+    "create": (("fail from then on", "ENOSPC"), ("fail once", "EACCES"), ("fail once", "EINTR")),
+    "list": (("fail once", "EACCES"), ("fail once", "EIO")),
+    "status": (("fail once", "EACCES"), ("fail once", "EIO")),
+    "read": (("fail once", "EIO"), ("fail once", "EINTR"), ("cut short", "EIO")),
+    "write": (
+        *(("fail from then on", "ENOSPC"), ("fail once", "EIO")),
+        *(("fail once", "EINTR"), ("cut short", "ENOSPC")),
+    ),
+    "sync": (("fail once", "EIO"), ("fail from then on", "ENOSPC"), ("fail once", "EINTR")),
+    "rename": (("fail once", "EIO"), ("fail once", "EACCES"), ("fail from then on", "ENOSPC")),
+    "remove": (("fail once", "EACCES"), ("fail once", "EIO")),
+    "make": (("fail from then on", "ENOSPC"), ("fail once", "EACCES")),
+    "lock": (("fail from then on", "ENOLCK"), ("fail once", "EIO"), ("fail once", "EINTR")),
+    "allocate": (("fail from then on", "ENOSPC"), ("fail once", "EIO"), ("fail once", "EINTR")),
+}
+
+_FAILURE = re.compile(r"^faintfield: [A-Z]\w+: .+; .+")
+
+
+def faults_of(calls: list[str]) -> list[Fault]:
+    """Return every fault that can meet a run which makes these kinds of calls."""
+    return [
+        Fault(kind, action, nth, error)
+        for kind in KINDS
+        for nth in range(1, calls.count(kind) + 1)
+        for action, error in FAULTS[kind]
+    ]
+
+
+def assert_survives(bench: Bench, name: str, fault: Fault) -> bool:
+    """Assert that a command with a fault succeeds, or fails by name and then succeeds; return whether it failed."""
+    bench.renew(name)
+    ended = bench.run(name, fault)
+    assert ended.stray == "", ended.stray
+    assert ended.code in (0, 1), ended.complaint or ended.code
+    if ended.code == 0:
+        bench.assert_finished(name)
+        return False
+    lines = [line for line in ended.complaint.splitlines() if line.startswith("faintfield: ")]
+    assert len(lines) == 1, ended.complaint
+    assert ended.complaint.splitlines()[-1] == lines[0]
+    assert _FAILURE.match(lines[0]), lines[0]
+    assert "Traceback" not in ended.complaint, ended.complaint
+    assert ended.said == "", ended.said
+    bench.assert_nothing_half_written(name, leftovers=fault.kind == "remove")
+    again = bench.run(name)
+    assert (again.code, again.stray) == (0, ""), again.complaint
+    bench.assert_finished(name)
+    return True
