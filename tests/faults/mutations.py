@@ -12,6 +12,7 @@ half-written, and leave nothing running.
 import fcntl
 import json
 import os
+import resource
 import shutil
 import sqlite3
 import sys
@@ -226,6 +227,8 @@ def _content(path: Path) -> object:
 def warm_up() -> None:
     """Load what commands load when they are first used, so that children inherit it."""
     cv2.setNumThreads(1)
+    # A mutation of a huge file must fail here, not take the memory of all
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * contained.MAX_EXTRA_BYTES, resource.RLIM_INFINITY))
     folder = Path(registry.__file__).parent / "commands"
     for path in folder.rglob("*.py"):
         module = ".".join(path.relative_to(folder).with_suffix("").parts)
