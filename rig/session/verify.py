@@ -33,6 +33,9 @@ class Verdict(Struct, frozen=True):
     ----------
     problems : tuple of str
         All damage, one line each; empty if there is none. Restore what is named from a copy.
+    interrupted : tuple of str
+        Files in `frames/` of exposures that were cut short. This is ordinary: the next capture sets them aside and
+        takes their frames.
     planned, present : int
         Number of frames in the plan, and of those whose file is present and unchanged.
     missing : tuple of str
@@ -48,6 +51,7 @@ class Verdict(Struct, frozen=True):
     """
 
     problems: tuple[str, ...]
+    interrupted: tuple[str, ...]
     planned: int
     present: int
     missing: tuple[str, ...]

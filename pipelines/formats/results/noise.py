@@ -228,7 +228,7 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     try:
         model = NoiseModel(**(values | maps), **known)
     except ValueError as failure:
-        raise BadValue(f"{path}, or its maps: {failure}; run `faintfield noise` again") from failure
+        raise BadValue(f"{path}: it or its maps: {failure}; run `faintfield noise` again") from failure
     return FittedNoise(model, unusable, response, record.mosaic or None)
 
 
