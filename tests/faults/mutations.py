@@ -59,20 +59,20 @@ _EACH_COMMAND = (
     "capture @none @session --yes",
 )
 
-CASES = Path(__file__).parent / "mutation_cases" / "found.jsonl"
+CASES = Path(__file__).parent / "mutation_cases" / "cases.jsonl"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One mutation: the kind of files, the number of the call, and what is done to which file."""
+    """One mutation: the kind of files, the words of the command, and what is done to which file."""
 
     kind: str
-    call: int
+    call: str
     edits: tuple[tuple[str, str, list[Any]], ...]
 
     def __str__(self) -> str:
         done = "; ".join(f"{file}: {name} {_short(arguments)}" for file, name, arguments in self.edits)
-        return f"{KINDS[self.kind].calls[self.call].words}\n    {done}"
+        return f"{self.call}\n    {done}"
 
 
 def _short(arguments: Sequence[Any]) -> str:
@@ -92,6 +92,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.ended: contained.Ended
         self._made: dict[str, Path] = {}
+        self.mutated = False
         self._kind = ""
         self._clean: contained.State = {}
         self._valid = folder / "valid"
@@ -103,7 +104,7 @@ class Bench:
         rng = Random(f"{kind} {seed}")
         self.lay_out(kind)
         place = self._guard / "IN"
-        call = rng.randrange(len(KINDS[kind].calls))
+        call = rng.choice(KINDS[kind].calls).words
         edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
             pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
@@ -121,9 +122,10 @@ class Bench:
     def faults(self, case: Case) -> list[str]:
         """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
         self.lay_out(case.kind)
-        call = KINDS[case.kind].calls[case.call]
+        call = next(it for it in KINDS[case.kind].calls if it.words == case.call)
         for file, name, arguments in case.edits:
             mutation_operations.apply(self._guard / "IN" / file, name, arguments)
+        self.mutated = contained.state_of(self._guard) != self._clean
         changed = sorted(self._changed(case.kind, call.notices))
         if not all(name in changed for name, *_ in case.edits):
             changed = []  # what vouches for the others was changed, too
@@ -258,8 +260,10 @@ def serve(folder: Path) -> None:
             found = bench.faults_of(named(request["function"]), request["seconds"])
         elif "edits" in request:
             found = _described(bench, "kept", Case(request["kind"], request["call"], request["edits"]))
-            if request.get("succeeds") and bench.ended.code != 0:
-                found.append(bench.ended.err)
+            if not request["edits"] and bench.ended.code != 0:
+                found.append(f"cannot read valid files: {bench.ended.err}")
+            if request["edits"] and not bench.mutated:
+                found.append("nothing was mutated: this case is of an earlier format")
         else:
             seeds = range(request["first"], request["last"])
             found = [it for seed in seeds for it in _described(bench, seed, bench.draw(request["kind"], seed))]
