@@ -5,8 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
 OUT ?= demo
+SAMPLE ?= 300
+MODULES ?= recon calib rig/session rig/capture rig/stages
 
-.PHONY: demo test lint bench results lock clean help
+.PHONY: demo test lint bench mutants results lock clean help
 
 help: ## list the tasks
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
@@ -25,6 +27,9 @@ lint: $(VENV)/installed ## style, types and import contracts
 
 bench: $(VENV)/compiled build/bench ## speed against peers, as ratios; docs/benchmarks.md keeps the last result
 	PYTHONPATH=build/bench $(BIN)/python -m benchmarks --keep docs/benchmarks.md
+
+mutants: $(VENV)/compiled ## wrong changes of the sources, and how many the tests find: SAMPLE=300 MODULES="recon calib"
+	$(BIN)/python -m tests.mutants $(MODULES) --sample $(SAMPLE)
 
 # Packages that only the benchmarks compare with stay out of .venv.
 build/bench:

@@ -7,7 +7,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, plane_from_ray
+from faintfield.calib.homography import (
+    fronto_parallel_rt_ref_plane,
+    image_lattice,
+    plane_from_ray,
+    transfer,
+    transfer_sigma_px,
+)
+from faintfield.calib.lens import Lens
 
 poses = st.integers(0, 2**32 - 1).map(
     lambda seed: np.random.default_rng(seed).uniform(-1, 1, (3, 6)) * np.repeat([0.5, 200.0], 3)
@@ -87,3 +94,62 @@ def test_the_lattice_of_an_image_holds_the_middles_of_equal_parts_of_its_pixels(
     columns, rows = ((-0.5 + (np.arange(20 * size) + 0.5) / 20).reshape(across, -1).mean(axis=1) for size in size_px)
     expected = [(column, row) for row in rows for column in columns]
     np.testing.assert_allclose(image_lattice(size_px, across), expected, atol=1e-12)
+
+
+def test_the_lattice_divides_an_image_evenly() -> None:
+    # Pixel 0 reaches from -0.5 to 0.5: halves of 8 pixels have their centres at 1.5 and 5.5
+    assert image_lattice((8, 4), across=2).tolist() == [[1.5, 0.5], [5.5, 0.5], [1.5, 2.5], [5.5, 2.5]]
+    assert image_lattice((100, 50)).shape == (25, 2)
+
+
+LENS = Lens((640, 480), 800.0, 790.0, 321.0, 238.0, (-0.1, 0.05, 1e-3, -5e-4))
+VIEW = np.array([0.02, -0.05, 0.1, 30.0, -20.0, 5.0])
+TILTED = np.array([0.2, -0.3, 0.1, 10.0, -5.0, 600.0])
+
+
+def seen_in_both(plane: NDArray[np.float64], points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+    """Return where the reference and the view see points of a plane, by scipy's rotations."""
+    in_ref = Rotation.from_rotvec(plane[:3]).apply(np.pad(points_mm, ((0, 0), (0, 1)))) + plane[3:]
+    return LENS.project(in_ref), LENS.project(Rotation.from_rotvec(VIEW[:3]).apply(in_ref) + VIEW[3:])
+
+
+def test_a_point_is_transferred_to_where_the_view_sees_it() -> None:
+    in_reference, in_view = seen_in_both(TILTED, POINTS_MM)
+    np.testing.assert_allclose(transfer(LENS, VIEW, TILTED, in_reference), in_view, atol=1e-5)
+
+
+@pytest.mark.parametrize("plane", [[0, 0, 0, 0, 0, -500.0], [0, np.pi / 2, 0, 5, 0, 0.0]], ids=["behind", "beside"])
+def test_a_plane_that_is_not_in_front_transfers_nothing(plane: list[float]) -> None:
+    pixels = np.array([[100.0, 200.0]])  # looks away from the plane beside
+    assert np.isnan(transfer(LENS, np.zeros(6), np.array(plane), pixels)).all()
+
+
+def test_the_stated_sigma_of_a_transfer_is_that_of_drawn_lenses_and_poses() -> None:
+    generator = np.random.default_rng(3)
+    scales = np.array([0.8, 0.7, 0.5, 0.4, 1e-3, 2e-3, 1e-4, 1e-4, *[2e-4] * 3, *[0.05] * 3])
+    mixing = np.eye(14) + 0.3 * generator.normal(size=(14, 14))
+    root = scales[:, None] * mixing
+    pixels = np.array([[150.0, 100.0], [320.0, 240.0], [500.0, 400.0]])
+    stated = transfer_sigma_px(LENS, VIEW[None], [root @ root.T], TILTED, pixels)[0]
+    truth = transfer(LENS, VIEW, TILTED, pixels)
+    squares = np.zeros(3)
+    for _ in range(2000):
+        drawn = np.array([*LENS.parameters, *VIEW]) + root @ generator.normal(size=14)
+        lens = Lens.from_parameters(LENS.size_px, drawn[:8])
+        squares += ((transfer(lens, drawn[8:], TILTED, pixels) - truth) ** 2).sum(axis=1)
+    np.testing.assert_allclose(stated, np.sqrt(squares / 2000), rtol=0.06)
+
+
+def test_sigma_is_stated_up_to_the_edges_of_the_view_and_no_farther() -> None:
+    pinhole = Lens((640, 480), 800.0, 800.0, 319.5, 239.5)
+    # The view stands 50 mm to the right: a plane at 400 mm moves by 100 px to the left
+    view = np.array([0.0, 0, 0, -50.0, 0, 0])
+    columns = np.array([99.4, 99.6, 300.0, 739.4, 739.6])
+    pixels = np.column_stack([columns, np.full(5, 100.0)])
+    plane = fronto_parallel_rt_ref_plane(400.0)
+    np.testing.assert_allclose(transfer(pinhole, view, plane, pixels)[:, 0], columns - 100.0, atol=1e-9)
+    sigma_px = transfer_sigma_px(pinhole, view[None], [1e-4 * np.eye(10)], plane, pixels)[0]
+    assert np.isfinite(sigma_px).tolist() == [False, True, True, True, False]
+    rows = np.column_stack([np.full(4, 300.0), [-0.6, -0.4, 479.4, 479.6]])
+    sigma_px = transfer_sigma_px(pinhole, view[None], [1e-4 * np.eye(10)], plane, rows)[0]
+    assert np.isfinite(sigma_px).tolist() == [False, True, True, False]

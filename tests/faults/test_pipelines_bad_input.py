@@ -49,6 +49,11 @@ def _content(name: str, content: Callable[[bytes], bytes]) -> Damage:
     return damage
 
 
+def _pipe(folder: Path) -> None:
+    (folder / "view_r2_c1.tiff").unlink()
+    os.mkfifo(folder / "view_r2_c1.tiff")
+
+
 def _saturated_everywhere(settings: dict[str, Any]) -> None:
     settings["noise"]["saturation_dn"] = 1.0
 
@@ -110,7 +115,7 @@ DAMAGED: dict[str, tuple[Damage, str, str]] = {
     ),
     "name longer than any": (_settings(lambda s: s["view"][7].update(image="x" * 5000)), "MissingFile", "xxx is named"),
     "pipe among the views": (
-        lambda folder: ((folder / "view_r2_c1.tiff").unlink(), os.mkfifo(folder / "view_r2_c1.tiff")),
+        _pipe,
         "MissingFile",
         "view_r2_c1.tiff is named",
     ),

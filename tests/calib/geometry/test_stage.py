@@ -72,6 +72,51 @@ def test_residuals_are_in_the_grids_own_axes(measured: RigGeometry) -> None:
     assert np.abs(largest[:2]).max() < 1e-3
 
 
+def test_residuals_are_those_of_a_plain_least_squares_grid_turned_into_its_axes(measured: RigGeometry) -> None:
+    generator = np.random.default_rng(8)
+    nodes = np.array(NODES, float)
+    x, y = 60.0 * (nodes[:, 1] - 2), 25.0 * (nodes[:, 0] - 2)
+    centres = TILT.apply(np.column_stack([x, y, np.zeros(25)]) + generator.normal(size=(25, 3)) * [0.3, 0.2, 0.1])
+    stage = replace(measured, rt_cam_ref=np.hstack([np.zeros((25, 3)), -centres]))
+    report = stage_report(stage, {}, None)
+    design = np.column_stack([np.ones(25), nodes])
+    solution = np.linalg.lstsq(design, centres)[0]
+    left = centres - design @ solution
+    found = np.array(report.residuals_mm)
+    # The same lengths, whatever the axes; of the three axes x lies along the rows, and the third across both
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), np.linalg.norm(left, axis=1), rtol=1e-9)
+    along_x = solution[2] / np.linalg.norm(solution[2])
+    across = np.cross(solution[2], solution[1])
+    np.testing.assert_allclose(found[:, 0], left @ along_x, atol=1e-9)
+    np.testing.assert_allclose(found[:, 2], left @ across / np.linalg.norm(across), atol=1e-9)
+    # 75 coordinates less 9 numbers of the grid
+    freedom = 75 - 9
+    rms_mm = np.sqrt(3 * (left**2).sum() / freedom)
+    assert report.node_residual_rms_mm.value == pytest.approx(rms_mm)
+    assert report.node_residual_rms_mm.sigma == pytest.approx(rms_mm / np.sqrt(2 * freedom))
+    assert report.pitch_x_mm.value == pytest.approx(np.linalg.norm(solution[2]))
+    assert report.pitch_y_mm.value == pytest.approx(np.linalg.norm(solution[1]))
+
+
+def test_an_axis_that_never_moved_was_approached_from_neither_side() -> None:
+    along_a_row = [((0, column), 0) for column in (2, 1, 0)]
+    assert approach_directions(along_a_row) == {(0, column): (-1.0, 0.0) for column in range(3)}
+    assert approach_directions([((1, 1), 0)]) == {(1, 1): (0.0, 0.0)}
+
+
+def test_three_nodes_are_too_few_to_tell_which_is_misplaced(measured: RigGeometry) -> None:
+    chosen = [0, 1, 5]
+    columns = np.concatenate([np.arange(9), *[9 + 6 * index + np.arange(6) for index in chosen]])
+    few = replace(
+        measured,
+        nodes=[NODES[index] for index in chosen],
+        reference=0,
+        rt_cam_ref=measured.rt_cam_ref[chosen],
+        covariance=measured.covariance[np.ix_(columns, columns)],
+    )
+    assert not [warning for warning in stage_report(few, {}, None).warnings if "from its place" in warning]
+
+
 def test_directions_of_a_serpentine_and_of_its_reverse_cancel() -> None:
     there = [(node, 0) for node in SERPENTINE]
     back = [(node, 1) for node in SERPENTINE[::-1]]

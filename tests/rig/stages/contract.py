@@ -72,6 +72,7 @@ def _check_moves(stage: Gantry) -> None:
         assert stage.move_to(*target).is_at(target)
         assert stage.verify_at(*target).is_at(target)
         assert stage.position().is_at(target)
+        assert stage.switches() == frozenset()
 
 
 def _check_refusals(stage: Gantry) -> None:

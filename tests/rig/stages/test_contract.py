@@ -1,14 +1,17 @@
 """Every stage meets the contract, over every kind of connection."""
 
+import re
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
 from faintfield.rig.devices import open_stage
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.protocol import Point, StageSettings
-from tests.rig.stages.benches import CONTROLLERS, Controller
+from tests.rig.stages.benches import CONTROLLERS, Controller, Traffic, grbl
 from tests.rig.stages.contract import check_stage
 from tests.rig.stages.socket_link import SocketLink
 
@@ -65,3 +68,71 @@ def test_conformance(controller: Controller) -> None:
     checks = list(check_conformance(stage))
     assert len(checks) == 7
     assert all(check.passed for check in checks), checks
+
+
+def test_a_setting_that_should_be_changed_fails_the_first_check() -> None:
+    bench = Bench(partial(SimulatedGrbl, settings={20: "0"}))
+    stage = bench.stage()
+    stage.connect()
+    (failed,) = (check for check in check_conformance(stage) if not check.passed)
+    assert failed.name == "settings"
+    assert failed.measured.startswith("$20=0")
+
+
+@pytest.mark.parametrize(("taken_s", "failed"), [(150.0, []), (170.0, ["homing"])])
+def test_homing_that_needs_most_of_its_bound_of_240_s_fails_the_check(taken_s: float, failed: list[str]) -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    usual_s = stage.home().duration_s
+    bench.clock.sleep_s(1.0)
+    bench = Bench(SimulatedGrbl)
+    bench.firmware.homing_slowdown = taken_s / usual_s
+    stage = bench.stage()
+    stage.connect()
+    assert [check.name for check in check_conformance(stage) if not check.passed and check.name == "homing"] == failed
+
+
+def test_a_stage_slower_than_its_settings_say_fails_the_check_of_speed() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    for number in (110, 111):
+        grbl(bench).settings[number] = f"{0.5 * float(grbl(bench).settings[number]):.3f}"
+    assert [check.name for check in check_conformance(stage) if not check.passed] == ["speed"]
+
+
+def test_lost_steps_fail_the_check_of_repeatability() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    checks = check_conformance(stage)
+    done = [next(checks) for _ in range(6)]
+    homings: list[bool] = []
+
+    def slip_after_the_timing(data: bytes) -> bytes:
+        homings.extend([True] * data.count(b"$H"))
+        if len(homings) == 4 and b"$J" in data:
+            bench.firmware.mechanics.axes[0].slip_mm += 1.0
+            homings.append(True)
+        return data
+
+    bench.wire.filters_to_controller.append(slip_after_the_timing)
+    last = next(checks)
+    assert all(check.passed for check in done)
+    assert (last.name, last.passed) == ("repeatability", False)
+    assert "lost its scale" in last.measured
+
+
+def test_the_checks_move_within_the_middle_of_the_travel() -> None:
+    bench, traffic = Bench(SimulatedGrbl), Traffic()
+    stage = bench.stage(traffic=traffic)
+    stage.connect()
+    for check in check_conformance(stage):
+        if check.name == "report rate":
+            break
+    targets = re.findall(rb"\$J=\S+ \S+ \S+ X(-?[\d.]+) Y(-?[\d.]+) ", traffic.all("sent"))
+    corners = {(float(x), float(y)) for x, y in targets}
+    assert {(-280.0, -280.0), (-120.0, -120.0), (-280.0, -120.0), (-120.0, -280.0), (-200.0, -200.0)} <= corners
+    approach_mm = stage.settings.approach_mm
+    assert all(-280.0 - approach_mm <= value <= -120.0 for corner in corners for value in corner)

@@ -10,7 +10,7 @@ from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageA
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
-from faintfield.rig.stages.drift import DriftWatch, recover
+from faintfield.rig.stages.drift import Drift, DriftWatch, recover
 from faintfield.rig.stages.gantry import Gantry
 from tests.rig.stages.benches import CONTROLLERS, Controller
 
@@ -111,6 +111,27 @@ def test_limits_that_cannot_be_kept_are_refused() -> None:
         watched(Bench(SimulatedGrbl), limit_mm=1.0)
     with pytest.raises(PlanRefused, match="resolves"):
         watched(Bench(partial(SimulatedGrbl, settings={25: "6000.000"})))
+
+
+@pytest.mark.parametrize(("drift_mm", "passed"), [(0.5, True), (-0.5, True), (0.51, False), (-0.51, False)])
+def test_a_drift_as_large_as_the_limit_passes(drift_mm: float, passed: bool) -> None:
+    assert Drift((0.0, drift_mm), 0.5).passed is passed
+
+
+def test_homing_that_takes_no_longer_from_farther_away_is_refused() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = bench.stage()
+    stage.connect()
+    homings: list[bool] = []
+
+    def slow_on_the_second(data: bytes) -> bytes:
+        homings.extend([True] * data.count(b"$H"))
+        bench.firmware.homing_slowdown = 5.0 if len(homings) == 2 else 1.0
+        return data
+
+    bench.wire.filters_to_controller.append(slow_on_the_second)
+    with pytest.raises(PlanRefused, match="no longer from farther away"):
+        DriftWatch(stage).begin()
 
 
 def test_recovery_homes_only_when_agreed_to_and_leaves_the_unchecked_doubtful() -> None:

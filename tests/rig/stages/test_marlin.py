@@ -1,5 +1,6 @@
 """The Marlin driver on a simulated controller: one test for each peculiarity of the protocol."""
 
+import re
 from collections.abc import Callable
 from functools import partial
 
@@ -135,6 +136,15 @@ def test_hold_stops_dead_and_so_loses_the_position() -> None:
     assert not stage.trusted
 
 
+def test_closed_switches_are_told_by_axis() -> None:
+    stage = homed(Bench(SimulatedMarlin))
+    stage.move_to(0.0, 100.0)
+    assert stage.switches() == {0}
+    stage.home()
+    stage.move_to(100.0, 0.0)
+    assert stage.switches() == {1}
+
+
 def test_one_axis_can_be_homed_alone() -> None:
     bench = Bench(SimulatedMarlin)
     stage = bench.stage()
@@ -189,6 +199,74 @@ def test_firmware_that_does_not_report_a_needed_setting_is_refused(line: bytes) 
     bench.wire.filters_to_host.append(without(line))
     with pytest.raises(WrongFirmware):
         bench.stage().connect()
+
+
+def test_what_a_killed_controller_said_last_is_no_answer_to_the_recovery() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    assert isinstance(bench.firmware, SimulatedMarlin)
+    bench.firmware.kill("Heating failed")
+    stage.recover()
+    assert not stage.trusted
+    stage.home()
+    assert stage.trusted
+
+
+def test_a_jog_goes_by_its_distances() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    stage.move_to(100.0, 200.0)
+    assert stage.jog(3.0, -4.0).is_at(Point(103.0, 196.0))
+    assert bench.true_position() == pytest.approx((103.0, 196.0), abs=0.01)
+
+
+def test_a_report_without_one_of_the_axes_is_refused() -> None:
+    bench = Bench(SimulatedMarlin)
+    bench.wire.filters_to_host.append(lambda data: re.sub(rb" Z:\S+", b"", data))
+    bench.wire.filters_to_host.append(lambda data: data.replace(b" Y", b" Z") if data.startswith(b"echo: M") else data)
+    travel = Box((0.0, 400.0), (0.0, 400.0))
+    stage = bench.stage(StageSettings(protocol="marlin", port="simulated", axes=("X", "Z"), travel_mm=travel))
+    stage.connect()
+    with pytest.raises(WrongFirmware, match=r"no position of axis 'Z'; set stage\.axes"):
+        stage.position()
+
+
+def test_a_busy_message_among_the_settings_does_not_change_them() -> None:
+    bench = Bench(SimulatedMarlin)
+    told: list[bool] = []
+
+    def busy_once(data: bytes) -> bytes:
+        if data.startswith(b"echo: M92") and not told:
+            told.append(True)
+            return b"echo:busy: processing\n" + data
+        return data
+
+    bench.wire.filters_to_host.append(busy_once)
+    stage = bench.stage()
+    stage.connect()
+    assert told
+    assert stage.travel() == Box((0.0, 400.0), (0.0, 400.0))
+
+
+def test_a_motion_that_is_refused_until_the_stage_is_homed_is_an_error() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.wire.filters_to_controller.append(
+        lambda data: bench.firmware.say("echo:Home XY First") or data if b"G1" in data else data  # type: ignore[func-returns-value]
+    )
+    with pytest.raises(StageRejected, match=r"refused 'G1 .*Home XY First; home the stage first"):
+        stage.move_to(100.0, 100.0)
+
+
+def test_missing_limits_and_a_missing_emergency_parser_are_told() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = bench.stage()
+    stage.connect()
+    assert stage.identify().warnings == ()
+    bench.wire.filters_to_host.append(lambda data: data.replace(b"EMERGENCY_PARSER:1", b"EMERGENCY_PARSER:0"))
+    stage.connect()
+    (warning,) = stage.identify().warnings
+    assert warning.startswith("no emergency parser")
 
 
 def test_the_wrong_firmware_is_refused() -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.simulation.controller.kinematics import Profile
 from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s, timeout_s
-from faintfield.rig.stages.protocol import Box, MotionLimits, Point
+from faintfield.rig.stages.protocol import Box, MotionLimits, Point, Position
 from faintfield.rig.stages.workspace import StageWorkspace, segment_meets
 
 LIMITS = MotionLimits((100.0, 50.0), (500.0, 200.0))
@@ -79,7 +79,51 @@ def test_paths_outside_the_travel_or_through_a_keep_out_are_refused() -> None:
     workspace.check_path([Point(0.0, 0.0), Point(0.0, 200.0), Point(200.0, 200.0)])
 
 
+def test_only_axes_that_would_arrive_downwards_turn_and_by_the_approach() -> None:
+    start = Point(0.0, 0.0)
+    assert one_sided_path(start, Point(-5.0, 3.0), 2.0) == (Point(-7.0, 3.0), Point(-5.0, 3.0))
+    assert one_sided_path(start, Point(0.0, 3.0), 2.0) == (Point(0.0, 3.0),)
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "meets"),
+    [
+        (Point(0.0, 10.0), Point(5.0, 10.0), True),  # ends on an edge
+        (Point(0.0, 20.0), Point(30.0, 20.0), True),  # along an edge
+        (Point(0.0, 20.001), Point(30.0, 20.001), False),
+        (Point(5.0, 0.0), Point(5.0, 30.0), True),
+        (Point(4.999, 0.0), Point(4.999, 30.0), False),
+        (Point(0.0, 15.0), Point(10.0, 5.0), True),  # touches a corner
+        (Point(0.0, 14.999), Point(10.0, 4.999), False),
+        (Point(7.0, 12.0), Point(7.0, 12.0), True),  # stands inside
+        (Point(7.0, 9.0), Point(7.0, 9.0), False),
+    ],
+)
+def test_what_only_touches_a_box_meets_it(start: Point, end: Point, meets: bool) -> None:
+    box = Box((5.0, 15.0), (10.0, 20.0))
+    assert segment_meets(box, start, end) is meets
+    assert segment_meets(box, end, start) is meets
+
+
+def test_rounding_does_not_put_a_position_outside_the_travel() -> None:
+    workspace = StageWorkspace(Box((0.0, 0.3), (0.0, 0.3)))
+    workspace.check_path([Point(0.1 + 0.2, 3 * 0.1), Point(0.3 + 9e-7, -9e-7)])
+    with pytest.raises(OutsideTravel):
+        workspace.check_path([Point(0.3 + 2e-6, 0.0)])
+
+
+def test_a_position_is_at_its_target_within_the_tolerance_if_it_is_trusted() -> None:
+    target = Point(0.0, 0.0)
+    assert Position(Point(0.25, -0.5), (0.25, 0.5), trusted=True).is_at(target)
+    assert not Position(Point(0.25, -0.5), (0.25, 0.5), trusted=False).is_at(target)
+    assert not Position(Point(0.26, 0.0), (0.25, 0.5), trusted=True).is_at(target)
+    assert not Position(Point(0.0, -0.51), (0.25, 0.5), trusted=True).is_at(target)
+
+
 def test_boxes() -> None:
-    with pytest.raises(ValueError, match="swap its ends"):
-        Box((1.0, 0.0), (0.0, 1.0))
+    for ends in ((1.0, 0.0), (1.0, 1.0)):
+        with pytest.raises(ValueError, match="swap its ends"):
+            Box(ends, (0.0, 1.0))
+        with pytest.raises(ValueError, match="swap its ends"):
+            Box((0.0, 1.0), ends)
     assert Box((0.0, 2.0), (0.0, 2.0)).intersection(Box((1.0, 3.0), (-1.0, 1.0))) == Box((1.0, 2.0), (0.0, 1.0))

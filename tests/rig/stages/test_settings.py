@@ -1,0 +1,176 @@
+"""What the settings of a controller mean, computed by hand from the firmware's documentation."""
+
+import pytest
+
+from faintfield.rig.errors import WrongFirmware
+from faintfield.rig.stages.grbl.settings import GrblSettings
+from faintfield.rig.stages.marlin import messages as marlin
+from faintfield.rig.stages.marlin.settings import MarlinSettings
+from faintfield.rig.stages.protocol import Box, Identity, MotionLimits
+
+GRBL = {
+    1: "255", 13: "0", 20: "1", 22: "1", 23: "2", 24: "100.0", 25: "1000.0", 27: "3.0",
+    100: "80.0", 101: "160.0", 102: "400.0", 110: "6000.0", 111: "3000.0", 112: "600.0",
+    120: "500.0", 121: "250.0", 122: "50.0", 130: "400.0", 131: "300.0", 132: "100.0",
+}  # fmt: skip
+BUILD = {"VER": "1.1h.20190830:", "OPT": "V,15,128"}
+MARLIN = [
+    "FIRMWARE_NAME:Marlin 2.1.2.4 (Jun  1 2024 12:00:00)",
+    "Cap:EMERGENCY_PARSER:1",
+    "echo: M92 X80.00 Y160.00 Z400.00",
+    "echo: M203 X100.00 Y50.00 Z5.00",
+    "echo: M201 X500.00 Y250.00 Z100.00",
+    "echo: M204 P400.00 R400.00 T300.00",
+    "echo:Soft endstops: On  Min:  X1.00 Y2.00 Z0.00   Max:  X401.00 Y302.00 Z100.00",
+]
+
+
+def grbl(changes: dict[int, str] | None = None, axes: tuple[int, int] = (0, 1), options: str = "V,15,128") -> Identity:
+    return GrblSettings(GRBL | (changes or {}), BUILD | {"OPT": options}).identity(axes)
+
+
+def of_marlin(*changes: tuple[str, str], axes: tuple[str, str] = ("X", "Y"), travel: Box | None = None) -> Identity:
+    lines = "\n".join(MARLIN)
+    for old, new in changes:
+        assert old in lines
+        lines = lines.replace(old, new)
+    return MarlinSettings(map(marlin.parse, lines.splitlines())).identity(axes, travel)
+
+
+def test_the_identity_of_grbl() -> None:
+    found = grbl()
+    assert found.firmware == "Grbl 1.1h.20190830"
+    assert found.travel_mm == Box((-400.0, 0.0), (-300.0, 0.0))
+    assert found.motion == MotionLimits((100.0, 50.0), (500.0, 250.0))
+    # Half a step of 1/80 and 1/160 mm, and half a micrometre each for report and command
+    assert found.tolerance_mm == pytest.approx((0.00725, 0.004125), abs=1e-12)
+    assert found.homing_bound_s == 240.0
+    assert found.pull_off_mm == 3.0
+    assert found.homes_together
+    assert found.warnings == ()
+    assert found.settings == {f"${number}": value for number, value in GRBL.items()}
+
+
+def test_other_axes_of_grbl_have_their_own_settings() -> None:
+    found = grbl(axes=(2, 0))
+    assert found.travel_mm == Box((-100.0, 0.0), (-400.0, 0.0))
+    assert found.motion == MotionLimits((10.0, 100.0), (50.0, 500.0))
+    assert found.tolerance_mm == pytest.approx((0.00225, 0.00725), abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "mask", "travel"),
+    [
+        ("V,15,128", "3", Box((-400.0, 0.0), (-300.0, 0.0))),
+        ("VZ,15,128", "0", Box((-400.0, 0.0), (-300.0, 0.0))),
+        ("VZ,15,128", "1", Box((0.0, 400.0), (-300.0, 0.0))),
+        ("VZ,15,128", "2", Box((-400.0, 0.0), (0.0, 300.0))),
+        ("VZ,15,128", "3", Box((0.0, 400.0), (0.0, 300.0))),
+        ("V,Z", "3", Box((-400.0, 0.0), (-300.0, 0.0))),  # only the letters before the comma are options
+    ],
+)
+def test_the_travel_of_grbl_extends_from_the_switch_which_may_be_the_origin(
+    options: str, mask: str, travel: Box
+) -> None:
+    assert grbl({23: mask}, options=options).travel_mm == travel
+
+
+def test_grbl_with_single_axis_homing_homes_each_axis_alone() -> None:
+    assert not grbl(options="VH,15,128").homes_together
+
+
+def test_the_bound_of_grbls_homing_is_the_whole_travel_and_twice_the_slow_search() -> None:
+    # 400 mm at 100 mm/min are 240 s; four pull-offs of 3 mm at 10 mm/min are 72 s; half as much again, and 2 s
+    assert grbl({24: "10.0", 25: "100.0"}).homing_bound_s == pytest.approx(1.5 * (240.0 + 72.0) + 2.0)
+    # The longer axis counts
+    assert grbl({24: "10.0", 25: "100.0"}, axes=(1, 0)).homing_bound_s == pytest.approx(470.0)
+    assert grbl({24: "10.0", 25: "100.0"}, axes=(1, 2)).homing_bound_s == pytest.approx(1.5 * (180.0 + 72.0) + 2.0)
+
+
+@pytest.mark.parametrize(
+    ("number", "value"),
+    [
+        (24, "0"),
+        (25, "0"),
+        (27, "-1"),
+        (100, "0"),
+        (101, "-5"),
+        (110, "0"),
+        (121, "0"),
+        (130, "0"),
+        (22, "0"),
+        (13, "1"),
+    ],
+)
+def test_values_of_grbl_that_cannot_be_driven_are_refused_by_number(number: int, value: str) -> None:
+    with pytest.raises(WrongFirmware, match=rf"^\${number}={value}: "):
+        grbl({number: value})
+
+
+@pytest.mark.parametrize("number", [13, 22, 23, 24, 25, 27, 100, 110, 120, 130])
+def test_settings_that_grbl_does_not_report_are_refused_by_number(number: int) -> None:
+    values = {key: value for key, value in GRBL.items() if key != number}
+    with pytest.raises(WrongFirmware, match=rf"^\${number}=not reported: "):
+        GrblSettings(values, BUILD).identity((0, 1))
+
+
+def test_settings_of_grbl_that_may_be_zero() -> None:
+    assert grbl({27: "0", 23: "0"}).pull_off_mm == 0.0
+    assert grbl({22: "3"}).homes_together, "bits beyond the first are grblHAL's"
+
+
+@pytest.mark.parametrize(("version", "accepted"), [("v1.1h", True), ("1.1f.2017", True), ("1.0", False), ("", False)])
+def test_only_grbl_1_1_is_driven(version: str, accepted: bool) -> None:
+    settings = GrblSettings(GRBL, {"VER": version})
+    if accepted:
+        assert settings.identity((0, 1)).homes_together
+    else:
+        with pytest.raises(WrongFirmware, match=version or "of no version"):
+            settings.identity((0, 1))
+
+
+def test_the_identity_of_marlin() -> None:
+    found = of_marlin()
+    assert found.firmware == "Marlin 2.1.2.4 (Jun  1 2024 12:00:00)"
+    assert found.travel_mm == Box((1.0, 401.0), (2.0, 302.0))
+    # Motions between exposures are travel moves: their acceleration is the least of T and the axis's own
+    assert found.motion == MotionLimits((100.0, 50.0), (300.0, 250.0))
+    assert found.tolerance_mm == pytest.approx((0.5 / 80 + 0.0055, 0.5 / 160 + 0.0055), abs=1e-12)
+    assert found.homing_bound_s == 240.0
+    assert not found.homes_together
+    assert found.pull_off_mm == 0.0
+    assert found.warnings == ()
+    assert found.settings["M92"] == "X80 Y160 Z400"
+    assert list(found.settings) == ["M201", "M203", "M204", "M92"]
+
+
+def test_other_axes_of_marlin_have_their_own_settings_and_a_configured_travel() -> None:
+    travel = Box((0.0, 50.0), (0.0, 60.0))
+    found = of_marlin(axes=("Z", "X"), travel=travel)
+    assert found.travel_mm == travel
+    assert found.motion == MotionLimits((5.0, 100.0), (100.0, 300.0))
+    with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
+        of_marlin(axes=("Z", "X"))
+
+
+def test_marlin_without_limits_or_emergency_parser_is_driven_with_a_warning() -> None:
+    travel = Box((0.0, 50.0), (0.0, 60.0))
+    without_limits = of_marlin((MARLIN[-1], "ok"), travel=travel)
+    assert [warning.split(":")[0] for warning in without_limits.warnings] == ["the controller reports no limits"]
+    without_parser = of_marlin(("PARSER:1", "PARSER:0"))
+    assert [warning.split(":")[0] for warning in without_parser.warnings] == ["no emergency parser"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("M203 X100.00 Y50.00", "M203 X100.00 Y0.00"), "M203 Y=0: "),
+        (("M92 X80.00", "M92"), "M92 X=not reported: "),
+        (("T300.00", "T-1.00"), "M204 T=-1: "),
+        (("Marlin 2.1.2.4", "Repetier 1.0"), "'Repetier 1.0 .*'; Marlin is needed"),
+        (("FIRMWARE_NAME:", "firmware:"), "of no stated name"),
+    ],
+)
+def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], message: str) -> None:
+    with pytest.raises(WrongFirmware, match=message):
+        of_marlin(change)
