@@ -4,15 +4,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import ndimage
+from scipy import ndimage, stats
 
-from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.likelihood.images import ElementalImages, read_noise_share, select_likelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.cross_validation import _lowest_offset
 from faintfield.recon.solver.data_fit import DataFit
+from faintfield.recon.solver.uncertainty import _degree, _divergence, _draw
+from tests.recon.small_problems import SHAPE, difference_matrix
 
 
 def test_a_grid_covers_a_rectangle_with_samples_in_the_middle_of_squares() -> None:
@@ -109,3 +111,63 @@ def test_noisier_pixels_bound_the_curvature_of_the_samples_that_they_see_by_the_
     expected = operator.coverage() * blurred(1 / (level_e * response + known_e2), (1,))
     found = DataFit(operator, images, level_e).metric(samples)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_the_pieces_of_a_draw_are_those_of_the_dense_matrix() -> None:
+    """The precision W + ∇ᵀ D ∇, its diagonal, ∇ᵀ, and the solution by conjugate gradients."""
+    generator = np.random.default_rng(6)
+    gradient = difference_matrix()
+    w, curvature = generator.uniform(1, 2, SHAPE), generator.uniform(0.5, 8, SHAPE)
+    matrix = np.diag(w.ravel()) + gradient.T @ np.diag(np.tile(curvature.ravel(), 2)) @ gradient
+    np.testing.assert_allclose(w + _degree(curvature), np.diag(matrix).reshape(SHAPE), rtol=1e-12)
+    field = generator.normal(size=(2, *SHAPE))
+    field[0, -1], field[1, :, -1] = 0.0, 0.0  # the gradient has no differences there
+    np.testing.assert_allclose(_divergence(field).ravel(), gradient.T @ field.ravel(), atol=1e-12)
+    white, of_edges = generator.normal(size=SHAPE), generator.normal(size=(2, *SHAPE))
+    of_edges[0, -1], of_edges[1, :, -1] = 0.0, 0.0
+    target = np.sqrt(w).ravel() * white.ravel() + gradient.T @ (np.sqrt(curvature) * of_edges).ravel()
+    found = _draw(w, curvature, white, of_edges, np.zeros(SHAPE)).ravel()
+    left = target - matrix @ found
+    by_diagonal = np.diag(matrix)
+    assert left @ (left / by_diagonal) <= 1.01e-4 * (target @ (target / by_diagonal))
+    assert left @ (left / by_diagonal) > 1e-8 * (target @ (target / by_diagonal)), "no more work than that"
+
+
+@pytest.mark.parametrize("mean_e", [0.05, 1.0, 20.0])
+@pytest.mark.parametrize("read_noise_e", [0.2, 0.6, 1.5])
+def test_the_share_of_read_noise_is_that_of_fishers_information(mean_e: float, read_noise_e: float) -> None:
+    counts = np.arange(int(mean_e + 12 * np.sqrt(mean_e)) + 20)
+
+    def density(mean: float, at: float) -> float:
+        return float(stats.poisson.pmf(counts, mean) @ stats.norm.pdf(at, counts, read_noise_e))
+
+    def integrand(at: float) -> float:
+        here = density(mean_e, at)
+        slope = (density(mean_e * 1.0001, at) - density(mean_e * 0.9999, at)) / (2e-4 * mean_e)
+        return slope**2 / here if here > 1e-250 else 0.0
+
+    places = np.linspace(-7 * read_noise_e, counts[-1], 4000)
+    information = np.trapezoid([integrand(at) for at in places], places)
+    expected = np.clip((1 / information - mean_e) / read_noise_e**2, 0, 1)
+    assert read_noise_share(mean_e, read_noise_e) == pytest.approx(expected, abs=2e-3)
+
+
+@pytest.mark.parametrize(("mean_e", "read_noise_e"), [(101.0, 0.1), (1.0, 3.1), (1.0, 0.03)])
+def test_read_noise_counts_whole_in_bright_light_where_it_is_large_and_where_it_does_not_matter(
+    mean_e: float, read_noise_e: float
+) -> None:
+    assert read_noise_share(mean_e, read_noise_e) == 1.0
+
+
+def test_the_chosen_likelihood_counts_the_share_of_the_typical_pixel() -> None:
+    electrons = np.ones((2, 4, 4))
+    images = ElementalImages(electrons, background_e=0.5, read_variance_e2=np.full((1, 4, 4), 0.36))
+    found = select_likelihood(images, "auto", 1.5)
+    assert found.name == "poisson-gaussian"
+    assert found.read_noise_share == read_noise_share(2.0, 0.6)
+    assert select_likelihood(images, "least-squares", 0.0).level_e > 0
+
+
+def test_images_binned_by_one_are_the_images() -> None:
+    images = ElementalImages(np.ones((2, 4, 4)))
+    assert images.binned(1) is images
