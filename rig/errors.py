@@ -20,6 +20,7 @@ RigError
 ├── SessionError
 │   ├── SessionCorrupt
 │   ├── SessionBusy
+│   ├── SessionUnreadable
 │   └── SessionUnwritable
 └── CaptureStopped
 
@@ -140,6 +141,10 @@ class SessionCorrupt(SessionError):
 
 class SessionBusy(SessionError):
     """Another capture uses the session."""
+
+
+class SessionUnreadable(SessionError):
+    """A file or folder of the session exists and cannot be read; nothing is known to be wrong with it."""
 
 
 class SessionUnwritable(SessionError):

@@ -37,6 +37,13 @@ def nominal_poses_rt_cam_ref(rows: int, columns: int, pitch_mm: float) -> NDArra
 type Order = Literal["serpentine", "raster"]
 type StepKind = Literal["charuco", "bright", "dark_scene", "noise_reference", "dark", "flat"]
 
+# A plan has at most this many frames: their names give the number five digits.
+MAX_FRAMES = 100_000
+# No exposure is longer: a day, and more.
+MAX_EXPOSURE_S = 100_000.0
+# No quantity of a rig is larger, and computing with numbers up to it does not overflow.
+MAX_NUMBER = 1e12
+
 # Time in s to verify that the stage has arrived: two status reports at five per second, and half a wait for the first.
 _ARRIVAL_S = 0.3
 
@@ -68,6 +75,11 @@ class Grid(Struct, frozen=True, forbid_unknown_fields=True):
                 f"a grid has at least one row and column and a positive pitch; got {self.rows} x {self.columns} "
                 f"at {self.pitch_mm:g} mm"
             )
+        if self.rows * self.columns > MAX_FRAMES:
+            raise ValueError(
+                f"a grid of {self.rows} x {self.columns} has {self.rows * self.columns} nodes, at most {MAX_FRAMES} "
+                "are possible; take fewer rows or columns"
+            )
 
     def position(self, row: int, column: int) -> Point:
         """Return the position of a node."""
@@ -95,6 +107,10 @@ class Stop(Struct, frozen=True, forbid_unknown_fields=True):
     node: tuple[int, int]
     target: Point
 
+    def __post_init__(self) -> None:
+        if not all(0 <= index < MAX_FRAMES for index in self.node):
+            raise ValueError(f"a node has a row and a column from 0 to {MAX_FRAMES - 1}; got {self.node}")
+
 
 class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     """One step of the experiment: the same exposures at every node, or at the centre node only.
@@ -117,8 +133,14 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     at: Literal["grid", "centre"] = "grid"
 
     def __post_init__(self) -> None:
-        if not self.exposure_s or min(self.exposure_s) <= 0.0 or self.frames_per_node < 1:
+        if not self.exposure_s or not all(it > 0.0 for it in self.exposure_s) or self.frames_per_node < 1:
             raise ValueError(f"a step needs exposure times above 0 s and at least one frame; got {self}")
+        if max(self.exposure_s) > MAX_EXPOSURE_S:
+            raise ValueError(f"exposure_s = {max(self.exposure_s):g}; an exposure lasts {MAX_EXPOSURE_S:g} s at most")
+
+    def frames_per_stop(self) -> int:
+        """Return the number of frames at each stop."""
+        return len(self.exposure_s) * self.frames_per_node
 
 
 class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
@@ -150,6 +172,11 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
     settle_s: float = 0.0
     readout_s: float = 0.0
 
+    def __post_init__(self) -> None:
+        if min(self.approach_mm, self.frame_bytes, self.settle_s, self.readout_s) < 0:
+            raise ValueError("distances, times and sizes of a plan are not negative; correct them")
+        check_frame_count(self.frame_count())
+
     @classmethod
     def of(cls, grid: Grid, steps: Sequence[CaptureStep], **rest: float) -> "CapturePlan":
         """Return the plan of `steps` over `grid`; `rest` holds the remaining parameters by name."""
@@ -163,7 +190,7 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
 
     def frame_count(self) -> int:
         """Return the number of frames."""
-        return sum(len(self.stops_of(s)) * len(s.exposure_s) * s.frames_per_node for s in self.steps)
+        return sum(len(self.stops_of(step)) * step.frames_per_stop() for step in self.steps)
 
     def disk_bytes(self) -> int:
         """Return the size of all frames on disk."""
@@ -197,6 +224,12 @@ class CapturePlan(Struct, frozen=True, forbid_unknown_fields=True):
         )
         moving_s = path_duration_s(self.path(start), motion, feed_mm_per_s)
         return moving_s + stops * (_ARRIVAL_S + self.settle_s) + exposing_s
+
+
+def check_frame_count(count: int) -> None:
+    """Raise `ValueError` for a plan with too many frames; call it before they are listed."""
+    if count > MAX_FRAMES:
+        raise ValueError(f"the plan has {count} frames, at most {MAX_FRAMES} are possible; take fewer at a node")
 
 
 class PlannedFrame(Struct, frozen=True):

@@ -7,8 +7,11 @@ import numpy as np
 from msgspec import Struct
 
 from faintfield.rig.cameras.settings import CameraSettings, GPhoto2Settings, Mosaic
-from faintfield.rig.plan import CaptureStep, Grid, StepKind
+from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
+
+# Longest rest at a node; all frames of the measurement are held in memory.
+MAX_REST_S = 60.0
 
 
 class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -92,6 +95,9 @@ class SettleSettings(Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if min(self.exposure_s, self.longest_s, self.limit_px) <= 0.0 or self.wait_s < 0.0:
             raise ValueError(f"settle times and limits must be positive; got {self}")
+        for name in ("exposure_s", "longest_s", "wait_s"):
+            if (given := getattr(self, name)) > MAX_REST_S:
+                raise ValueError(f"settle.{name} = {given:g}; at most {MAX_REST_S:g} s are waited for rest")
 
 
 class CheckSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -221,6 +227,8 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("there is no [[step]]; say what to capture")
         if not self.board and any(step.kind == "charuco" for step in self.step):
             raise ValueError("there is a charuco step but no [[board]]; describe the printed boards")
+        nodes = self.grid.rows * self.grid.columns
+        check_frame_count(sum(it.frames_per_stop() * (nodes if it.at == "grid" else 1) for it in self.steps()))
 
     @property
     def mosaic(self) -> Mosaic | None:

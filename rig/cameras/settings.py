@@ -6,6 +6,9 @@ from msgspec import Struct
 
 type Mosaic = tuple[str, ...]
 
+# Largest frame that is simulated; rendering takes some hundred bytes of memory for each pixel.
+MAX_SIMULATED_PIXELS = 40_000_000
+
 
 class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
     """A tethered camera that libgphoto2 supports.
@@ -120,8 +123,16 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
     def __post_init__(self) -> None:
         if min(self.size_px) < 8:
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
+        width, height = self.size_px
+        if width * height > MAX_SIMULATED_PIXELS:
+            raise ValueError(
+                f"camera.size_px = {list(self.size_px)} has {width * height} pixels, at most {MAX_SIMULATED_PIXELS} "
+                "are simulated; give a smaller frame"
+            )
         if self.gain_dn_per_e <= 0 or min(self.read_noise_e, self.position_error_mm, self.rotation_error_mrad) < 0:
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
+        if min(self.lit_photons_per_s, self.unlit_photons_per_s, self.seed) < 0 or not 0 < self.saturation_dn < 2**16:
+            raise ValueError("camera: light and seed are not negative, and saturation_dn is 1 to 65535; correct them")
         if self.mosaic is not None and (not self.mosaic or set("".join(self.mosaic)) - set("RGB")):
             raise ValueError(f"camera.mosaic = {list(self.mosaic)}; give rows of the letters R, G and B")
 

@@ -1,8 +1,11 @@
 """Write the files of a session whole or not at all, never overwrite or delete one, and lock the session's folder."""
 
+import errno
 import fcntl
 import os
-from collections.abc import Iterator
+import re
+import stat
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -10,13 +13,27 @@ from pathlib import Path
 import tifffile
 
 from faintfield.rig.cameras.protocol import Exposure
-from faintfield.rig.errors import SessionBusy, SessionUnwritable
-from faintfield.rig.session.durable import sync_folder
+from faintfield.rig.errors import SessionBusy, SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.session.durable import make_folder, sync_folder
+from faintfield.rig.session.names import is_plain_name
 
 PART = ".part"
 
+_REMEDIES = {
+    errno.ENOSPC: "make room",
+    errno.EDQUOT: "make room",
+    errno.EFBIG: "make room",
+    errno.EACCES: "make the folder writable",
+    errno.EPERM: "make the folder writable",
+    errno.EROFS: "make the folder writable",
+    errno.ENOLCK: "use a file system on which files can be locked",
+    errno.EOPNOTSUPP: "use a file system on which files can be locked",
+    errno.EIO: "check the disk and its cable",
+    errno.ENAMETOOLONG: "shorten the name",
+}
 
-def write_new(path: Path, content: bytes | memoryview) -> None:
+
+def write_new(path: Path, content: bytes | bytearray | memoryview) -> None:
     """Write `content` to a new file that survives a power cut.
 
     The bytes are written to `path` with the suffix `.part` and flushed; then the file is renamed and its folder is
@@ -29,10 +46,11 @@ def write_new(path: Path, content: bytes | memoryview) -> None:
     """
     part = path.with_name(path.name + PART)
     with translate_errors(path):
-        if path.exists():
+        if os.path.lexists(path):
             raise SessionUnwritable(f"{path}: exists and is never overwritten; set it aside and go on")
+        part.unlink(missing_ok=True)  # what a kill left behind, or a link that leads elsewhere
         try:
-            with part.open("wb") as file:
+            with part.open("xb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
@@ -46,9 +64,11 @@ def write_new(path: Path, content: bytes | memoryview) -> None:
 def set_aside(path: Path, folder: Path) -> Path:
     """Move a file into `folder` under an unused name, and return its new path."""
     with translate_errors(path):
-        folder.mkdir(exist_ok=True)
+        require_kind(folder, stat.S_ISDIR, "folder")
+        make_folder(folder)
+        name = path.name if is_plain_name(path.name) else "unnamed"
         number = 0
-        while (target := folder / f"{path.name}.{number}").exists():
+        while os.path.lexists(target := folder / f"{name}.{number}"):
             number += 1
         path.rename(target)
         sync_folder(folder)
@@ -67,6 +87,37 @@ def encode_exposure(exposure: Exposure) -> bytes | memoryview:
     return buffer.getbuffer()  # not `getvalue`, which copies perhaps a hundred megabytes
 
 
+def list_names(folder: Path) -> list[str]:
+    """Return the names in a folder of a session, sorted; there are none before it is created.
+
+    Raises
+    ------
+    SessionCorrupt
+        It is no folder, or a link, which could lead out of the session.
+    SessionUnreadable
+        It cannot be listed.
+    """
+    with translate_read_errors(folder):
+        require_kind(folder, stat.S_ISDIR, "folder")
+        return sorted(os.listdir(folder)) if os.path.lexists(folder) else []
+
+
+def require_kind(path: Path, is_kind: Callable[[int], bool], kind: str) -> None:
+    """Refuse a link, pipe, device, … where a session has a file or folder of its own; there may be nothing yet.
+
+    Raises
+    ------
+    SessionCorrupt
+        Something else is there.
+    """
+    try:
+        mode = os.lstat(path).st_mode
+    except FileNotFoundError:
+        return
+    if not is_kind(mode):
+        raise SessionCorrupt(f"{path}: is not a {kind} of the session itself; move it away, or restore it from a copy")
+
+
 @contextmanager
 def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
     """Hold the lock on a session, exclusive or shared with other readers; it ends with the process at the latest.
@@ -75,22 +126,36 @@ def lock_session(folder: Path, *, shared: bool = False) -> Iterator[None]:
     ------
     SessionBusy
         Another capture holds the session.
+    SessionCorrupt
+        The lock is not a regular file.
+    SessionUnwritable, SessionUnreadable
+        It cannot be locked.
     """
     path = folder / "lock"
-    with translate_errors(path):
-        descriptor = os.open(path, os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT, 0o644)
+    translated = translate_read_errors if shared else translate_errors
+    with translated(path):
+        require_kind(path, stat.S_ISREG, "file")
+        access = os.O_RDONLY if shared else os.O_RDWR | os.O_CREAT
+        descriptor = os.open(path, access | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
     try:
-        try:
-            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError as failure:
-            holder = os.pread(descriptor, 100, 0).decode(errors="replace") or "another process"
-            raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it first") from failure
-        if not shared:
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
+        with translated(path):
+            _take_lock(descriptor, folder, shared=shared)
         yield
     finally:
         os.close(descriptor)
+
+
+def _take_lock(descriptor: int, folder: Path, *, shared: bool) -> None:
+    """Lock an open file; write the number of this process into it if the lock is exclusive."""
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError as failure:
+        named = re.fullmatch(rb"process \d+", os.pread(descriptor, 100, 0))
+        holder = named[0].decode() if named else "another process"
+        raise SessionBusy(f"{folder}: a capture is under way ({holder}); wait for it or stop it first") from failure
+    if not shared:
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"process {os.getpid()}".encode(), 0)
 
 
 @contextmanager
@@ -99,8 +164,20 @@ def translate_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as failure:
-        place = failure.filename or path
+        remedy = _REMEDIES.get(failure.errno or 0, "see that the disk is whole and the path leads to a folder")
         raise SessionUnwritable(
-            f"{place}: {failure.strerror or failure}; what was committed is safe: make room, or make the folder "
-            "writable, and run the same command again"
+            f"{failure.filename or path}: {failure.strerror or failure}; what was committed is safe: {remedy}, and "
+            "run the same command again"
+        ) from failure
+
+
+@contextmanager
+def translate_read_errors(path: Path) -> Iterator[None]:
+    """Raise `SessionUnreadable` for an error of the operating system."""
+    try:
+        yield
+    except OSError as failure:
+        raise SessionUnreadable(
+            f"{failure.filename or path}: cannot be read ({failure.strerror or failure}); allow it to be read, or "
+            "check the disk, and run the same command again"
         ) from failure

@@ -1,4 +1,4 @@
-"""Make renames survive a power cut; for sessions and for results."""
+"""Make renames and new folders survive a power cut; for sessions and for results."""
 
 import os
 from pathlib import Path
@@ -11,3 +11,11 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder, and those above it, if they are missing, so that they survive a power cut."""
+    if not folder.is_dir():
+        make_folder(folder.parent)
+        folder.mkdir(exist_ok=True)
+    sync_folder(folder.parent)

@@ -1,41 +1,48 @@
 """Keep the journal of a session: a database of all that happened during a capture.
 
 The journal is SQLite in WAL mode with synchronous=FULL: once a call returns, what it recorded survives a power cut.
-Rows are only added, and ordered by their numbers; times are for people, since clocks can be set back.
+Rows are only added, ordered by their numbers, and chained by hashes; times are for people, since clocks can be set
+back.
 """
 
-import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Any, Self
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from faintfield.rig.cameras.protocol import Metadata
-from faintfield.rig.errors import SessionCorrupt, SessionUnwritable
+from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.plan import MAX_FRAMES
+from faintfield.rig.session.chain import START, add_rows, check_chain, insert_rows
+from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
+from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.stages.protocol import Point
 from faintfield.rig.stages.transport import Direction
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS event (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, kind TEXT NOT NULL, frame INTEGER, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS intent (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at TEXT NOT NULL, frame INTEGER NOT NULL);
-CREATE TABLE IF NOT EXISTS "commit" (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, file TEXT NOT NULL UNIQUE,
-    sha256 TEXT NOT NULL, bytes INTEGER NOT NULL, detail TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS void (
-    intent INTEGER PRIMARY KEY REFERENCES intent (id), at TEXT NOT NULL, why TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS traffic (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, at_s REAL NOT NULL, direction TEXT NOT NULL, data BLOB NOT NULL);
-"""
 _COMMITTED = """
 SELECT intent.id, intent.frame, "commit".file, "commit".sha256, "commit".bytes, "commit".detail, void.why
 FROM "commit" JOIN intent ON intent.id = "commit".intent LEFT JOIN void ON void.intent = intent.id ORDER BY intent.id
 """
+_UNCOMMITTED = 'SELECT id, frame FROM intent WHERE id NOT IN (SELECT intent FROM "commit") ORDER BY id'
+_EVENTS = "SELECT id, at, kind, frame, detail FROM event WHERE ?1 IS NULL OR kind = ?1 ORDER BY id"
+_TO_BE_RETAKEN = """
+SELECT "commit".intent FROM "commit" JOIN intent AS old ON old.id = "commit".intent
+JOIN intent AS new ON new.frame = old.frame WHERE new.id = ? AND "commit".intent NOT IN (SELECT intent FROM void)
+"""
+# What the columns of these queries hold; SQLite keeps any type in any column of a journal of format 1.
+type _Number = Annotated[int, Meta(ge=1)]
+type _Index = Annotated[int, Meta(ge=0)]
+type _Sha256 = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+type _CommittedRow = tuple[_Number, _Index, str, _Sha256, _Index, str, str | None]
+type _UncommittedRow = tuple[_Number, _Index]
+type _EventRow = tuple[_Number, str, str, _Index | None, str]
+type _TrafficRow = tuple[float, Direction, bytes]
+# More rows are in no journal, and they would fill the memory: each frame is taken once or a few times.
+_MAX_ROWS = 10 * MAX_FRAMES
 # Records of serial traffic held in memory before they are written, as each write costs a flush of the disk; any other
 # entry writes them earlier.
 _MAX_PENDING_TRAFFIC = 2000
@@ -138,20 +145,33 @@ class Journal:
         Create the file if it is missing.
     read_only : bool
         Open without a lock and without writing, so that a write-protected medium can be read.
+
+    Attributes
+    ----------
+    format : int
+        Format of the journal; rows are chained from format 2 on.
+
+    Raises
+    ------
+    SessionCorrupt
+        The journal is missing, damaged or not what a capture wrote.
+    SessionUnreadable, SessionUnwritable
+        The system does not let it be opened.
     """
 
     def __init__(self, path: Path, *, create: bool = False, read_only: bool = False) -> None:
         self.path = path
+        self._read_only = read_only
         self._traffic: list[tuple[float, str, bytes]] = []
-        if not create and not path.is_file():
-            raise SessionCorrupt(f"{path}: the journal is missing; restore it, or begin a new session")
+        if create and not path.exists():
+            create_database(path)
         with self._translate_errors():
-            wal = path.with_name(path.name + "-wal")
-            mode = "ro" if wal.exists() else "ro&immutable=1"
-            uri = f"{path.absolute().as_uri()}?mode={mode if read_only else 'rwc'}"
-            self._db = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-            if not read_only:
-                self._prepare()
+            self._db = connect(path, read_only=read_only)
+        try:
+            self._prepare()
+        except BaseException:
+            self._db.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -178,110 +198,113 @@ class Journal:
     def event(self, kind: str, *, frame: int | None = None, **detail: object) -> None:
         """Record an event."""
         with self._transaction():
-            self._db.execute(
-                "INSERT INTO event (at, kind, frame, detail) VALUES (?, ?, ?, ?)",
-                (_now(), kind, frame, _to_json(detail)),
-            )
+            self._add("event", (None, _now(), kind, frame, _to_json(detail)))
 
     def intend(self, frame: int) -> int:
         """Record that `frame` will be taken now, and return the number of the exposure."""
         with self._transaction():
-            row = self._db.execute("INSERT INTO intent (at, frame) VALUES (?, ?)", (_now(), frame))
-        assert row.lastrowid is not None
-        return row.lastrowid
+            return self._add("intent", (None, _now(), frame))
 
     def commit(self, intent: int, file: str, sha256: str, size_bytes: int, record: FrameRecord) -> None:
         """Record that the frame of `intent` is complete on disk; earlier takes of it become void."""
         with self._transaction():
-            self._db.execute(
-                'INSERT INTO void (intent, at, why) SELECT "commit".intent, ?, ? FROM "commit" '
-                'JOIN intent AS old ON old.id = "commit".intent JOIN intent AS new ON new.frame = old.frame '
-                'WHERE new.id = ? AND "commit".intent NOT IN (SELECT intent FROM void)',
-                (_now(), "retaken", intent),
-            )
-            self._db.execute(
-                'INSERT INTO "commit" (intent, at, file, sha256, bytes, detail) VALUES (?, ?, ?, ?, ?, ?)',
-                (intent, _now(), file, sha256, size_bytes, _to_json(record)),
-            )
+            for (retaken,) in self._db.execute(_TO_BE_RETAKEN, (intent,)).fetchall():
+                self._add("void", (retaken, _now(), "retaken"))
+            self._add("commit", (intent, _now(), file, sha256, size_bytes, _to_json(record)))
 
     def void(self, intents: list[int], why: str) -> None:
-        """Record that committed frames are void, and will be taken again."""
+        """Record that committed frames, which are not void yet, are void, and will be taken again."""
         with self._transaction():
-            self._db.executemany(
-                "INSERT OR IGNORE INTO void (intent, at, why) VALUES (?, ?, ?)", [(it, _now(), why) for it in intents]
-            )
+            for intent in intents:
+                self._add("void", (intent, _now(), why))
 
     def committed(self) -> list[CommittedFrame]:
         """Return all committed frames in the order of their exposures."""
         with self._translate_errors():
-            rows = self._db.execute(_COMMITTED).fetchall()
             return [
-                CommittedFrame(a, b, c, d, e, msgspec.json.decode(record, type=FrameRecord), void)
-                for a, b, c, d, e, record, void in rows
+                CommittedFrame(a, b, self._plain(c), d, e, msgspec.json.decode(record, type=FrameRecord), void)
+                for a, b, c, d, e, record, void in self._read(_CommittedRow, _COMMITTED)
             ]
 
     def uncommitted(self) -> list[tuple[int, int]]:
         """Return the number and the frame of every exposure that was not committed."""
         with self._translate_errors():
-            query = 'SELECT id, frame FROM intent WHERE id NOT IN (SELECT intent FROM "commit") ORDER BY id'
-            return self._db.execute(query).fetchall()
+            return self._read(_UncommittedRow, _UNCOMMITTED)
 
     def events(self, kind: str | None = None) -> list[JournalEvent]:
         """Return the events in order, all or those of one kind."""
         with self._translate_errors():
-            query = "SELECT id, at, kind, frame, detail FROM event WHERE ?1 IS NULL OR kind = ?1 ORDER BY id"
-            rows = self._db.execute(query, (kind,)).fetchall()
-            return [JournalEvent(a, b, c, d, msgspec.json.decode(detail)) for a, b, c, d, detail in rows]
+            return [
+                JournalEvent(a, b, c, d, msgspec.json.decode(detail, type=dict[str, object]))
+                for a, b, c, d, detail in self._read(_EventRow, _EVENTS, kind)
+            ]
 
     def details[T](self, kind: str, layout: type[T]) -> list[T]:
         """Return the details of the events of a kind, in order, each as an instance of `layout`."""
         with self._translate_errors():
             return [msgspec.convert(event.detail, layout) for event in self.events(kind)]
 
-    def traffic(self) -> list[tuple[float, str, bytes]]:
-        """Return the traffic of the stage as time in s, direction and bytes."""
+    def traffic(self) -> Iterator[tuple[float, str, bytes]]:
+        """Yield the traffic of the stage as time in s, direction and bytes."""
         with self._translate_errors():
-            return self._db.execute("SELECT at_s, direction, data FROM traffic ORDER BY id").fetchall()
-
-    def damage(self) -> str | None:
-        """Return what SQLite's integrity check finds, None if nothing."""
-        with self._translate_errors():
-            found = str(self._db.execute("PRAGMA integrity_check").fetchone()[0])
-            return None if found == "ok" else " ".join(found.split())
+            for row in self._db.execute("SELECT at_s, direction, data FROM traffic ORDER BY id"):
+                yield msgspec.convert(row, _TrafficRow)
 
     def _prepare(self) -> None:
-        """Prefer durability to speed, and create the tables."""
-        self._db.execute("PRAGMA journal_mode = WAL")
-        self._db.execute("PRAGMA synchronous = FULL")
-        self._db.execute("PRAGMA foreign_keys = ON")
-        self._db.executescript(_SCHEMA)
+        """Check all that the journal holds; for writing, prefer durability to speed."""
+        with self._translate_errors():
+            self._db.execute("BEGIN")  # one state of the journal for all checks
+            self.format = check_database(self._db, self.path)
+            self._head = check_chain(self._db, self.path) if self.format > 1 else START
+            self._db.execute("COMMIT")
+            if not self._read_only:
+                self._db.execute("PRAGMA journal_mode = WAL")
+                self._db.execute("PRAGMA synchronous = FULL")
+                self._db.execute("PRAGMA foreign_keys = ON")
+
+    def _read(self, layout: Any, query: str, *arguments: object) -> list[Any]:
+        """Return the rows of a query, each checked against `layout`."""
+        rows = [msgspec.convert(row, layout) for row in self._db.execute(query, arguments).fetchmany(_MAX_ROWS + 1)]
+        if len(rows) > _MAX_ROWS:
+            raise SessionCorrupt(
+                f"{self.path}: holds more than {_MAX_ROWS} entries of a kind; restore the journal from a copy"
+            )
+        return rows
+
+    def _plain(self, file: str) -> str:
+        """Return the name of a frame's file, which must not lead out of its folder."""
+        if not is_plain_name(file):
+            raise SessionCorrupt(f"{self.path}: {file!r:.60} is not the name of a frame; restore it from a copy")
+        return file
+
+    def _add(self, table: str, *rows: tuple[object, ...]) -> int:
+        """Insert rows with consecutive numbers into a table, chain them, and return the number of the last."""
+        if self.format == 1:
+            return insert_rows(self._db, table, rows)[1]
+        self._head, last = add_rows(self._db, self._head, table, rows)
+        return last
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         """Run the block as one transaction, which also writes the pending traffic."""
+        head = self._head
         with self._translate_errors():
             self._db.execute("BEGIN IMMEDIATE")
             try:
                 yield
-                self._db.executemany("INSERT INTO traffic (at_s, direction, data) VALUES (?, ?, ?)", self._traffic)
+                if self._traffic:
+                    self._add("traffic", *((None, *entry) for entry in self._traffic))
                 self._db.execute("COMMIT")
             except BaseException:
+                self._head = head
                 if self._db.in_transaction:
                     self._db.execute("ROLLBACK")
                 raise
         self._traffic.clear()
 
-    @contextmanager
-    def _translate_errors(self) -> Iterator[None]:
-        """Raise `SessionUnwritable` or `SessionCorrupt` for an error of SQLite."""
-        try:
-            yield
-        except (sqlite3.OperationalError, OSError) as failure:
-            raise SessionUnwritable(
-                f"{self.path}: {failure}; make room, or make the folder writable, and run the same command again"
-            ) from failure
-        except (sqlite3.DatabaseError, msgspec.DecodeError) as failure:
-            raise SessionCorrupt(f"{self.path}: {failure}; restore the journal from a copy") from failure
+    def _translate_errors(self) -> AbstractContextManager[None]:
+        """Raise a named failure for an error of SQLite."""
+        return translate_sqlite_errors(self.path, read_only=self._read_only)
 
 
 def _now() -> str:

@@ -1,6 +1,7 @@
 """Begin or resume a session: plan, journal, files and hashes have to agree."""
 
-import hashlib
+import errno
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,8 +9,16 @@ from pathlib import Path
 import msgspec
 
 from faintfield.rig.errors import PlanRefused, SessionCorrupt
-from faintfield.rig.session.disk import PART, lock_session, set_aside, translate_errors, write_new
-from faintfield.rig.session.durable import sync_folder
+from faintfield.rig.session.disk import (
+    PART,
+    list_names,
+    lock_session,
+    set_aside,
+    translate_errors,
+    translate_read_errors,
+    write_new,
+)
+from faintfield.rig.session.durable import make_folder
 from faintfield.rig.session.journal import Begun, CommittedFrame, Journal
 from faintfield.rig.session.regular_files import sha256
 from faintfield.rig.session.session import (
@@ -21,7 +30,8 @@ from faintfield.rig.session.session import (
     Session,
     has_session,
     is_sealed,
-    read_plan,
+    open_journal,
+    read_plan_and_hash,
 )
 from faintfield.rig.settings import RigSettings
 
@@ -46,24 +56,28 @@ def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = ite
     SessionBusy
         Another capture holds the session.
     SessionCorrupt
-        Plan and journal disagree, the session is complete, or the folder holds other files and no session.
-    SessionUnwritable
-        The folder cannot be written.
+        Plan and journal disagree or are damaged, the session is complete, or the folder holds other files and no
+        session.
+    SessionUnreadable, SessionUnwritable
+        The folder cannot be read or written.
     """
     with translate_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     with lock_session(folder):
         if is_sealed(folder):
             raise SessionCorrupt(f"{folder}: is complete and is not written to any more; name another folder")
         if not has_session(folder):
             _begin(folder, plan)
-        frozen = read_plan(folder)
-        with Journal(folder / JOURNAL, create=not (folder / JOURNAL).exists()) as journal:
-            _check_plan_hash(folder, journal)
+        frozen, digest = read_plan_and_hash(folder)
+        names = list_names(folder / FRAMES)
+        if names and not (folder / JOURNAL).exists():
+            raise SessionCorrupt(f"{folder / JOURNAL}: is missing but there are frames; restore it from a copy")
+        with open_journal(folder, frozen, create=True) as journal:
+            _check_plan_hash(folder, journal, digest, begun=bool(names))
             with translate_errors(folder):
-                (folder / FRAMES).mkdir(exist_ok=True)
+                make_folder(folder / FRAMES)
             session = Session(folder, frozen, journal)
-            _reconcile(session, progress)
+            _reconcile(session, names, progress)
             yield session
 
 
@@ -71,45 +85,59 @@ def _begin(folder: Path, plan: FrozenPlan | None) -> None:
     """Write the plan, the first file of a session besides the lock."""
     if plan is None:
         raise SessionCorrupt(f"{folder}: holds no session; name another folder, or begin one from a rig.toml")
-    others = sorted(it.name for it in folder.iterdir() if it.name not in ("lock", PLAN + PART))
+    others = [it for it in list_names(folder) if it not in ("lock", PLAN + PART)]
     if others:
         raise SessionCorrupt(f"{folder}: holds {others[0]} and no session; name a new or empty folder")
     write_new(folder / PLAN, msgspec.json.format(msgspec.json.encode(plan)) + b"\n")
-    sync_folder(folder.parent)
 
 
-def _check_plan_hash(folder: Path, journal: Journal) -> None:
+def _check_plan_hash(folder: Path, journal: Journal, digest: str, *, begun: bool) -> None:
     """Compare the hash of the plan with the one in the journal, or record it in a new journal."""
-    digest = hashlib.sha256((folder / PLAN).read_bytes()).hexdigest()
-    begun = journal.details("begun", Begun)
-    if not begun:
-        if any((folder / FRAMES).glob("*")):
+    stated = journal.details("begun", Begun)
+    if not stated:
+        if begun:
             raise SessionCorrupt(f"{folder / JOURNAL}: is empty but there are frames; restore the journal from a copy")
         journal.event("begun", plan_sha256=digest)
-    elif begun[0].plan_sha256 != digest:
+    elif stated[0].plan_sha256 != digest:
         raise SessionCorrupt(f"{folder / PLAN}: was changed after the session was begun; restore it from a copy")
     else:
         journal.event("resumed")
 
 
-def _reconcile(session: Session, progress: Progress) -> None:
+def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
     """Set aside files that are not in the journal; declare frames void whose file is altered or missing."""
     folder, journal = session.folder, session.journal
     committed = {it.file for it in journal.committed()}
-    with translate_errors(folder):
-        orphans = sorted(path for path in (folder / FRAMES).iterdir() if path.name not in committed)
-    for path in orphans:
-        journal.event("set_aside", file=path.name, to=set_aside(path, folder / ASIDE).name, why="not committed")
+    for name in names:
+        if name not in committed:
+            moved = set_aside(folder / FRAMES / name, folder / ASIDE)
+            journal.event("set_aside", file=_printable(name), to=moved.name, why="not committed")
     for it in progress(list(session.valid().values())):
         path = session.path_of(it)
-        if not path.is_file():
+        if it.file not in names:
             journal.event("gone", frame=it.frame, file=it.file)
-        elif sha256(path) != it.sha256:
+        elif not _is_intact(path, it.sha256):
             moved = set_aside(path, folder / ASIDE)
             journal.event("set_aside", frame=it.frame, file=path.name, to=moved.name, why="altered")
         else:
             continue
         session.void([it], "altered or gone")
+
+
+def _is_intact(path: Path, digest: str) -> bool:
+    """Return whether a frame's file is what was written; one that cannot be read may be, and is an error."""
+    with translate_read_errors(path):
+        try:
+            return sha256(path) == digest
+        except OSError as failure:
+            if failure.errno in (errno.EINVAL, errno.ENOENT, errno.ELOOP):  # no regular file, or a link to nowhere
+                return False
+            raise
+
+
+def _printable(name: str) -> str:
+    """Return a file name without bytes that are no text."""
+    return os.fsencode(name).decode(errors="backslashreplace")
 
 
 def check_same_rig(frozen: FrozenPlan, now: RigSettings) -> None:

@@ -1,7 +1,9 @@
 """The session of a capture: its frames that are taken or missing, how one is recorded, and how all are read."""
 
+import errno
 import hashlib
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,14 +11,20 @@ import msgspec
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import Exposure
-from faintfield.rig.errors import SessionCorrupt
-from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
-from faintfield.rig.session.disk import encode_exposure, write_new
+from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
+from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
+from faintfield.rig.session.database import FORMAT
+from faintfield.rig.session.disk import encode_exposure, list_names, translate_errors, write_new
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
-from faintfield.rig.session.regular_files import sha256
+from faintfield.rig.session.names import is_plain_name
+from faintfield.rig.session.regular_files import read_regular, sha256
 from faintfield.rig.settings import RigSettings
 
 PLAN, JOURNAL, FRAMES, SUMS, ASIDE = "plan.json", "journal.sqlite", "frames", "SHA256SUMS", "set_aside"
+
+
+# Size in bytes of the plan of MAX_FRAMES stops, and more.
+_MAX_PLAN_BYTES = 32_000_000
 
 
 class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
@@ -29,12 +37,16 @@ class FrozenPlan(Struct, frozen=True, forbid_unknown_fields=True):
     rig : RigSettings
         Configuration of the rig when the session was begun.
     format : int
-        Version of the file format.
+        Version of the format of the session.
     """
 
     plan: CapturePlan
     rig: RigSettings
-    format: int = 1
+    format: int = FORMAT
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.format <= FORMAT:
+            raise ValueError(f"the session has format {self.format}, formats 1 to {FORMAT} are read; update faintfield")
 
 
 class WrittenFile(Struct, frozen=True):
@@ -70,7 +82,7 @@ class Session:
         self.journal = journal
         self.frames = planned_frames(frozen.plan)
         self._skipped: set[int] = set()
-        self._valid = {it.frame: it for it in journal.committed() if it.void is None}
+        self._valid = valid_frames(folder, self.frames, journal.committed())
 
     @property
     def plan(self) -> CapturePlan:
@@ -105,7 +117,10 @@ class Session:
     def write(self, frame: PlannedFrame, intent: int, exposure: Exposure) -> WrittenFile:
         """Write the file of an exposure under a name that contains its number, and is therefore unique."""
         content = encode_exposure(exposure)
-        path = self.folder / FRAMES / f"{frame.name}_x{intent}{exposure.suffix}"
+        name = exposure_name(frame, intent) + exposure.suffix
+        if not is_plain_name(name):
+            raise SessionUnwritable(f"{exposure.suffix!r:.60} is no suffix of a file; correct what the camera gives")
+        path = self.folder / FRAMES / name
         # Hash the bytes in memory, while they are written: `verify` then finds errors of the disk.
         with ThreadPoolExecutor(1) as hashing:
             digest = hashing.submit(hashlib.sha256, content)
@@ -136,9 +151,11 @@ class Session:
         Skipped frames are left out for good, as the journal records.
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
+        committed = {it.file for it in self.journal.committed()}
         self.journal.close()
-        names = [PLAN, JOURNAL, *sorted(f"{FRAMES}/{path.name}" for path in (self.folder / FRAMES).iterdir())]
-        lines = [f"{sha256(self.folder / name)}  {name}\n" for name in names]
+        names = [PLAN, JOURNAL, *(f"{FRAMES}/{it}" for it in list_names(self.folder / FRAMES) if it in committed)]
+        with translate_errors(self.folder):
+            lines = [f"{sha256(self.folder / name)}  {name}\n" for name in names]
         write_new(self.folder / SUMS, "".join(lines).encode())
 
 
@@ -153,20 +170,100 @@ def read_plan(folder: Path) -> FrozenPlan:
     Raises
     ------
     SessionCorrupt
-        The plan is missing or cannot be read.
+        The plan is missing or is none.
+    SessionUnreadable
+        The system does not let it be read.
     """
+    return read_plan_and_hash(folder)[0]
+
+
+def read_plan_and_hash(folder: Path) -> tuple[FrozenPlan, str]:
+    """Read the plan of the session in `folder`, and return its SHA-256, too; raises as `read_plan` does."""
     path = folder / PLAN
     try:
-        return msgspec.json.decode(path.read_bytes(), type=FrozenPlan)
+        encoded = read_regular(path, _MAX_PLAN_BYTES)
+        content = msgspec.json.decode(encoded)
+        if place := _find_wild_number(content):
+            raise SessionCorrupt(f"{path}: {place} in size is more than {MAX_NUMBER:g}; restore it from a copy")
+        return msgspec.convert(content, FrozenPlan), hashlib.sha256(encoded).hexdigest()
     except OSError as failure:
-        raise SessionCorrupt(f"{path}: {failure.strerror}; name the folder of a session, or restore the file") from None
-    except (msgspec.DecodeError, ValueError) as failure:
+        if failure.errno in (errno.ENOENT, errno.ENOTDIR):
+            raise SessionCorrupt(f"{path}: is missing; name the folder of a session, or restore the file") from failure
+        if failure.errno in (errno.EINVAL, errno.EFBIG, errno.ELOOP):
+            raise SessionCorrupt(f"{path}: {failure.strerror}; restore it from a copy") from failure
+        raise SessionUnreadable(f"{path}: {failure.strerror}; allow it to be read, or check the disk") from failure
+    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as failure:
         raise SessionCorrupt(f"{path}: is not a plan ({failure}); restore it from a copy") from failure
+
+
+def _find_wild_number(content: object, place: str = "plan") -> str | None:
+    """Return place and value of a number that no rig has, at any depth."""
+    if isinstance(content, dict):
+        parts = [(value, f"{place}.{key}") for key, value in content.items()]
+    elif isinstance(content, list):
+        parts = [(value, f"{place}[{index}]") for index, value in enumerate(content)]
+    elif isinstance(content, int | float) and not abs(content) <= MAX_NUMBER:
+        return f"{place} = {float(content):g}"
+    else:
+        return None
+    return next((found for value, name in parts if (found := _find_wild_number(value, name))), None)
+
+
+def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read_only: bool = False) -> Journal:
+    """Open the journal of the session in `folder`, which has to be of the format of its plan.
+
+    Raises
+    ------
+    SessionCorrupt, SessionUnreadable, SessionUnwritable
+        See `Journal`.
+    """
+    journal = Journal(folder / JOURNAL, create=create, read_only=read_only)
+    if journal.format != frozen.format:
+        journal.close()
+        raise SessionCorrupt(
+            f"{journal.path}: has format {journal.format}, the plan {frozen.format}; restore the journal from a copy"
+        )
+    return journal
+
+
+def find_strangers(frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]) -> Iterator[str]:
+    """Yield how entries of a journal disagree with the plan, one line each."""
+    taken: dict[int, str] = {}
+    for it in committed:
+        if it.frame >= len(frames):
+            yield f"{FRAMES}/{it.file}: is frame {it.frame} of a plan of {len(frames)} frames"
+        elif it.file.partition(".")[0] != exposure_name(frames[it.frame], it.intent):
+            yield f"{FRAMES}/{it.file}: is not a frame of the plan"
+        elif it.record.exposure_s != frames[it.frame].exposure_s:
+            yield f"{FRAMES}/{it.file}: has another exposure time than in the plan"
+        elif it.void is None and taken.setdefault(it.frame, it.file) != it.file:
+            yield f"{FRAMES}/{it.file}: is the same frame as {taken[it.frame]}"
+
+
+def exposure_name(frame: PlannedFrame, intent: int) -> str:
+    """Return the name of the file of an exposure, without its suffix."""
+    return f"{frame.name}_x{intent}"
+
+
+def valid_frames(
+    folder: Path, frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]
+) -> dict[int, CommittedFrame]:
+    """Return the valid frames by their index in the plan.
+
+    Raises
+    ------
+    SessionCorrupt
+        An entry of the journal disagrees with the plan.
+    """
+    entries = list(committed)
+    for problem in find_strangers(frames, entries):
+        raise SessionCorrupt(f"{folder / JOURNAL}: {problem}; restore the journal from a copy")
+    return {it.frame: it for it in entries if it.void is None}
 
 
 def has_session(folder: Path) -> bool:
     """Return whether `folder` holds a session."""
-    return (folder / PLAN).exists()
+    return os.path.lexists(folder / PLAN)
 
 
 def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]]:
@@ -177,7 +274,9 @@ def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]
     SessionCorrupt
         Plan or journal cannot be read.
     """
-    frames = planned_frames(read_plan(folder).plan)
-    with Journal(folder / JOURNAL, read_only=True) as journal:
-        valid = {it.frame: it for it in journal.committed() if it.void is None}
+    frozen = read_plan(folder)
+    frames = planned_frames(frozen.plan)
+    with open_journal(folder, frozen, read_only=True) as journal:
+        valid = valid_frames(folder, frames, journal.committed())
+    list_names(folder / FRAMES)  # refuses a link that leads elsewhere
     return [(it, valid[it.number], folder / FRAMES / valid[it.number].file) for it in frames if it.number in valid]

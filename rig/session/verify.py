@@ -1,17 +1,29 @@
 """Verify a session: compare its plan, journal, files and hashes; nothing is changed."""
 
-import hashlib
-from collections.abc import Callable, Iterable, Iterator
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence, Set
 from pathlib import Path
 
 from msgspec import Struct
 
-from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import PlannedFrame, planned_frames
-from faintfield.rig.session.disk import lock_session
-from faintfield.rig.session.journal import Begun, CommittedFrame, Journal, Sealed, Suspect
-from faintfield.rig.session.regular_files import sha256
-from faintfield.rig.session.session import FRAMES, JOURNAL, PLAN, SUMS, is_sealed, read_plan
+from faintfield.rig.session.disk import list_names, lock_session, translate_read_errors
+from faintfield.rig.session.journal import Begun, CommittedFrame, Sealed, Suspect
+from faintfield.rig.session.regular_files import read_regular, sha256
+from faintfield.rig.session.session import (
+    FRAMES,
+    JOURNAL,
+    PLAN,
+    SUMS,
+    exposure_name,
+    find_strangers,
+    is_sealed,
+    open_journal,
+    read_plan_and_hash,
+)
+
+# The sums of a capture of MAX_FRAMES frames, taken three times each, have this size in bytes.
+_MAX_SUMS_BYTES = 50_000_000
 
 
 class Verdict(Struct, frozen=True):
@@ -20,7 +32,10 @@ class Verdict(Struct, frozen=True):
     Parameters
     ----------
     problems : tuple of str
-        All problems, one line each; empty if there is none.
+        All damage, one line each; empty if there is none. Restore what is named from a copy.
+    interrupted : tuple of str
+        Files in `frames/` of exposures that were cut short. This is ordinary: the next capture sets them aside and
+        takes their frames.
     planned, present : int
         Number of frames in the plan, and of those whose file is present and unchanged.
     missing : tuple of str
@@ -36,6 +51,7 @@ class Verdict(Struct, frozen=True):
     """
 
     problems: tuple[str, ...]
+    interrupted: tuple[str, ...]
     planned: int
     present: int
     missing: tuple[str, ...]
@@ -60,11 +76,11 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
     SessionBusy
         A capture is under way.
     SessionCorrupt
-        Plan or journal cannot be read.
+        Plan or journal are missing, damaged or not what a capture wrote.
+    SessionUnreadable
+        The system does not let the lock, the plan, the journal or the folder of the frames be read.
     """
-    if not (folder / PLAN).is_file():
-        raise SessionCorrupt(f"{folder / PLAN}: is missing; name the folder of a session, or restore the file")
-    if not (folder / "lock").exists():
+    if not os.path.lexists(folder / "lock"):
         return _verify(folder, progress)
     with lock_session(folder, shared=True):
         return _verify(folder, progress)
@@ -72,21 +88,24 @@ def verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]] = 
 
 def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) -> Verdict:
     """Verify a session whose lock is held, or that has none."""
-    frozen = read_plan(folder)
+    frozen, plan_sha256 = read_plan_and_hash(folder)
     frames = planned_frames(frozen.plan)
-    with Journal(folder / JOURNAL, read_only=True) as journal:
-        damage = journal.damage()
+    with open_journal(folder, frozen, read_only=True) as journal:
         committed = journal.committed()
         begun = [event.plan_sha256 for event in journal.details("begun", Begun)]
         sealed = [event.skipped for event in journal.details("sealed", Sealed)]
         suspects = {intent for event in journal.details("suspect", Suspect) for intent in event.intents}
-    digests = {path.name: sha256(path) for path in progress(sorted((folder / FRAMES).glob("*")))}
-    problems = [] if damage is None else [f"{JOURNAL}: {damage}"]
-    if begun != [hashlib.sha256((folder / PLAN).read_bytes()).hexdigest()]:
+        uncommitted = journal.uncommitted()
+    names = list_names(folder / FRAMES)
+    digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
+    interrupted = find_interrupted(frames, uncommitted, set(names) - {it.file for it in committed})
+    problems: list[str] = []
+    if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
         problems.append(f"{PLAN}: is not the plan that the session was begun with")
-    problems += _compare(frames, committed, digests)
+    problems += find_strangers(frames, committed)
+    problems += _compare(committed, digests, set(interrupted))
     if is_sealed(folder):
-        problems += _compare_sums(folder, digests)
+        problems += _compare_sums(folder, committed, digests)
     valid = {it.frame: it for it in committed if it.void is None}
     left_out = {number for numbers in sealed[-1:] for number in numbers}
     open_frames = [it for it in frames if it.number not in valid]
@@ -95,6 +114,7 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
         problems += [f"{name}: is missing although the session is complete" for name in missing]
     return Verdict(
         problems=tuple(problems),
+        interrupted=interrupted,
         planned=len(frames),
         present=sum(digests.get(it.file) == it.sha256 for it in valid.values()),
         missing=missing,
@@ -105,31 +125,53 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     )
 
 
+class _Unreadable(Struct, frozen=True):
+    """Why a file cannot be read; stands in for its hash."""
+
+    why: str
+
+
+def _digest(path: Path) -> str | _Unreadable:
+    """Return the hash of a file, or why there is none."""
+    try:
+        return sha256(path)
+    except OSError as failure:
+        return _Unreadable(failure.strerror or type(failure).__name__)
+
+
+def find_interrupted(
+    frames: Sequence[PlannedFrame], uncommitted: Iterable[tuple[int, int]], orphans: Iterable[str]
+) -> tuple[str, ...]:
+    """Return the names among `orphans` that an exposure without a commit may have left in `frames/`."""
+    begun = {exposure_name(frames[frame], intent) for intent, frame in uncommitted if frame < len(frames)}
+    return tuple(sorted(name for name in orphans if name.partition(".")[0] in begun))
+
+
 def _compare(
-    frames: tuple[PlannedFrame, ...], committed: list[CommittedFrame], digests: dict[str, str]
+    committed: list[CommittedFrame], digests: dict[str, str | _Unreadable], interrupted: Set[str]
 ) -> Iterator[str]:
-    """Yield the disagreements between plan, journal and files."""
-    taken: dict[int, str] = {}
+    """Yield the disagreements between journal and files."""
     for it in committed:
-        if not 0 <= it.frame < len(frames) or not it.file.startswith(frames[it.frame].name):
-            yield f"{FRAMES}/{it.file}: is not a frame of the plan"
-        elif it.void is None and taken.setdefault(it.frame, it.file) != it.file:
-            yield f"{FRAMES}/{it.file}: is the same frame as {taken[it.frame]}"
-        if it.file not in digests:
-            if it.void is None:
+        match digests.get(it.file):
+            case _Unreadable(why=why):
+                yield f"{FRAMES}/{it.file}: cannot be read ({why})"
+            case None if it.void is None:
                 yield f"{FRAMES}/{it.file}: is missing"
-        elif digests[it.file] != it.sha256 and it.void is None:
-            yield f"{FRAMES}/{it.file}: was altered"
-    for name in sorted(digests.keys() - {it.file for it in committed}):
+            case str(digest) if it.void is None and digest != it.sha256:
+                yield f"{FRAMES}/{it.file}: was altered"
+    for name in sorted(digests.keys() - {it.file for it in committed} - interrupted):
         yield f"{FRAMES}/{name}: is not in the journal"
 
 
-def _compare_sums(folder: Path, digests: dict[str, str]) -> Iterator[str]:
-    """Yield the disagreements between SHA256SUMS and the files."""
-    lines = (folder / SUMS).read_text(encoding="utf-8", errors="replace").splitlines()
+def _compare_sums(
+    folder: Path, committed: list[CommittedFrame], digests: dict[str, str | _Unreadable]
+) -> Iterator[str]:
+    """Yield the disagreements between SHA256SUMS and the files; no file is opened because it is named there."""
+    with translate_read_errors(folder / SUMS):
+        lines = read_regular(folder / SUMS, _MAX_SUMS_BYTES).decode(errors="backslashreplace").splitlines()
     stated = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
-    actual = {f"{FRAMES}/{name}": digest for name, digest in digests.items()}
-    actual |= {name: sha256(folder / name) for name in (PLAN, JOURNAL)}
+    frames = {f"{FRAMES}/{it.file}": digests.get(it.file) for it in committed if it.void is None or it.file in digests}
+    actual = frames | {name: _digest(folder / name) for name in (PLAN, JOURNAL)}
     for name in sorted(stated.keys() | actual.keys()):
         if stated.get(name) != actual.get(name):
             yield f"{name}: does not agree with {SUMS}"

@@ -200,7 +200,14 @@ def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
             (f"{key} = ", f"{key} = {value} #", "BadValue", f"{key} = {value}; a share lies between 0 and 1")
             for key, value in (("saturated_share", "7"), ("sharpness_share", "-0.5"))
         ],
-        ("size_px = [64, 48]", "size_px = [400000, 400000]", "DiskFull", "are needed"),
+        ("size_px = [64, 48]", "size_px = [200000, 200000]", "BadValue", "40000000000 pixels, at most 40000000 are"),
+        (
+            "rows = 7\ncolumns = 7",
+            "rows = 100000\ncolumns = 100000",
+            "BadValue",
+            "10000000000 nodes, at most",
+        ),
+        ("frames_per_node = 10", f"frames_per_node = {10**9}", "BadValue", "6000000441 frames, at most 100000 are"),
     ],
 )
 def test_check_refuses_what_cannot_be_done(shell: Shell, old: str, new: str, failure: str, words: str) -> None:
@@ -211,6 +218,14 @@ def test_check_refuses_what_cannot_be_done(shell: Shell, old: str, new: str, fai
     assert len(shell.words.splitlines()) == 1
     assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
     assert not (shell.session / "plan.json").exists()
+
+
+def test_check_asks_for_room_on_the_disk(shell: Shell) -> None:
+    shell.edit("size_px = [64, 48]", "size_px = [6000, 6000]")
+    shell.edit("frames_per_node = 10", "frames_per_node = 1600")
+    assert shell.run("check", shell.rig) == 1
+    assert "faintfield: DiskFull: " in shell.words
+    assert "are needed" in shell.words
 
 
 def test_init_overwrites_nothing(shell: Shell) -> None:

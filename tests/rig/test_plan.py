@@ -1,14 +1,18 @@
 """The plan of a capture: order, times, room on disk, and what is refused before anything moves."""
 
+import math
 from itertools import pairwise
+from typing import Any
 
 import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
-from faintfield.rig.plan import CapturePlan, CaptureStep, Grid, centre_node
+from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, centre_node
+from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
@@ -45,6 +49,38 @@ def test_serpentine_goes_back_and_forth_and_raster_does_not() -> None:
     assert raster == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)]
     assert Grid(7, 7, 50.0, Point(0.0, 0.0)).centre().node == (3, 3)
     assert Grid(2, 4, 50.0, Point(0.0, 0.0)).centre().node == (1, 2) == centre_node(2, 4)
+
+
+def test_a_plan_of_too_many_frames_is_refused_before_they_are_listed() -> None:
+    with pytest.raises(ValueError, match="10000000000 nodes, at most 100000 are possible; take fewer"):
+        Grid(100_000, 100_000, 1.0, Point(0.0, 0.0))
+    plan = plan_of(Grid(100, 100, 1.0, Point(0.0, 0.0)), (CaptureStep("flat", (0.1,), 10),))
+    assert plan.frame_count() == MAX_FRAMES
+    with pytest.raises(ValueError, match="the plan has 110000 frames, at most 100000 are possible; take fewer"):
+        plan_of(Grid(100, 100, 1.0, Point(0.0, 0.0)), (CaptureStep("flat", (0.1,), 11),))
+    with pytest.raises(ValueError, match=f"the plan has {10**12} frames"):
+        plan_of(Grid(1, 1, 1.0, Point(0.0, 0.0)), (CaptureStep("flat", (0.1,), 10**12),))
+
+
+@pytest.mark.parametrize("exposure_s", [0.0, -1.0, math.nan, math.inf, 1e6])
+def test_impossible_exposure_times_are_refused(exposure_s: float) -> None:
+    with pytest.raises(ValueError, match="exposure"):
+        CaptureStep("flat", (0.1, exposure_s))
+
+
+@pytest.mark.parametrize(
+    "impossible",
+    [{"size_px": (200_000, 200_000)}, {"lit_photons_per_s": -1.0}, {"seed": -1}, {"saturation_dn": 2**16}],
+)
+def test_impossible_simulated_cameras_are_refused(impossible: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"camera.*; "):
+        SimulatedSettings(**impossible)
+
+
+@pytest.mark.parametrize("impossible", [{"longest_s": 61.0}, {"wait_s": 1e9}, {"exposure_s": 1e9}])
+def test_endless_rests_are_refused(impossible: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="at most 60 s"):
+        SettleSettings(**impossible)
 
 
 def test_frames_and_disk_space() -> None:
