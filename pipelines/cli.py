@@ -17,7 +17,7 @@ import msgspec
 from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
 from faintfield.pipelines.console import framed_console, inform, visible
-from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, WrongUsage
+from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
 from faintfield.pipelines.log_file import logged
 from faintfield.pipelines.registry import register_commands
 
@@ -88,13 +88,18 @@ def _print_bytes(line: bytes) -> None:
 
 @contextmanager
 def _named_system_errors() -> Iterator[None]:
-    """Name an error of the system that met a command where it expects none: a disk or a network can fail anywhere."""
+    """Name an error of the system that met a command where it expects none: a disk or the memory can fail anywhere."""
     try:
         yield
     except OSError as failure:
         raise FileFailed(
             f"{failure.filename or 'a file'}: {failure.strerror or failure}; see to its disk and its permissions, and "
             "run the same command again"
+        ) from failure
+    except MemoryError as failure:
+        raise MemoryShort(
+            f"the command needs more memory than there is ({str(failure) or 'no size stated'}); ask for less at once, or use "
+            "a machine with more"
         ) from failure
 
 

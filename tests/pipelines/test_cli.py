@@ -234,6 +234,29 @@ def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatc
     assert len(ended.stderr.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("failure", "named"),
+    [
+        (
+            MemoryError("Unable to allocate 8 TiB"),
+            "MemoryShort: the command needs more memory than there is (Unable to",
+        ),
+        (MemoryError(), "MemoryShort: the command needs more memory than there is (no size stated)"),
+        (OSError(5, "Input/output error", "/mnt/x"), "FileFailed: /mnt/x: Input/output error"),
+    ],
+)
+def test_what_the_system_refuses_is_a_named_failure(
+    failure: Exception, named: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise failure
+
+    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    assert cli.run(["report", "x"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"faintfield: {named}")
+
+
 def test_a_bug_is_not_reported_as_a_named_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError
