@@ -22,13 +22,14 @@ _STRIDE = {"capture": 7, "noise": 4, "geometry": 7, "reconstruct": 11, "run": 90
 
 def assert_all_survived(bench: Bench, name: str, faults: list[Fault]) -> None:
     """Try a command with each fault; name all those that it does not survive."""
-    wrong = {}
+    wrong, struck = {}, 0
     for fault in faults:
         try:
-            assert_survives(bench, name, fault)
+            struck += assert_survives(bench, name, fault)
         except AssertionError as failure:
             wrong[str(fault)] = str(failure)
     assert wrong == {}, f"{len(wrong)} of {len(faults)}"
+    assert struck > 0.9 * len(faults)  # a run with other times may make a call less
 
 
 @pytest.mark.parametrize("name", COMMANDS)
