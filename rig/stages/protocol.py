@@ -170,6 +170,10 @@ class Controller(Protocol):
 type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
 
+# pyserial has URLs for more, but one of them writes a file (`spy://`), and a rig.toml may come from anyone.
+_URL_SCHEMES = ("socket", "rfc2217")
+
+
 class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """Connection and limits of the stage.
 
@@ -178,7 +182,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     protocol : str
         Firmware of the controller; `simulated` needs no port and no hardware.
     port : str
-        Serial device or pyserial URL, such as `socket://127.0.0.1:7000`.
+        Serial device, or a pyserial URL of the network such as `socket://127.0.0.1:7000`.
     baud : int
         Bits per second.
     axes : (str, str)
@@ -205,6 +209,12 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not self.port and self.protocol != "simulated":
             raise ValueError("stage.port is missing; give the serial device, such as /dev/ttyUSB0")
+        scheme, of_url, _ = self.port.partition("://")
+        if of_url and scheme not in _URL_SCHEMES:
+            raise ValueError(
+                f"stage.port = {self.port!r}; give a serial device, or a URL that begins with "
+                f"{' or '.join(f'{it}://' for it in _URL_SCHEMES)}"
+            )
         if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
         if self.approach_mm < 0.0:

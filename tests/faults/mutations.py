@@ -12,6 +12,7 @@ half-written, and leave nothing running.
 import fcntl
 import json
 import os
+import resource
 import shutil
 import sqlite3
 import sys
@@ -58,20 +59,20 @@ _EACH_COMMAND = (
     "capture @none @session --yes",
 )
 
-CASES = Path(__file__).parent / "mutation_cases" / "found.jsonl"
+CASES = Path(__file__).parent / "mutation_cases" / "cases.jsonl"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One mutation: the kind of files, the number of the call, and what is done to which file."""
+    """One mutation: the kind of files, the words of the command, and what is done to which file."""
 
     kind: str
-    call: int
+    call: str
     edits: tuple[tuple[str, str, list[Any]], ...]
 
     def __str__(self) -> str:
         done = "; ".join(f"{file}: {name} {_short(arguments)}" for file, name, arguments in self.edits)
-        return f"{KINDS[self.kind].calls[self.call].words}\n    {done}"
+        return f"{self.call}\n    {done}"
 
 
 def _short(arguments: Sequence[Any]) -> str:
@@ -91,6 +92,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.ended: contained.Ended
         self._made: dict[str, Path] = {}
+        self.mutated = False
         self._kind = ""
         self._clean: contained.State = {}
         self._valid = folder / "valid"
@@ -102,17 +104,17 @@ class Bench:
         rng = Random(f"{kind} {seed}")
         self.lay_out(kind)
         place = self._guard / "IN"
-        call = rng.randrange(len(KINDS[kind].calls))
+        call = rng.choice(KINDS[kind].calls).words
         edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
             pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
-            files = sorted(it for it in place.glob(pattern) if it.is_file() and not it.is_symlink())
+            files = sorted(it for it in place.glob(pattern) if mutation_operations.can_be_mutated(it))
             if not files:
                 continue  # an earlier operation removed them
             path = rng.choice(files)
             name, arguments = mutation_operations.draw(rng, path)
             edits.append((str(path.relative_to(place)), name, arguments))
-            self._mutate(*edits[-1])
+            mutation_operations.apply(path, name, arguments)
         if rng.random() < 0.4:
             edits += [(file, "sign", []) for file, *_ in edits]
         return Case(kind, call, tuple(edits))
@@ -120,9 +122,10 @@ class Bench:
     def faults(self, case: Case) -> list[str]:
         """Return what is wrong with how a command ended on the files of a case; nothing if all is well."""
         self.lay_out(case.kind)
-        call = KINDS[case.kind].calls[case.call]
-        for edit in case.edits:
-            self._mutate(*edit)
+        call = next(it for it in KINDS[case.kind].calls if it.words == case.call)
+        for file, name, arguments in case.edits:
+            mutation_operations.apply(self._guard / "IN" / file, name, arguments)
+        self.mutated = contained.state_of(self._guard) != self._clean
         changed = sorted(self._changed(case.kind, call.notices))
         if not all(name in changed for name, *_ in case.edits):
             changed = []  # what vouches for the others was changed, too
@@ -135,12 +138,6 @@ class Bench:
                 faults.append(f"ended well, and then `{call.then}` did not: {self.ended.err[-300:]}")
             self.ended = ended
         return faults
-
-    def _mutate(self, file: str, name: str, arguments: list[Any]) -> None:
-        """Do an operation to a file, if it is still there."""
-        path = self._guard / "IN" / file
-        if os.path.lexists(path):
-            mutation_operations.apply(path, name, arguments)
 
     def faults_of(
         self,
@@ -215,7 +212,7 @@ class Bench:
 
 def _content(path: Path) -> object:
     """Return what a file holds: of a database its rows, of any other its bytes, None if neither can be read."""
-    if not path.is_file() or path.stat().st_size > contained.MAX_FILE_BYTES:
+    if not path.is_file() or not mutation_operations.can_be_mutated(path.resolve()):
         return None
     if path.suffix != ".sqlite":
         return path.read_bytes()
@@ -232,6 +229,8 @@ def _content(path: Path) -> object:
 def warm_up() -> None:
     """Load what commands load when they are first used, so that children inherit it."""
     cv2.setNumThreads(1)
+    # A mutation of a huge file must fail here, not take the memory of all
+    resource.setrlimit(resource.RLIMIT_DATA, (2 * contained.MAX_EXTRA_BYTES, resource.RLIM_INFINITY))
     folder = Path(registry.__file__).parent / "commands"
     for path in folder.rglob("*.py"):
         module = ".".join(path.relative_to(folder).with_suffix("").parts)
@@ -261,8 +260,10 @@ def serve(folder: Path) -> None:
             found = bench.faults_of(named(request["function"]), request["seconds"])
         elif "edits" in request:
             found = _described(bench, "kept", Case(request["kind"], request["call"], request["edits"]))
-            if request.get("succeeds") and bench.ended.code != 0:
-                found.append(bench.ended.err)
+            if not request["edits"] and bench.ended.code != 0:
+                found.append(f"cannot read valid files: {bench.ended.err}")
+            if request["edits"] and not bench.mutated:
+                found.append("nothing was mutated: this case is of an earlier format")
         else:
             seeds = range(request["first"], request["last"])
             found = [it for seed in seeds for it in _described(bench, seed, bench.draw(request["kind"], seed))]

@@ -87,8 +87,8 @@ def ask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ask]:
 
 @pytest.mark.parametrize("kind", KINDS_HERE)
 def test_every_command_reads_the_files_before_they_are_mutated(kind: str, ask: Ask) -> None:
-    for call in range(len(KINDS[kind].calls)):
-        assert ask(kind=kind, call=call, edits=[], succeeds=True) == []
+    for call in KINDS[kind].calls:
+        assert ask(kind=kind, call=call.words, edits=[]) == []
 
 
 @pytest.mark.parametrize("kind", KINDS_HERE)

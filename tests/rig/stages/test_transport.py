@@ -1,6 +1,7 @@
 """Lines over pyserial: bounded waits, every byte in the log, and named failures for lost connections."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -174,3 +175,16 @@ def test_settings_are_checked() -> None:
         StageSettings(protocol="grbl", port="x", axes=("X", "A"))
     StageSettings(protocol="grbl", port="x", axes=("Z", "X"), approach_mm=0.0, feed_mm_per_min=0.1)
     assert open_stage(StageSettings(protocol="simulated")).settings.protocol == "grbl"
+
+
+@pytest.mark.parametrize("scheme", ["spy", "loop", "alt", "hwgrep", "file"])
+def test_a_rig_file_opens_no_url_that_does_more_than_carry_bytes(scheme: str, tmp_path: Path) -> None:
+    written = tmp_path / "written"
+    with pytest.raises(ValueError, match=r"stage.port = .*; give a serial device, or a URL that begins with socket://"):
+        StageSettings("grbl", port=f"{scheme}:///dev/null?file={written}")
+    assert not written.exists()
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyUSB0", "COM3", "socket://10.0.0.7:7000", "rfc2217://10.0.0.7:7000"])
+def test_a_rig_file_names_devices_and_device_servers(port: str) -> None:
+    assert StageSettings("grbl", port=port).port == port
