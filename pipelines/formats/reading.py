@@ -1,8 +1,9 @@
 """Read files, of a bounded size, and turn all that can go wrong into one named failure with the path."""
 
+import errno
 import math
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from io import BufferedReader
 from pathlib import Path
@@ -31,19 +32,30 @@ _OVERHEAD_BYTES = 1_000_000
 
 
 def is_file(path: Path) -> bool:
-    """Return whether there is a regular file; False for names that no file can have."""
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # longer than any name, or with a NUL
-        return False
+    """Return whether there is a regular file; False for names that no file can have.
+
+    Raises
+    ------
+    MissingFile
+        The system does not tell: a right or a disk is lacking.
+    """
+    return _is_there(path, Path.is_file)
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether there is a folder; False for names that none can have."""
+    """Return whether there is a folder; otherwise as `is_file`."""
+    return _is_there(path, Path.is_dir)
+
+
+def _is_there(path: Path, look: Callable[[Path], bool]) -> bool:
     try:
-        return path.is_dir()
-    except (OSError, ValueError):
+        return look(path)
+    except ValueError:  # a name with a NUL
         return False
+    except OSError as failure:
+        if failure.errno == errno.ENAMETOOLONG:
+            return False
+        raise _unreadable(path, failure) from failure
 
 
 @contextmanager

@@ -61,6 +61,6 @@ def test_a_hundred_kills(bench: Bench, name: str) -> None:
     whole_s = time.monotonic() - begun_s
     for share in np.random.default_rng(16).uniform(0.0, 1.0, 100 - len(faults)):
         bench.renew(name)
-        ended = bench.run(name, limit_s=share * whole_s)
+        ended = bench.run(name, limit_s=float(share) * whole_s)
         assert ended.code in (TIME_OVER, 0)
         assert_recovers(bench, name)
