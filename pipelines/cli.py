@@ -98,8 +98,8 @@ def _named_system_errors() -> Iterator[None]:
         ) from failure
     except MemoryError as failure:
         raise MemoryShort(
-            f"the command needs more memory than there is ({str(failure) or 'no size stated'}); ask for less at once, or use "
-            "a machine with more"
+            f"the command needs more memory than there is ({str(failure) or 'no size stated'}); ask for less at once, or "
+            "use a machine with more"
         ) from failure
 
 
