@@ -97,9 +97,9 @@ def _named_system_errors() -> Iterator[None]:
             "run the same command again"
         ) from failure
     except MemoryError as failure:
+        reason = str(failure) or "no size stated"
         raise MemoryShort(
-            f"the command needs more memory than there is ({str(failure) or 'no size stated'}); ask for less at once, or "
-            "use a machine with more"
+            f"the command needs more memory than there is ({reason}); ask for less at once, or use a machine with more"
         ) from failure
 
 
