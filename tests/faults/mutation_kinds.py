@@ -51,12 +51,15 @@ class Call:
         A command that must end well after this one did.
     notices : tuple of str
         Patterns of files within IN whose every change of content must make the command fail.
+    copies : tuple of str
+        Patterns of files that it copies as they are, and another command reads.
     """
 
     words: str
     may_change: tuple[str, ...] = ("OUT", "OUT/*")
     then: str = ""
     notices: tuple[str, ...] = ()
+    copies: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -324,7 +327,7 @@ KINDS: Mapping[str, Kind] = {
     "EMVA 1288": Kind(
         _emva1288,
         ("descriptor.txt", "descriptor.txt", "images/*"),
-        (Call("import emva1288 IN/descriptor.txt OUT"),),
+        (Call("import emva1288 IN/descriptor.txt OUT", copies=("OUT/frames/*",)),),
     ),
     "complete session": Kind(
         _sealed_session,
