@@ -48,8 +48,9 @@ def without_secrets(text: str) -> str:
 
 def inform(text: str) -> None:
     """Print one line for people, and record it in the log if there is one."""
-    console.print(visible(text), markup=False)
-    logger.info(text)
+    line = visible(text)
+    console.print(line, markup=False)
+    logger.info(line)
 
 
 def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Generator[T]:

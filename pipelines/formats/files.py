@@ -152,8 +152,9 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 
 @contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
-    """Lock a folder of results while the block runs; it is created if missing, and removed if it stays empty.
+    """Lock a folder of results while the block runs, and first remove what a killed process left unfinished there.
 
+    The folder is created if missing, and removed if it stays empty.
     On a file system without locks, such as some network disks, nothing keeps a second command out.
 
     Raises
@@ -180,6 +181,7 @@ def exclusive(folder: Path) -> Iterator[None]:
                 f"{folder}: cannot be locked ({failure.strerror}); name a place that can be written"
             ) from failure
     try:
+        remove_leftovers(folder)
         yield
     finally:
         with suppress(OSError):

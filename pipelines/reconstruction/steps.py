@@ -8,7 +8,7 @@ import msgspec
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import NAMED_FAILURES, MissingFile
-from faintfield.pipelines.formats.files import Hashes
+from faintfield.pipelines.formats.files import Hashes, exclusive
 from faintfield.pipelines.formats.provenance import first_difference, provenance
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content
 from faintfield.pipelines.formats.results.records import REPORT_FILE
@@ -67,6 +67,9 @@ def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
     RigError, CalibrationError, ReconstructionError, InputError
         The first failure, after all other steps were done.
     """
+    for folder in (session, session / RECONSTRUCTIONS):
+        with exclusive(folder):
+            pass  # removes what a killed command left there, even if all steps are up to date
     hashes = Hashes(session)
     altered = _altered_frames(session, hashes)
     done: list[StepOutcome] = []

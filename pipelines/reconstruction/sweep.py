@@ -10,6 +10,7 @@ from msgspec import UNSET, structs
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform, progress
+from faintfield.pipelines.errors import FileFailed
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of, words_of
 from faintfield.pipelines.formats.results.plane_files import Origin, PlaneFiles
@@ -192,7 +193,13 @@ class Sweep:
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, runner: Runner, out: Path) -> None:
-        """Run the missing tasks, and write each plane at once."""
+        """Run the missing tasks, and write each plane at once.
+
+        Raises
+        ------
+        FileFailed
+            A colour that was written cannot be read back.
+        """
         for files in self.files:
             if record := files.finished():
                 self.finished[files.method, files.place] = record
@@ -207,6 +214,12 @@ class Sweep:
                 for message in messages:
                     inform(message)
                 self._write_complete(task.files)
+        for files in self.files:
+            if (files.method, files.place) not in self.finished:
+                raise FileFailed(
+                    f"{files.path}: one of its colours cannot be read back after it was written; see to its disk, and "
+                    "run the same command again"
+                )
 
     def _tasks(self) -> list[PlaneTask]:
         """Return the missing tasks, one channel after the other."""

@@ -49,6 +49,11 @@ def test_without_distortion_a_ray_is_the_pixel_from_the_principal_point_in_focal
     np.testing.assert_allclose(rays[10, 40], [(40 - 28.4) / 70.0, (10 - 22.1) / 72.5], rtol=1e-14)
 
 
+def test_the_camera_matrix_maps_undistorted_rays_to_pixels() -> None:
+    matrix = lens_of(()).camera_matrix()
+    np.testing.assert_allclose(matrix @ [0.1, 0.3, 1.0], [70.0 * 0.1 + 28.4, 72.5 * 0.3 + 22.1, 1.0], rtol=1e-14)
+
+
 @given(
     distortion=st.sampled_from(DISTORTIONS),
     first=st.tuples(st.integers(0, 5), st.integers(0, 5)),

@@ -46,9 +46,6 @@ from tests.patience import HANG_S
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
 
-_MAX_WAIT_S = 240.0
-
-
 class Running:
     """A capture in a thread, with its page."""
 
@@ -293,7 +290,7 @@ class Besieged:
 
     def end(self) -> str:
         """Wait until the capture has ended well, and return what it has said since it began."""
-        _, said = self.process.communicate(timeout=_MAX_WAIT_S)
+        _, said = self.process.communicate(timeout=HANG_S)
         assert self.process.returncode == 0, said
         return said
 
@@ -333,10 +330,10 @@ def besieged(address: str, idle: int, slow: int, body_bytes: int) -> Iterator[No
     """Besiege a page while the block runs, which begins when every connection is open and every request was made."""
     signal, other_end = multiprocessing.Pipe()
     besieger = in_process(besiege, address, idle, slow, body_bytes, other_end)
-    assert signal.poll(_MAX_WAIT_S), "the page takes no more requests"
+    assert signal.poll(HANG_S), "the page takes no more requests"
     yield
     signal.send("stop")
-    besieger.join(_MAX_WAIT_S)
+    besieger.join(HANG_S)
     assert besieger.exitcode == 0
 
 
@@ -376,7 +373,7 @@ def test_a_silent_connection_is_closed(running: Running, monkeypatch: pytest.Mon
     parts = urllib.parse.urlsplit(running.address)
     beginnings = (b"", b"GET / HT", f"POST {parts.path}press HTTP/1.1\r\nHost: 127.0.0.1\r\n".encode())
     for beginning in beginnings:
-        with socket.create_connection((parts.hostname, parts.port), _MAX_WAIT_S) as connection:
+        with socket.create_connection((parts.hostname, parts.port), HANG_S) as connection:
             connection.sendall(beginning)
             with suppress(ConnectionResetError):
                 assert connection.recv(1) == b""
@@ -387,7 +384,7 @@ def test_who_does_not_read_the_answer_is_let_go(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(capture_page, "_state", lambda panel: "x" * 50_000_000)
     with serve_page(CapturePanel(unattended=True)) as address:
         parts = urllib.parse.urlsplit(address)
-        with socket.create_connection((parts.hostname, parts.port), _MAX_WAIT_S) as connection:
+        with socket.create_connection((parts.hostname, parts.port), HANG_S) as connection:
             connection.sendall(f"GET {parts.path}state HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
             read = 0
             with suppress(ConnectionResetError):

@@ -3,13 +3,13 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.faults.command_trials import COMMANDS, Bench, assert_survives, bench_in, faults_of
+from tests.faults.command_trials import COMMANDS, Bench, assert_survives, faults_of
 from tests.faults.io_faults import CRASHED, ROOT, Ended, Fault, Trial, compiled
 from tests.patience import HANG_S
 
@@ -18,12 +18,6 @@ _SAMPLE = {"capture": 20, "noise": 15, "geometry": 15, "reconstruct": 12, "run":
 
 # Of the faults that can meet a command, the slow test takes every one of this many: 1 would take hours.
 _STRIDE = {"capture": 7, "noise": 4, "geometry": 7, "reconstruct": 11, "run": 90}
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with bench_in(tmp_path_factory.mktemp("io")) as opened:
-        yield opened
 
 
 def assert_all_survived(bench: Bench, name: str, faults: list[Fault]) -> None:
@@ -45,7 +39,7 @@ def test_a_command_survives_faults_of_the_system(bench: Bench, name: str) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(HANG_S)
+@pytest.mark.timeout(10 * HANG_S)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_survives_many_faults_of_the_system(bench: Bench, name: str) -> None:
     assert_all_survived(bench, name, faults_of(bench.calls(name))[:: _STRIDE[name]])
@@ -160,3 +154,14 @@ def test_a_careful_command_is_not_blamed(tmp_path: Path) -> None:
     bench = Bench(tmp_path, Careless(_named))
     assert bench.calls("noise") == ["write"]
     assert assert_survives(bench, "noise", Fault("write", "fail once", 1, "ENOSPC"))
+
+
+@pytest.mark.parametrize("error", ["EACCES", "EIO"])
+def test_a_colour_that_cannot_be_read_back_is_a_named_failure(bench: Bench, error: str) -> None:
+    bench.undisturbed("reconstruct")
+    diary = bench.folder("reconstruct").with_suffix(".calls").read_text().splitlines()
+    opened = [line for line in diary if line.split()[0] == "0"]
+    back = [nth for nth, line in enumerate(opened, 1) if "/.parts/" in line and not line.endswith(".unfinished")]
+    assert back
+    for nth in back:
+        assert_survives(bench, "reconstruct", Fault("open", "fail once", nth, error))

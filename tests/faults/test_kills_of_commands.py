@@ -2,24 +2,17 @@
 
 import signal
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
 from faintfield.rig.session.verify import verify
-from tests.faults.command_trials import Bench, bench_in
+from tests.faults.command_trials import Bench
 from tests.faults.io_faults import TIME_OVER, Fault
 from tests.patience import HANG_S
 
 _NAMES = ("noise", "geometry", "run")
 _CHANGING = {"create", "write", "sync", "rename", "remove", "make", "allocate"}
-
-
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    with bench_in(tmp_path_factory.mktemp("kills")) as opened:
-        yield opened
 
 
 def kills(calls: list[str], changing: int, others: int) -> list[Fault]:

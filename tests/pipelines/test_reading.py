@@ -25,6 +25,7 @@ from faintfield.pipelines.formats.files import Hashes, exclusive, sha256
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_arrays, read_content, read_json
 from faintfield.pipelines.formats.toml_files import inside, read_toml
+from tests.patience import HANG_S
 
 
 class _Settings(msgspec.Struct, forbid_unknown_fields=True):
@@ -197,7 +198,7 @@ def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path) -> None:
     (tmp_path / "long.tiff").write_bytes((tmp_path / "circle.tiff").read_bytes()[:100])
     names = ["size.tiff", "strip.tiff", "circle.tiff", "size.png", "size.jpg", "long.tiff"]
     words = [sys.executable, "-c", _READ_FRAMES, *(str(tmp_path / name) for name in names)]
-    ended = subprocess.run(words, capture_output=True, text=True, timeout=300, check=False)
+    ended = subprocess.run(words, capture_output=True, text=True, timeout=HANG_S, check=False)
     assert (ended.returncode, ended.stderr) == (0, "")
     *lines, grown_mb = ended.stdout.splitlines()
     reasons = [

@@ -14,7 +14,7 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
+from faintfield.pipelines.formats.files import exclusive, remove, remove_leftovers, sha256, write_record, write_whole
 from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, MAX_NODE, sound_node, sound_pose
 from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
 
@@ -181,12 +181,14 @@ def write_geometry(out: Path, record: GeometryRecord, beside: Mapping[str, bytes
 
     geometry.json is removed first and written last: where it stands, it vouches for the files beside it.
     """
-    remove(out / GEOMETRY_FILE)
-    if (cameras := (out / CAMERA_FILE).parent).is_symlink():  # files are written and removed in `out` alone
-        remove(cameras)
-    for earlier in out.glob(CAMERA_FILE.format("*", "*")):
-        remove(earlier)  # the node may not be part of the new geometry
-    for name, content in beside.items():
-        write_whole(out / name, content)
-    hashes = {name: sha256(out / name) for name in beside}
-    write_record(out / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))
+    with exclusive(out):
+        remove(out / GEOMETRY_FILE)
+        if (cameras := (out / CAMERA_FILE).parent).is_symlink():  # files are written and removed in `out` alone
+            remove(cameras)
+        remove_leftovers(cameras)
+        for earlier in out.glob(CAMERA_FILE.format("*", "*")):
+            remove(earlier)  # the node may not be part of the new geometry
+        for name, content in beside.items():
+            write_whole(out / name, content)
+        hashes = {name: sha256(out / name) for name in beside}
+        write_record(out / GEOMETRY_FILE, msgspec.structs.replace(record, sha256=hashes))

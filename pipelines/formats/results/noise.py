@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole, writing
+from faintfield.pipelines.formats.files import exclusive, remove, sha256, write_record, write_whole, writing
 from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
@@ -157,13 +157,14 @@ def write_noise(
     pages : mapping of str to bytes
         PNG by file name.
     """
-    remove(out / NOISE_FILE)
-    with writing(out / NOISE_MAPS) as file:
-        np.savez_compressed(file, allow_pickle=False, **dict(maps))
-    for name, page in pages.items():
-        write_whole(out / name, page)
-    record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
-    write_record(out / NOISE_FILE, record)
+    with exclusive(out):
+        remove(out / NOISE_FILE)
+        with writing(out / NOISE_MAPS) as file:
+            np.savez_compressed(file, allow_pickle=False, **dict(maps))
+        for name, page in pages.items():
+            write_whole(out / name, page)
+        record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))
+        write_record(out / NOISE_FILE, record)
     return record
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.rig.cameras.protocol import Pixels
+from faintfield.rig.cameras.protocol import CameraReport, Pixels
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.capture.guide import Answer, OperatorRequest, Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.settling import Settling
-from faintfield.rig.capture.survey import survey
+from faintfield.rig.capture.survey import check_plan, survey
 from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import CaptureStopped, OutsideTravel, PlanRefused, RigError
 from faintfield.rig.plan import Grid, PlannedFrame
@@ -223,6 +223,28 @@ def test_settling_is_measured_once_per_session(tmp_path: Path) -> None:
     assert rest_s - 0.4 <= found[0].wait_s <= rest_s - 0.2 + 0.2
     shifts = [shift for _, shift in found[0].curve]
     assert shifts[0] > 5 * max(shifts[-10:])
+
+
+def test_a_rig_that_never_rests_is_told_and_given_the_longest_rest(tmp_path: Path) -> None:
+    restless = Settling(SWINGING.settle.longest_s, settled=False, scatter_px=1.0, curve=((0.0, 1.0),))
+    person = Person({}, {2: "stop"})
+    with mock.patch("faintfield.rig.capture.take.measure_settling", return_value=restless):
+        run(tmp_path / "session", person, SWINGING)
+    assert any("not seen at rest within 3 s" in line for status in person.statuses for line in status.warnings)
+
+
+def test_an_exposure_time_that_the_camera_lacks_is_refused_with_the_nearest() -> None:
+    rig = open_rig(SMALL_RIG)
+    found = survey(rig, SMALL_RIG)
+    rig.stage.connect()
+    offered = CameraReport("camera", 1000, exposures_s=(0.05, 0.2, 0.5, 2.0))
+    with pytest.raises(PlanRefused, match=r"exposure_s = 0\.1 is not offered .* nearest that is: (0\.05|0\.2);"):
+        check_plan(found.plan, rig.stage, offered)
+    with pytest.raises(PlanRefused, match=r"exposure_s = 1 is not offered .* nearest that is: (0\.5|2);"):
+        check_plan(found.plan, rig.stage, CameraReport("camera", 1000, exposures_s=(0.1, 0.5, 2.0)))
+    with pytest.raises(PlanRefused, match=r"exposure_s = 1 is not offered .* nearest that is: 1\.5;"):
+        check_plan(found.plan, rig.stage, CameraReport("camera", 1000, exposures_s=(0.1, 0.6, 1.5)))
+    check_plan(found.plan, rig.stage, CameraReport("camera", 1000, exposures_s=(0.1005, 0.995)))
 
 
 @pytest.mark.parametrize("rows", [2, 7])

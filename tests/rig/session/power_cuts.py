@@ -40,20 +40,25 @@ class Disk:
         else:
             self._content[state.st_ino] = Path(f"/proc/self/fd/{descriptor}").read_bytes()
 
-    def lay_out(self, target: Path) -> None:
-        """Copy to `target` what a power cut would leave now."""
-        self._lay_out(self.root, self.root.stat().st_ino, target)
+    def lay_out(self, target: Path, *, all_entries: bool = False) -> None:
+        """Copy to `target` what a power cut would leave now.
+
+        With `all_entries`, folders have their present entries: a file system may write a new name early, and the bytes
+        of its file late.
+        """
+        self._lay_out(self.root, self.root.stat().st_ino, target, all_entries)
 
     def close(self) -> None:
         for descriptor in self._kept:
             os.close(descriptor)
 
-    def _lay_out(self, folder: Path, inode: int, target: Path) -> None:
+    def _lay_out(self, folder: Path, inode: int, target: Path, all_entries: bool) -> None:
         target.mkdir()
-        for name, entry in self._entries.get(inode, {}).items():
+        present = {it.name: it.inode() for it in os.scandir(folder)} if all_entries else {}
+        for name, entry in (present or self._entries.get(inode, {})).items():
             there = folder / name
             if entry in self._entries or (there.is_dir() and there.stat().st_ino == entry):
-                self._lay_out(there, entry, target / name)
+                self._lay_out(there, entry, target / name, all_entries)
             else:
                 (target / name).write_bytes(self._content.get(entry, b""))
         if (target / "journal.sqlite").exists():

@@ -17,6 +17,8 @@ from tests.rig.session.power_cuts import Disk, record
 class Cuts:
     """Lays out what is left by a power cut at each change, in folders of its own."""
 
+    all_entries = False
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.remains: list[Path] = []
@@ -24,7 +26,7 @@ class Cuts:
 
     def __call__(self, disk: Disk) -> None:
         remains = self.folder / f"{next(self._numbers):04d}"
-        disk.lay_out(remains)
+        disk.lay_out(remains, all_entries=self.all_entries)
         self.remains.append(remains)
 
 
@@ -40,7 +42,9 @@ def live(tmp_path: Path) -> Path:
     return folder
 
 
-def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cuts: Cuts) -> None:
+@pytest.mark.parametrize("all_entries", [False, True])
+def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cuts: Cuts, all_entries: bool) -> None:
+    cuts.all_entries = all_entries
     root = live(tmp_path)
     with record(root, cuts):
         capture_small(root / "new" / "session")
@@ -52,6 +56,8 @@ def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cu
             verdict = verify(session)
             assert verdict.problems == (), remains.name
             present.append(verdict.present)
+        for path in session.glob("frames/*.tiff"):
+            assert path.stat().st_size > 0  # a name is given to whole files only
     assert present == sorted(present)
     assert set(present) == set(range(FRAMES + 1))
     assert not verify(cuts.remains[-1] / "new" / "session").missing
