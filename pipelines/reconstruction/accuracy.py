@@ -67,7 +67,7 @@ def _errors(
     at_depth = true_plane(truth, depth)
     assert at_depth is not None
     texture, region = texture_and_region(folder, at_depth)
-    if plane.shape != texture.shape:
+    if not plane.shape == texture.shape == bright.shape:
         return None
     error = mean_square_error(plane, bright, region)
     return PlaneErrors(

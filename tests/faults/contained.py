@@ -178,7 +178,9 @@ def state_of(folder: Path) -> State:
     return found
 
 
-def faults_of(ended: Ended, folder: Path, before: State, may_change: tuple[str, ...]) -> list[str]:
+def faults_of(
+    ended: Ended, folder: Path, before: State, may_change: tuple[str, ...], copies: tuple[str, ...] = ()
+) -> list[str]:
     """Return what is wrong with how a child ended, and with what it left in the folder around all of its files.
 
     Parameters
@@ -191,6 +193,8 @@ def faults_of(ended: Ended, folder: Path, before: State, may_change: tuple[str, 
         The state of the folder before the child was started.
     may_change : tuple of str
         Patterns of the files that it may change, add or remove.
+    copies : tuple of str
+        Patterns of the files that are copied as they are, and may be as damaged as their originals.
     """
     after = state_of(folder)
     changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
@@ -202,7 +206,7 @@ def faults_of(ended: Ended, folder: Path, before: State, may_change: tuple[str, 
             continue
         elif any(fnmatchcase(os.path.basename(name), pattern) for pattern in _UNFINISHED):
             faults.append(f"half-written: {name!r} was left")
-        elif flaw := _flaw(folder / name):
+        elif not any(fnmatchcase(name, pattern) for pattern in copies) and (flaw := _flaw(folder / name)):
             faults.append(f"half-written: {name!r} {flaw}")
     return faults
 

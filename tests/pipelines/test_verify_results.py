@@ -302,3 +302,14 @@ def test_a_digest_is_of_the_text_without_white_space() -> None:
     assert digest_holds(content.replace(b"x  y", b"x y")) is False
     assert digest_holds(content.rstrip()[:-1] + b', "later": 1}') is False
     assert digest_holds(b'{"a": 1.0}') is None
+
+
+def test_of_two_sets_that_are_described_alike_the_one_with_the_same_images_is_meant(
+    planes: Path, done: Command
+) -> None:
+    other = shutil.copytree(planes.parent / "scene", planes.parent / "another", symlinks=True)
+    shutil.copyfile(other / "view_r0_c1.tiff", other / "view_r0_c0.tiff")
+    assert "from another" not in done("verify", planes).stderr
+    shutil.rmtree(planes.parent / "scene")
+    with pytest.raises(ResultDamaged, match=r"was made from another view_r0_c0\.tiff"):
+        verify(planes)

@@ -248,17 +248,22 @@ def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:
 
     The first input is the file that describes the others, such as elemental.toml or the plan of a session.
     """
-    described_in, known = next(iter(inputs.items()))
+    described_in = next(iter(inputs))
     folder = record.parent.resolve()
     around = [folder, *folder.parents[:_LEVELS_ABOVE]]
     for candidate in around:
         if _exists(candidate / described_in):
             return candidate
+    beside: list[Path] = []
     with suppress(OSError):  # a folder around it that may not be listed
-        for candidate in (one for level in around[1:] for one in sorted(level.iterdir()) if one.is_dir()):
-            if problem_of_file(candidate / described_in, candidate, known) is None:
-                return candidate
-    return None
+        beside = [one for level in around[1:] for one in sorted(level.iterdir()) if one.is_dir()]
+    # Several sets may be described alike: the one whose files are the same, too, is meant
+    for name, digest in inputs.items():
+        same = [one for one in beside if problem_of_file(one / name, one, digest) is None]
+        beside = same or ([] if name == described_in else beside)
+        if len(beside) < 2:
+            break
+    return beside[0] if beside else None
 
 
 def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:

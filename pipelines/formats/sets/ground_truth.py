@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.pipelines.errors import WrongSize
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.results.records import Poses
@@ -58,5 +59,19 @@ def true_plane(truth: Truth | None, depth_mm: float) -> TruePlane | None:
 
 
 def texture_and_region(folder: Path, plane: TruePlane) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Return the object's texture (row, column[, colour]) and the region (row, column) where it is visible."""
-    return read_frame(folder / plane.texture).pixels_dn, read_frame(folder / plane.visible).pixels_dn > 127
+    """Return the object's texture (row, column[, colour]) and the region (row, column) where it is visible.
+
+    Raises
+    ------
+    MissingFile, UnreadableImage
+        A file cannot be read.
+    WrongSize
+        The two are of different sizes.
+    """
+    texture, visible = (read_frame(folder / name).pixels_dn for name in (plane.texture, plane.visible))
+    if visible.shape != texture.shape[:2]:
+        raise WrongSize(
+            f"{folder / plane.visible}: is {visible.shape}, {plane.texture} {texture.shape[:2]} (rows, columns); "
+            "simulate the set again"
+        )
+    return texture, visible > 127
