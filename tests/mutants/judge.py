@@ -123,17 +123,18 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def recorded(packages: Iterable[str], jobs: int) -> Known:
-    """Return the tests of packages; those of a file are recorded anew where it or any source has changed."""
+    """Return the tests of packages; those of a file are recorded anew where it or its package has changed."""
     tree, store = refresh_tree(), WORK / "recorded"
     store.mkdir(parents=True, exist_ok=True)
-    sources = digest(path for package in PACKAGES for path in sorted((tree / package).rglob("*.py")))
     seconds, lines, waiting, records = {}, {}, {}, []
-    tops = [tree / top for package in packages for top in _TESTS[package]]
-    for path in sorted(path for top in tops for path in [top, *top.rglob("test_*.py")] if path.is_file()):
-        record = store / f"{digest([path])[:16]}-{sources[:16]}.json"
-        records.append(record)
-        if not record.exists():
-            waiting[record] = path.relative_to(tree)
+    for package in packages:
+        sources = digest(sorted((tree / package).rglob("*.py")))
+        tops = [tree / top for top in _TESTS[package]]
+        for path in sorted(path for top in tops for path in [top, *top.rglob("test_*.py")] if path.is_file()):
+            record = store / f"{digest([path])[:16]}-{sources[:16]}.json"
+            records.append(record)
+            if not record.exists():
+                waiting[record] = path.relative_to(tree)
     processes = Processes(jobs)
     for record, path in waiting.items():
         processes.start(

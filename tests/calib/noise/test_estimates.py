@@ -38,7 +38,8 @@ def moments(*frames: float, exposure_s: tuple[float, ...] = (0.1, 10.0, 60.0)) -
 
 def test_intervals_are_symmetric_and_those_of_positive_quantities_on_a_logarithmic_scale() -> None:
     plain = _interval(-2.0, 0.1, 1.96)
-    assert (plain.value, plain.se, plain.ci95) == (-2.0, 0.1, pytest.approx((-2.196, -1.804)))
+    assert (plain.value, plain.se) == (-2.0, 0.1)
+    assert plain.ci95 == pytest.approx((-2.196, -1.804))
     positive = _interval(2.0, 0.1, 1.96, positive=True)
     assert positive.ci95 == pytest.approx((2 * np.exp(-0.098), 2 * np.exp(0.098)))
 

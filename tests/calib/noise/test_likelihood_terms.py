@@ -61,10 +61,10 @@ def by_scipy(values: dict[str, float], moments: Moments) -> float:
         total += stats.chi2.logpdf(squares / variance, (n - 1) * moments.freedom) - np.log(variance)
     scale = np.diag(v / of_darks.frames) + values["dsnu_dn2"] + values["dcnu_dn2_per_s2"] * np.outer(t, t)
     several = np.ix_(repeated, repeated)
-    total += stats.wishart.logpdf(of_darks.scatter_dn2[several], moments.freedom, scale[several])
+    total += float(stats.wishart.logpdf(of_darks.scatter_dn2[several], moments.freedom, scale[several]))
     level = values["jitter_dn2"] + v / moments.pixels
     line = values["offset_dn"] + values["dark_signal_dn_per_s"] * t
-    total += stats.norm.logpdf(of_darks.mean_dn, line, np.sqrt(level / of_darks.frames)).sum()
+    total += float(np.sum(stats.norm.logpdf(of_darks.mean_dn, line, np.sqrt(level / of_darks.frames))))
     for n, squares, variance in zip(
         of_darks.frames[repeated], of_darks.level_scatter_dn2[repeated], level[repeated], strict=True
     ):

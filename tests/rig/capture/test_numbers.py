@@ -101,7 +101,7 @@ def test_the_leak_is_the_range_of_an_eighths_means_less_that_of_chance() -> None
 
 def board_frames(sweeps: int = 2, nodes: int = 6) -> list[PlannedFrame]:
     """Return the frames of board sweeps, and one bright frame after them."""
-    frames = []
+    frames: list[PlannedFrame] = []
     for sweep in range(sweeps):
         for column in range(nodes):
             stop = Stop((0, column), Point(float(column), 0.0))
