@@ -59,7 +59,9 @@ class Known:
     lines: dict[str, dict[str, frozenset[int]]]
 
     def runs(self, mutant: Mutant) -> set[str]:
-        """Return the tests that run the lines of a mutant."""
+        """Return the tests that run the lines of a mutant; none for what only runs while numba compiles."""
+        if runs_in_the_compiler(mutant.file):
+            return set()
         return {name for name, lines in self.lines.items() if lines.get(mutant.file, frozenset()) & {*mutant.lines}}
 
     def tests_of(self, mutant: Mutant) -> list[str]:
@@ -169,6 +171,12 @@ def digest(paths: Iterable[Path]) -> str:
 def is_compiled(file: str) -> bool:
     """Return whether numba compiles functions of a file."""
     return file.startswith("recon/") and "numba" in (ROOT / file).read_text()
+
+
+@cache
+def runs_in_the_compiler(file: str) -> bool:
+    """Return whether a file extends numba: its functions run only where nothing compiled is in the cache."""
+    return "numba.extending" in (ROOT / file).read_text()
 
 
 @cache
