@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
-from faintfield.calib.detection import BoardCorners, detect_all, detect_boards
+from faintfield.calib.detection import BoardCorners, detect_all, detect_boards, stretch
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.rig.simulation.boards import SimulatedBoard, six_boards
 from faintfield.rig.simulation.experiment import paper_experiment
@@ -149,3 +149,14 @@ def test_photographs_calibrate_as_well_as_documented() -> None:
 @needs_data
 def test_visible_corners_of_an_occluded_board_are_found() -> None:
     assert len(photograph("chocclusion_original").corners) == 16
+
+
+@pytest.mark.parametrize("scale", [1.0, 4000.0])
+def test_images_of_any_depth_are_stretched_from_black_to_white(scale: float) -> None:
+    light = np.full((400, 600), 1.0, np.float32)
+    light[:, 200:400], light[:, 400:] = 1.5, 2.0
+    light[10:20, 10:20], light[380:390, 580:590] = 0.2, 3.0  # less than 0.2 % of the pixels
+    found = stretch(scale * light)
+    assert found.dtype == np.uint8
+    assert found[200, [100, 300, 500]] == pytest.approx([0, 127.5, 255], abs=1)
+    assert (found[15, 15], found[385, 585]) == (0, 255)

@@ -77,10 +77,13 @@ def verdicts_of(mutants: list[Mutant], jobs: int) -> dict[str, str]:
             if verdict not in _FOUND:
                 os.write(terminal, f"{verdict}: {mutant.name}\n".encode())
 
+        begin = _VERDICTS.stat().st_size if _VERDICTS.exists() else 0
         preload()
         known = recorded(sorted({mutant.file.partition("/")[0] for mutant in waiting}), jobs)
         judge(waiting, known, jobs, keep)
-        verdicts = known_verdicts()
+        with _VERDICTS.open() as kept:
+            kept.seek(begin)
+            verdicts |= {row["name"]: row["verdict"] for row in map(json.loads, kept)}
     return {mutant.name: verdicts[mutant.name] for mutant in mutants}
 
 

@@ -59,7 +59,9 @@ class Known:
     lines: dict[str, dict[str, frozenset[int]]]
 
     def runs(self, mutant: Mutant) -> set[str]:
-        """Return the tests that run the lines of a mutant."""
+        """Return the tests that run the lines of a mutant; none for what only runs while numba compiles."""
+        if runs_in_the_compiler(mutant.file):
+            return set()
         return {name for name, lines in self.lines.items() if lines.get(mutant.file, frozenset()) & {*mutant.lines}}
 
     def tests_of(self, mutant: Mutant) -> list[str]:
@@ -123,17 +125,18 @@ def _same(one: Path, other: Path) -> bool:
 
 
 def recorded(packages: Iterable[str], jobs: int) -> Known:
-    """Return the tests of packages; those of a file are recorded anew where it or any source has changed."""
+    """Return the tests of packages; those of a file are recorded anew where it or its package has changed."""
     tree, store = refresh_tree(), WORK / "recorded"
     store.mkdir(parents=True, exist_ok=True)
-    sources = digest(path for package in PACKAGES for path in sorted((tree / package).rglob("*.py")))
     seconds, lines, waiting, records = {}, {}, {}, []
-    tops = [tree / top for package in packages for top in _TESTS[package]]
-    for path in sorted(path for top in tops for path in [top, *top.rglob("test_*.py")] if path.is_file()):
-        record = store / f"{digest([path])[:16]}-{sources[:16]}.json"
-        records.append(record)
-        if not record.exists():
-            waiting[record] = path.relative_to(tree)
+    for package in packages:
+        sources = digest(sorted((tree / package).rglob("*.py")))
+        tops = [tree / top for top in _TESTS[package]]
+        for path in sorted(path for top in tops for path in [top, *top.rglob("test_*.py")] if path.is_file()):
+            record = store / f"{digest([path])[:16]}-{sources[:16]}.json"
+            records.append(record)
+            if not record.exists():
+                waiting[record] = path.relative_to(tree)
     processes = Processes(jobs)
     for record, path in waiting.items():
         processes.start(
@@ -168,6 +171,12 @@ def digest(paths: Iterable[Path]) -> str:
 def is_compiled(file: str) -> bool:
     """Return whether numba compiles functions of a file."""
     return file.startswith("recon/") and "numba" in (ROOT / file).read_text()
+
+
+@cache
+def runs_in_the_compiler(file: str) -> bool:
+    """Return whether a file extends numba: its functions run only where nothing compiled is in the cache."""
+    return "numba.extending" in (ROOT / file).read_text()
 
 
 @cache

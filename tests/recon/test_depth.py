@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.recon.depth.agreement import Agreement, agreement, bins_for, depth_map
+from faintfield.recon.depth.agreement import _MODEL_ERROR, Agreement, agreement, bins_for, depth_map
 from faintfield.recon.depth.focus import SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
@@ -71,6 +71,22 @@ def test_the_squares_of_agreeing_views_equal_their_degrees_of_freedom(halves: li
     per_freedom = plane.squares[inner].sum() / (plane.sensitivity[inner] - 1).sum()
     assert 0.75 < per_freedom < 1.1  # interpolation removes noise, and the variance allows for model error
     assert halves[FAR].squares[inner].sum() > 1.5 * plane.squares[inner].sum()
+
+
+def test_the_squares_of_even_views_are_those_of_their_levels_less_the_background() -> None:
+    rows, columns = np.indices((12, 16), float)
+    operator = PlaneOperator(
+        np.stack([np.eye(3)] * 3), np.stack([columns, rows], axis=-1), PlaneGrid((12, 16), 1.0, (0.0, 0.0))
+    )
+    light_e, background_e, read_variance_e2 = np.array([18.0, 20.0, 25.0]), 3.0, 2.0
+    electrons = np.broadcast_to((light_e + background_e)[:, None, None], (3, 12, 16)).astype(np.float32)
+    found = agreement(operator, ElementalImages(electrons, background_e, read_variance_e2))
+    mean_e = light_e.mean()
+    variance_e2 = mean_e + background_e + read_variance_e2 + (_MODEL_ERROR * mean_e) ** 2
+    np.testing.assert_allclose(found.light, mean_e, rtol=1e-5)
+    np.testing.assert_allclose(found.squares, np.sum((light_e - mean_e) ** 2) / variance_e2, rtol=1e-5)
+    np.testing.assert_allclose(found.light_variance, variance_e2 / 3, rtol=1e-5)
+    np.testing.assert_allclose(found.sensitivity, 3.0)
 
 
 @pytest.mark.parametrize("level_e", [0.0, 20.0])

@@ -1,5 +1,6 @@
 """The geometry against the simulated truth: errors, stated uncertainty, and what is refused."""
 
+import os
 from dataclasses import replace
 
 import cv2
@@ -18,7 +19,7 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
-from faintfield.calib.geometry.bundle import BundleProblem, solve
+from faintfield.calib.geometry.bundle import BundleProblem, _c_library_silenced, solve
 from faintfield.calib.geometry.observations import gather
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
 from faintfield.calib.lens import Lens
@@ -302,3 +303,11 @@ def test_a_board_that_is_not_the_print_is_refused() -> None:
     narrower = {name: replace(board, columns=8) for name, board in BOARDS.items()}
     with pytest.raises(ValueError, match="has no corner 47; give the board as printed"):
         calibrate_geometry(narrower, given.observations, OPTICS.size_px, given.reference)
+
+
+def test_what_the_solver_says_is_dropped_and_standard_error_works_again_afterwards() -> None:
+    before = os.fstat(2)
+    with _c_library_silenced():
+        assert not os.path.samestat(os.fstat(2), before)
+        assert os.path.samestat(os.fstat(2), os.stat(os.devnull))
+    assert os.path.samestat(os.fstat(2), before)

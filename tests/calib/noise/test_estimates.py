@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from faintfield.calib.noise import Conditions, measure_series
 from faintfield.calib.noise.estimates import (
     _in_electrons,
     _interval,
     _levels_quantile,
+    _light_e,
     _root,
     _why_no_current,
     _why_no_gain,
@@ -18,6 +20,7 @@ from faintfield.calib.noise.fitting import NoiseLikelihood, choose_likelihood
 from faintfield.calib.noise.gaussian import NoiseFit
 from faintfield.calib.noise.marginal import Counts
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
+from tests.calib.noise.darkroom import darks, specimen
 
 NAMES = ("offset_dn", "log_read_dn2", "dsnu_dn2", "jitter_dn2", "dark_signal_dn_per_s", "log_gain")
 
@@ -149,3 +152,12 @@ def test_the_simplest_likelihood_that_holds_is_chosen() -> None:
     assert choose_likelihood(counts(), fit(**many_dn), 0.0) is NoiseLikelihood.EXACT
     assert choose_likelihood(counts(), fit({"log_gain": 0.6}, **many_dn), 0.0) is NoiseLikelihood.GAUSSIAN
     assert choose_likelihood(counts(), fit(**many_dn, dark_signal_dn_per_s=-0.1), 0.0) is NoiseLikelihood.GAUSSIAN
+
+
+def test_the_electrons_of_a_flat_are_its_bent_signal_less_the_dark_current() -> None:
+    chip, rng = specimen(1, shape=(16, 16))
+    flat = measure_series(darks(chip, [2.0], 3, rng)[2.0], Conditions("flat", 2.0))
+    bent = fit(nonlinearity_per_dn=1e-4)
+    # The charge behind a signal s is s (1 + κ s), of which d t is dark
+    assert _light_e(bent, flat, 2100.0) == pytest.approx((2000.0 * 1.2 - 0.4 * 2.0) / 2.0)
+    assert _light_e(fit(), flat, 2100.0) == pytest.approx((2000.0 - 0.8) / 2.0)

@@ -110,6 +110,18 @@ def test_no_position_is_reported_while_the_stage_moves_or_is_held() -> None:
     assert stage.trusted, "a hold slows down without losing steps"
 
 
+def test_holding_takes_no_longer_than_slowing_down_and_two_reports() -> None:
+    bench = Bench(SimulatedGrbl)
+    stage = homed(bench)
+    stage.move_to(-300.0, -300.0)
+    bench.firmware.receive(b"$J=G53 G90 X-100 F6000\n")
+    bench.clock.sleep_s(0.5)
+    begun_s = bench.clock.now_s()
+    stage.hold()
+    assert bench.clock.now_s() - begun_s < 1.5
+    assert not bench.firmware.mechanics.moving
+
+
 def test_a_stage_that_moves_far_longer_than_predicted_is_stopped() -> None:
     bench = Bench(SimulatedGrbl)
     stage = homed(bench)

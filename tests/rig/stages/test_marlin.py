@@ -72,6 +72,18 @@ def test_recovery_notices_an_unseen_restart() -> None:
     assert not stage.trusted
 
 
+def test_a_board_that_answers_is_recovered_without_restarting_it() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.wire.filters_to_host.append(without(b"start"))
+    bench.firmware.restart()
+    bench.clock.sleep_s(5.0)
+    begun_s = bench.clock.now_s()
+    stage.recover()
+    assert not stage.trusted
+    assert bench.clock.now_s() - begun_s < 2.0, "a restart takes a second, and the wait for its greeting three"
+
+
 def test_an_answer_without_a_position_is_an_error() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
