@@ -651,10 +651,8 @@ def _cell(path: Path, table: str, column: str, row: int, how: str, value: Any) -
 def _opened(path: Path) -> sqlite3.Connection:
     """Open a database for any change."""
     db = sqlite3.connect(path, isolation_level=None)
-    db.execute("PRAGMA synchronous = OFF")
-    db.execute("PRAGMA foreign_keys = OFF")
-    db.execute("PRAGMA ignore_check_constraints = ON")
-    db.execute("PRAGMA writable_schema = ON")
+    for setting in ("synchronous = OFF", "foreign_keys = OFF", "ignore_check_constraints = ON", "writable_schema = ON"):
+        _attempt(db, f"PRAGMA {setting}")
     return db
 
 

@@ -107,10 +107,10 @@ class Bench:
         call = rng.choice(KINDS[kind].calls).words
         edits: list[tuple[str, str, list[Any]]] = []
         for _ in range(rng.choice([1, 1, 1, 1, 2, 3])):
-            pattern = rng.choice([it for it in KINDS[kind].files if any(place.glob(it))])
-            files = sorted(it for it in place.glob(pattern) if mutation_operations.can_be_mutated(it))
-            if not files:
-                continue  # an earlier operation removed them
+            found = [sorted(filter(mutation_operations.can_be_mutated, place.glob(it))) for it in KINDS[kind].files]
+            if not any(found):
+                break  # the operations before left none
+            files = rng.choice([it for it in found if it])
             path = rng.choice(files)
             name, arguments = mutation_operations.draw(rng, path)
             edits.append((str(path.relative_to(place)), name, arguments))

@@ -61,7 +61,7 @@ def ask(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ask]:
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     server = subprocess.Popen(
-        [sys.executable, "-W", "default", "-m", "tests.faults.mutations", "--serve", str(shared / "mutations")],
+        [sys.executable, "-m", "tests.faults.mutations", "--serve", str(shared / "mutations")],
         cwd=_ROOT,
         env=os.environ | ONE_THREAD,
         stdin=subprocess.PIPE,

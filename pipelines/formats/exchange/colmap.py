@@ -193,6 +193,8 @@ def _images_text(path: Path) -> list[ColmapImage]:
     for line in _lines(path)[::2]:  # every other line lists points, and may be empty
         if line.strip():
             _, *numbers, camera, name = line.split(maxsplit=9)
+            if len(numbers) != 7:
+                raise ValueError(f"an image has {len(numbers)} numbers of its pose, 7 are expected")
             values = tuple(float(text) for text in numbers)
             images.append(ColmapImage(name, int(camera), _pose(values[:4], values[4:])))
     return images
