@@ -14,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import UnreadableImage
+from faintfield.rig.session.regular_files import read_all
 
 # Takes width and height in px and the size in bytes of a picture when it is decoded; raises if it is too large.
 type Accept = Callable[[int, int, int], None]
@@ -62,7 +63,7 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any
             _require_honest_strips(page, file)
             return np.asarray(page.asarray())
     file.seek(0)
-    return _with_opencv(_content(file, page.nbytes))
+    return _with_opencv(read_all(file, page.nbytes + _OVERHEAD_BYTES))
 
 
 def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
@@ -80,7 +81,7 @@ def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
     size_bytes = width * height * pixel_bytes
     accept(width, height, size_bytes)
     file.seek(0)
-    content = _content(file, size_bytes)
+    content = read_all(file, size_bytes + _OVERHEAD_BYTES)
     if _END_MARKS[mark] not in content[-1024:] or (mark is _PNG and not _sound_png(content)):
         raise ValueError("not an image, or truncated")
     return _with_opencv(content)
@@ -132,14 +133,6 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
             _, height, width, channels = struct.unpack(">BHHB", file.read(6))
             return width, height, channels
         file.seek(length - 2, 1)
-
-
-def _content(file: BufferedReader, picture_bytes: int) -> bytes:
-    """Return the content of a file that holds a picture of a size when it is decoded."""
-    content = file.read(picture_bytes + _OVERHEAD_BYTES + 1)
-    if len(content) > picture_bytes + _OVERHEAD_BYTES:
-        raise ValueError("is far larger than its picture")
-    return content
 
 
 def _with_opencv(content: bytes) -> NDArray[Any]:

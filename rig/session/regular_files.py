@@ -35,13 +35,20 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
     Raises
     ------
     OSError
-        The file cannot be opened or read, is not a regular file, or is larger than `max_bytes`.
+        The file cannot be opened or read, is not a regular file, is larger than `max_bytes`, or grows meanwhile.
     """
     with open_regular(path) as file:
-        content = file.read(max_bytes + 1)
-    if len(content) > max_bytes:
-        size = path.stat().st_size
-        raise OSError(errno.EFBIG, f"holds {size} bytes, at most {max_bytes} are read", str(path))
+        return read_all(file, max_bytes)
+
+
+def read_all(file: BufferedReader, max_bytes: int) -> bytes:
+    """Return the content of an open regular file from its present position on; raise OSError as `read_regular` does."""
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if left > max_bytes:
+        raise OSError(errno.EFBIG, f"holds {left} bytes, at most {max_bytes} are read")
+    content = file.read(left + 1)  # no more, because `read` takes the memory that it is asked for
+    if len(content) > left:
+        raise OSError(errno.EBUSY, "grows while it is read")
     return content
 
 

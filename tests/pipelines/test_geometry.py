@@ -177,7 +177,7 @@ def test_a_set_with_one_board_is_refused_in_one_line(
     assert not (poor / "geometry.json").exists()
 
 
-@pytest.mark.parametrize("command", ["geometry", "export", "import"])
+@pytest.mark.parametrize("command", ["geometry", "export"])
 def test_without_mrcal_what_needs_it_fails_by_name_in_one_line(
     command: str,
     measured: tuple[Path, GeometrySummary],
@@ -190,7 +190,6 @@ def test_without_mrcal_what_needs_it_fails_by_name_in_one_line(
     calls = {
         "geometry": [folder, "--out", tmp_path / "out"],
         "export": ["mrcal", scene, tmp_path / "out"],
-        "import": ["mrcal", folder / "cameras", tmp_path / "out"],
     }
     monkeypatch.setitem(sys.modules, "mrcal", None)
     capsys.readouterr()
