@@ -31,6 +31,7 @@ def test_flats_fix_the_gain_of_a_sensor_that_shows_single_electrons() -> None:
     assert alone.likelihood is found.likelihood is NoiseLikelihood.EXACT
     before, after = (one.estimates["gain_dn_per_e"] for one in (alone, found))
     assert before.value is not None
+    assert after.value is not None
     assert after.value == pytest.approx(2.0, rel=0.02)
     assert before.se is not None
     assert after.se is not None
