@@ -5,6 +5,7 @@ import sys
 from functools import partial
 
 import numpy as np
+import pytest
 
 from faintfield.rig.stages import motion
 from tests.mutants.changes import mutants_of
@@ -26,6 +27,7 @@ def _fail() -> int:
     raise RuntimeError("as a wrong change may")
 
 
+@pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # as the workers of pytest-xdist are
 def test_each_process_ends_with_its_status_and_what_hangs_is_told() -> None:
     processes = Processes(2)
     sys.stderr.flush()
