@@ -11,7 +11,7 @@ from faintfield.rig.plan import CaptureStep, Grid, StepKind, check_frame_count
 from faintfield.rig.stages.protocol import StageSettings
 
 # Longest rest at a node; all frames of the measurement are held in memory.
-MAX_REST_S = 60.0
+MAX_REST_S = 3600.0
 
 
 class BoardSettings(Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,5 +1,6 @@
 """`faintfield verify`: sessions against their journals, and results against their records and inputs."""
 
+from collections.abc import Sized
 from pathlib import Path
 
 import msgspec
@@ -43,37 +44,48 @@ def verify(path: Path, /, *, inputs: Path | None = None) -> Verified:
     path
         A session, a folder of results, or one record such as noise.json, geometry.json or reconstruction.json.
     inputs
-        Folder of the session or set that the results were made from; searched for around them by default.
+        Folder of the session or set that the results were made from; searched for around them by default. Inputs that
+        are not found are named as not checked, which is no failure.
     """
     if inputs is not None and not inputs.is_dir():
         raise MissingFile(f"{inputs}: no such folder; name that of the session or set")
     session, known = None, {}
     if has_session(path) or (path / JOURNAL).exists():
-        session = _verify_session(path)
-        known = {frame.resolve(): taken.sha256 for _, taken, frame in taken_frames(path)}  # found to be true just now
+        session = verify_session(path, lambda paths: progress(list(paths), "hashing"))
+        _report_session(path, session)
+        if not session.problems:
+            known = {frame.resolve(): taken.sha256 for _, taken, frame in taken_frames(path)}  # just found to be true
     records = records_below(path) if session else records_of(path)
-    if not records:
-        return Verified(str(path), session, None)
-    results = verify_results(
-        records,
-        inputs_in(inputs) if inputs else inputs_around,
-        lambda paths: progress(paths, "hashing"),
-        lambda file: known.get(file) or sha256(file),
-    )
-    _report(path, results)
+    results = None
+    if records:
+        results = verify_results(
+            records,
+            inputs_in(inputs) if inputs else inputs_around,
+            lambda paths: progress(paths, "hashing"),
+            lambda file: known.get(file) or sha256(file),
+        )
+        _report_results(path, results)
+    if session and session.problems:
+        raise SessionCorrupt(
+            f"{path}: is damaged: {_count(session.problems, 'problem')}, the first: {session.problems[0]}; "
+            "restore these files from a copy, and move what is not in the journal out of frames/"
+        )
+    if results and results.problems:
+        raise ResultDamaged(
+            f"{path}: {_count(results.problems, 'problem')} in its results, the first: {results.problems[0]}; "
+            "restore these files from a copy, or make the results again by the command that made them"
+        )
     return Verified(str(path), session, results)
 
 
-def _verify_session(folder: Path) -> Verdict:
-    """Verify a session, and inform the user."""
-    verdict = verify_session(folder, lambda paths: progress(list(paths), "hashing"))
+def _report_session(folder: Path, verdict: Verdict) -> None:
+    """Inform the user of what was found of a session."""
     _list("problem", verdict.problems)
-    if verdict.problems:
-        raise SessionCorrupt(
-            f"{folder}: is damaged: {len(verdict.problems)} problems, the first: {verdict.problems[0]}; "
-            f"restore these files from a copy"
+    state = "complete"
+    if not verdict.sealed:
+        state = (
+            f"{len(verdict.missing)} still to be taken" if verdict.missing else "not sealed: run capture to finish it"
         )
-    state = "complete" if verdict.sealed else f"{len(verdict.missing)} still to be taken"
     inform(f"{folder}: {verdict.present} of {verdict.planned} frames present and whole, {state}")
     for count, what in (
         (len(verdict.left_out), "left out by the operator"),
@@ -83,22 +95,22 @@ def _verify_session(folder: Path) -> Verdict:
     ):
         if count:
             inform(f"  {count} {what}")
-    return verdict
 
 
-def _report(path: Path, verdict: ResultVerdict) -> None:
+def _report_results(path: Path, verdict: ResultVerdict) -> None:
     """Inform the user of what was found of results."""
     _list("not checked", verdict.unchecked)
     _list("problem", verdict.problems)
-    if verdict.problems:
-        raise ResultDamaged(
-            f"{path}: {len(verdict.problems)} problems in its results, the first: {verdict.problems[0]}; "
-            "restore these files from a copy, or make the results again by the command that made them"
+    if not verdict.problems:
+        inform(
+            f"{path}: all agrees: records: {verdict.records}, files beside them: {verdict.files}, "
+            f"inputs: {verdict.inputs}; not checked: {len(verdict.unchecked) or 'nothing'}"
         )
-    inform(
-        f"{path}: {verdict.records} records agree with their digests, with {verdict.files} files beside them, and with "
-        f"{verdict.inputs} inputs"
-    )
+
+
+def _count(things: Sized, noun: str) -> str:
+    """Return how many there are of something."""
+    return f"{len(things)} {noun}{'' if len(things) == 1 else 's'}"
 
 
 def _list(label: str, lines: tuple[str, ...]) -> None:

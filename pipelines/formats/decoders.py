@@ -36,7 +36,10 @@ _OWN_COMPRESSIONS = (1, *_DEFLATE, 32773)
 _DEFLATE_RATIO, _UNTESTED_BYTES = 1032, 300_000_000
 
 # What a file may have in bytes besides its pixels: its header, and a picture of its own.
-_OVERHEAD_BYTES = 64_000_000
+OVERHEAD_BYTES = 64_000_000
+
+# A JPEG has some ten segments and fill bytes before its picture.
+_MAX_SEGMENTS = 10_000
 
 # TIFFs of microscopes and scanners, whose pages tifffile would look for in ways of their own.
 _NO_SPECIAL_KIND: dict[str, Any] = {f"is_{kind}": False for kind in ("lsm", "ndpi", "philips", "scanimage", "stk")}
@@ -63,7 +66,7 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any
             _require_honest_strips(page, file)
             return np.asarray(page.asarray())
     file.seek(0)
-    return _with_opencv(read_all(file, page.nbytes + _OVERHEAD_BYTES))
+    return _with_opencv(read_all(file, page.nbytes + OVERHEAD_BYTES))
 
 
 def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
@@ -81,7 +84,7 @@ def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
     size_bytes = width * height * pixel_bytes
     accept(width, height, size_bytes)
     file.seek(0)
-    content = read_all(file, size_bytes + _OVERHEAD_BYTES)
+    content = read_all(file, size_bytes + OVERHEAD_BYTES)
     if _END_MARKS[mark] not in content[-1024:] or (mark is _PNG and not _sound_png(content)):
         raise ValueError("not an image, or truncated")
     return _with_opencv(content)
@@ -102,7 +105,7 @@ def _require_honest_strips(page: tifffile.TiffPage, file: BufferedReader) -> Non
     """Refuse strips or tiles that take more memory than the picture, compressed or decompressed."""
     pixel_bytes = page.samplesperpixel * -(-page.bitspersample // 8)
     most = max(page.tilewidth * page.tilelength * page.tiledepth * pixel_bytes, page.nbytes)
-    if most > page.nbytes + _OVERHEAD_BYTES or sum(page.databytecounts) > 2 * most + _OVERHEAD_BYTES:
+    if most > page.nbytes + OVERHEAD_BYTES or sum(page.databytecounts) > 2 * most + OVERHEAD_BYTES:
         raise ValueError("its strips or tiles are larger than the picture")
     if page.compression not in _DEFLATE:
         return
@@ -122,7 +125,7 @@ def _png_size(file: BufferedReader) -> tuple[int, int, int]:
 def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
     """Return width, height and bytes per pixel that the frame header of a JPEG states."""
     file.seek(2)
-    while True:
+    for _ in range(_MAX_SEGMENTS):
         begin, marker, length = struct.unpack(">BBH", file.read(4))
         if begin == marker == 0xFF:  # a marker may be preceded by any number of these
             file.seek(-3, 1)
@@ -133,6 +136,7 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
             _, height, width, channels = struct.unpack(">BHHB", file.read(6))
             return width, height, channels
         file.seek(length - 2, 1)
+    raise ValueError("its picture does not begin")
 
 
 def _with_opencv(content: bytes) -> NDArray[Any]:

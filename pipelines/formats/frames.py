@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
 from faintfield.pipelines.errors import InputError, MissingFile, UnreadableImage, WrongSize
-from faintfield.pipelines.formats.decoders import Accept, decode_photo, decode_tiff
+from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, decode_photo, decode_tiff
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_FRAME_BYTES
 from faintfield.pipelines.formats.reading import is_file, opened
+from faintfield.rig.session.regular_files import require_size
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
@@ -27,6 +28,10 @@ logging.getLogger("exifread").addHandler(logging.NullHandler())
 
 # Masked pixels this close to the active area are not used, px: they catch a little of its light.
 _MASKED_GUARD_PX = 4
+
+
+# Bytes of a pixel decoded: four channels of the largest type.
+_MAX_PIXEL_BYTES = 32
 
 
 def mosaic_period(mosaic: Sequence[str] | None) -> tuple[int, int]:
@@ -122,13 +127,15 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
                 "take it again with the same settings, or correct the size that is stated"
             )
 
+    most = MAX_FRAME_BYTES if expected_px is None else expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
     with opened(path) as file:
         try:
+            require_size(file, most + OVERHEAD_BYTES)  # decoders read what a header states before they tell its size
             frame = _decoded(file, path, suffix, accept)
         except InputError:
             raise
         except Exception as failure:  # decoders raise exceptions of a dozen types
-            raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+            raise UnreadableImage(_cannot_decode(path, getattr(failure, "strerror", None) or str(failure))) from failure
     shape = frame.pixels_dn.shape
     if len(shape) not in (2, 3) or (len(shape) == 3 and shape[2] != 3):
         raise UnreadableImage(

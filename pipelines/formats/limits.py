@@ -5,8 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Size of the largest picture that is read, decoded: 16-bit grey of the largest detector, twice.
-MAX_FRAME_BYTES = 1_000_000_000
+# Size of the largest picture that is read, decoded: a plane in three colours of the largest detector, as float32.
+MAX_FRAME_BYTES = 3_000_000_000
+
+# Size of the largest picture on a page of results.
+MAX_PREVIEW_BYTES = 200_000_000
 
 # Longest exposure: eleven days.
 MAX_EXPOSURE_S = 1e6

@@ -52,7 +52,7 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
     """
     frozen = _plan_session(settings, folder)
     if is_sealed(folder):
-        inform(f"{folder}: is complete; there is nothing left to capture")
+        inform(f"{folder}: is complete, nothing is left to capture; `faintfield verify` compares every byte of it")
         return 0
     panel = CapturePanel(unattended=unattended)
     with ExitStack() as stack:

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
+from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import DepthMapRecord, ReconstructionRecord
 from faintfield.pipelines.pages.page import data_uri
 
@@ -36,4 +38,4 @@ def depth_sections(directory: Path, results: dict[Path, ReconstructionRecord]) -
 def _preview(path: Path) -> str | None:
     """Return the preview of a map."""
     preview = path.with_suffix(".png")
-    return data_uri(preview.read_bytes(), ".png") if preview.is_file() else None
+    return data_uri(read_content(preview, MAX_PREVIEW_BYTES), ".png") if preview.is_file() else None

@@ -7,6 +7,8 @@ from msgspec import UNSET
 
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
+from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.result_files import file_within, read_result
 from faintfield.pipelines.pages.page import data_uri
@@ -84,7 +86,9 @@ def set_sections(overviews: list[Path]) -> list[SetSection]:
         for name in (INTEGRAL_IMAGE, REFERENCE_VIEW, NOISE_REFERENCE_VIEW, BRIGHT_VIEW, REGION_OUTLINED):
             file_within(path.parent, name)
         pictures = [path.with_name(name) for name in (INTEGRAL_IMAGE, REFERENCE_VIEW)]
-        key = tuple(picture.read_bytes() for picture in pictures if picture.is_file()) or (path.read_bytes(),)
+        key = tuple(read_content(picture, MAX_PREVIEW_BYTES) for picture in pictures if picture.is_file()) or (
+            read_content(path),
+        )
         rank = PREFERRED_POSES.index(overview.poses)
         if key not in distinct or rank < PREFERRED_POSES.index(distinct[key][1].poses):
             distinct[key] = (path.parent, overview)
@@ -108,7 +112,7 @@ def _section(folder: Path, overview: Overview) -> SetSection:
 
 def _whole(path: Path) -> str | None:
     """Return a picture as it is."""
-    return data_uri(path.read_bytes(), ".png") if path.is_file() else None
+    return data_uri(read_content(path, MAX_PREVIEW_BYTES), ".png") if path.is_file() else None
 
 
 def _pixel_for_pixel(path: Path) -> str | None:

@@ -24,24 +24,24 @@ START = bytes(32)
 _CHAINED = ("event", "intent", "commit", "void", "traffic")
 
 
-def add_rows(db: sqlite3.Connection, head: bytes, table: str, rows: Sequence[tuple[object, ...]]) -> tuple[bytes, int]:
-    """Insert rows with consecutive numbers into a table and a link over them; return its hash and the last number.
+def add_rows(db: sqlite3.Connection, table: str, rows: Sequence[tuple[object, ...]]) -> int:
+    """Insert rows with consecutive numbers into a table and a link over them; return the last number.
 
     Parameters
     ----------
     db : Connection
         Open database, within a transaction.
-    head : bytes
-        Hash of the newest link.
     table : str
         Name of the table.
     rows : sequence of tuple
         Values of all columns.
     """
     first, last = insert_rows(db, table, rows)
-    digest = _digest(db, head, table, first, last)[0]
+    # Read and not remembered: an interrupt may have come before the last commit was known to be done
+    newest = db.execute("SELECT sha256 FROM chain ORDER BY id DESC LIMIT 1").fetchone()
+    digest = _digest(db, newest[0] if newest else START, table, first, last)[0]
     db.execute("INSERT INTO chain VALUES (NULL, ?, ?, ?, ?)", (table, first, last, digest))
-    return digest, last
+    return last
 
 
 def insert_rows(db: sqlite3.Connection, table: str, rows: Sequence[tuple[object, ...]]) -> tuple[int, int]:
@@ -51,8 +51,8 @@ def insert_rows(db: sqlite3.Connection, table: str, rows: Sequence[tuple[object,
     return numbers[0], numbers[-1]
 
 
-def check_chain(db: sqlite3.Connection, path: Path) -> bytes:
-    """Compute all links again, and return the hash of the newest.
+def check_chain(db: sqlite3.Connection, path: Path) -> None:
+    """Compute all links again.
 
     Raises
     ------
@@ -69,8 +69,8 @@ def check_chain(db: sqlite3.Connection, path: Path) -> bytes:
         head, count = _digest(db, head, table, first, last)
         if head != stated:
             raise SessionCorrupt(
-                f"{path}: row {first} of {table}, or one up to {last}, is not what was written; restore the journal "
-                "from a copy"
+                f"{path}: row {first} of {table}, or one of those up to {last}, was changed, removed or added; restore "
+                "the journal from a copy"
             )
         covered[table] += count
         if covered[table] > held[table]:  # at once: links that cover the same rows again and again would take for ever
@@ -80,7 +80,6 @@ def check_chain(db: sqlite3.Connection, path: Path) -> bytes:
             raise SessionCorrupt(
                 f"{path}: {table} has {held[table]} rows, its chain {covered[table]}; restore the journal from a copy"
             )
-    return head
 
 
 def _digest(db: sqlite3.Connection, previous: bytes, table: str, first: int, last: int) -> tuple[bytes, int]:

@@ -122,7 +122,7 @@ def connect(path: Path, *, read_only: bool) -> sqlite3.Connection:
         # In WAL mode SQLite writes none, and what it reads there can make it delete any file
         if os.path.lexists(rollback):
             raise SessionCorrupt(f"{rollback}: is not written by a capture; move it away")
-        size = path.stat().st_size
+        size = path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
         if size > MAX_JOURNAL_BYTES:
             raise SessionCorrupt(f"{path}: holds {size} bytes, at most {MAX_JOURNAL_BYTES}; restore it from a copy")
         with path.open("rb") as opened:
@@ -151,7 +151,9 @@ def check_database(db: sqlite3.Connection, path: Path) -> int:
     SessionCorrupt
         A check failed.
     """
-    budget = iter(range(_STEPS // 1000 + _STEPS_PER_BYTE * path.stat().st_size // 1000))
+    wal = _companions(path)[0]
+    size = path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
+    budget = iter(range(_STEPS // 1000 + _STEPS_PER_BYTE * size // 1000))
     db.set_progress_handler(lambda: next(budget, None) is None, 1000)
     try:
         db.execute("PRAGMA cell_size_check = ON")

@@ -17,7 +17,7 @@ from msgspec import Meta, Struct
 from faintfield.rig.cameras.protocol import Metadata
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.plan import MAX_FRAMES
-from faintfield.rig.session.chain import START, add_rows, check_chain, insert_rows
+from faintfield.rig.session.chain import add_rows, check_chain, insert_rows
 from faintfield.rig.session.database import check_database, connect, create_database, translate_sqlite_errors
 from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.stages.protocol import Point
@@ -255,7 +255,8 @@ class Journal:
         with self._translate_errors():
             self._db.execute("BEGIN")  # one state of the journal for all checks
             self.format = check_database(self._db, self.path)
-            self._head = check_chain(self._db, self.path) if self.format > 1 else START
+            if self.format > 1:
+                check_chain(self._db, self.path)
             self._db.execute("COMMIT")
             if not self._read_only:
                 self._db.execute("PRAGMA journal_mode = WAL")
@@ -281,26 +282,27 @@ class Journal:
         """Insert rows with consecutive numbers into a table, chain them, and return the number of the last."""
         if self.format == 1:
             return insert_rows(self._db, table, rows)[1]
-        self._head, last = add_rows(self._db, self._head, table, rows)
-        return last
+        return add_rows(self._db, table, rows)
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Run the block as one transaction, which also writes the pending traffic."""
-        head = self._head
+        """Run the block as one transaction, which also writes the pending traffic; an interrupt may come anywhere."""
+        written: list[tuple[float, str, bytes]] = []
         with self._translate_errors():
-            self._db.execute("BEGIN IMMEDIATE")
             try:
+                if self._db.in_transaction:  # an interrupt came before it could be rolled back
+                    self._db.execute("ROLLBACK")
+                self._db.execute("BEGIN IMMEDIATE")
                 yield
                 if self._traffic:
                     self._add("traffic", *((None, *entry) for entry in self._traffic))
+                written, self._traffic = self._traffic, []
                 self._db.execute("COMMIT")
             except BaseException:
-                self._head = head
-                if self._db.in_transaction:
+                if self._db.in_transaction:  # else the commit was done, or nothing begun
+                    self._traffic = written + self._traffic
                     self._db.execute("ROLLBACK")
                 raise
-        self._traffic.clear()
 
     def _translate_errors(self) -> AbstractContextManager[None]:
         """Raise a named failure for an error of SQLite."""

@@ -43,13 +43,19 @@ def read_regular(path: Path, max_bytes: int) -> bytes:
 
 def read_all(file: BufferedReader, max_bytes: int) -> bytes:
     """Return the content of an open regular file from its present position on; raise OSError as `read_regular` does."""
-    left = os.fstat(file.fileno()).st_size - file.tell()
-    if left > max_bytes:
-        raise OSError(errno.EFBIG, f"holds {left} bytes, at most {max_bytes} are read")
+    left = require_size(file, max_bytes)
     content = file.read(left + 1)  # no more, because `read` takes the memory that it is asked for
     if len(content) > left:
         raise OSError(errno.EBUSY, "grows while it is read")
     return content
+
+
+def require_size(file: BufferedReader, max_bytes: int) -> int:
+    """Return the number of bytes from the present position on; raise OSError if there are more than `max_bytes`."""
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if left > max_bytes:
+        raise OSError(errno.EFBIG, f"holds {left} bytes, at most {max_bytes} are read")
+    return left
 
 
 def sha256(path: Path) -> str:

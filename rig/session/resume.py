@@ -108,13 +108,14 @@ def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
     """Set aside files that are not in the journal; declare frames void whose file is altered or missing."""
     folder, journal = session.folder, session.journal
     committed = {it.file for it in journal.committed()}
+    present = set(names)
     for name in names:
         if name not in committed:
             moved = set_aside(folder / FRAMES / name, folder / ASIDE)
             journal.event("set_aside", file=_printable(name), to=moved.name, why="not committed")
     for it in progress(list(session.valid().values())):
         path = session.path_of(it)
-        if it.file not in names:
+        if it.file not in present:
             journal.event("gone", frame=it.frame, file=it.file)
         elif not _is_intact(path, it.sha256):
             moved = set_aside(path, folder / ASIDE)
@@ -155,5 +156,6 @@ def check_same_rig(frozen: FrozenPlan, now: RigSettings) -> None:
     for name in now.__struct_fields__:
         if getattr(now, name) != getattr(frozen.rig, name):
             raise PlanRefused(
-                f"[{name}] of the rig.toml is not what the session was begun with; restore it, or begin a new session"
+                f"[{name}] of the rig.toml is not what the plan.json of the session says; restore the one that "
+                "was changed, or begin a new session"
             )

@@ -170,8 +170,8 @@ class Controller(Protocol):
 type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
 
-# pyserial has URLs for more, but one of them writes a file (`spy://`), and a rig.toml may come from anyone.
-_URL_SCHEMES = ("socket", "rfc2217")
+# pyserial has others, of which one writes a file (`spy://`), and a rig.toml may come from anyone.
+_URL_SCHEMES = ("socket", "rfc2217", "hwgrep", "alt")
 
 
 class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -182,7 +182,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     protocol : str
         Firmware of the controller; `simulated` needs no port and no hardware.
     port : str
-        Serial device, or a pyserial URL of the network such as `socket://127.0.0.1:7000`.
+        Serial device, or a pyserial URL such as `socket://127.0.0.1:7000`.
     baud : int
         Bits per second.
     axes : (str, str)

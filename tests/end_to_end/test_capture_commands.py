@@ -276,7 +276,7 @@ def test_a_session_stays_with_its_rig_and_with_one_capture(shell: Shell) -> None
         assert shell.run("verify", shell.session) == 1
     shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
     assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert "PlanRefused: [grid] of the rig.toml is not what the session was begun with" in shell.words
+    assert "PlanRefused: [grid] of the rig.toml is not what the plan.json of the session says" in shell.words
 
 
 def test_verify_says_what_is_wrong(shell: Shell) -> None:

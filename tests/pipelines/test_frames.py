@@ -1,5 +1,6 @@
 """Frames of every kind: read as the sensor gave them, or refused when they are not whole."""
 
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile, UnreadableImage
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import encoded
 
 type Writer = Callable[[Path, NDArray[np.generic]], object]
 
@@ -213,3 +215,19 @@ class TestRawFile:
         with pytest.raises(UnreadableImage, match=r"short\.dng: cannot be decoded") as refused:
             read_frame(tmp_path / "short.dng")
         assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["view.tiff", "view.png", "view.jpg"])
+def test_a_file_far_larger_than_its_picture_is_not_handed_to_a_decoder(name: str, tmp_path: Path) -> None:
+    path = tmp_path / name
+    path.write_bytes(encoded(np.zeros((12, 16), np.uint8), path.suffix))
+    os.truncate(path, 1_500_000_000)  # sparse: its description could be as long
+    with pytest.raises(UnreadableImage, match=r"holds 1500000000 bytes, at most \d+ are read; .*; take or copy"):
+        read_frame(path, (16, 12))
+
+
+def test_a_jpeg_that_never_begins_is_given_up(tmp_path: Path) -> None:
+    path = tmp_path / "view.jpg"
+    path.write_bytes(b"\xff\xd8" + b"\xff" * 30_000_000 + b"\xff\xd9")
+    with pytest.raises(UnreadableImage, match="its picture does not begin"):
+        read_frame(path)

@@ -319,7 +319,7 @@ def test_a_raw_file_brings_its_mosaic_but_not_always_its_exposure(
     assert "one.dng: the only one of the darks of 0.5 s" in line
 
 
-def raw_like(path: Path) -> Frame:
+def raw_like(path: Path, *_: object, **__: object) -> Frame:
     """Return a TIFF as if it were a raw file with masked pixels and EXIF."""
     level = np.array([[100.0, 100.0], [100.0, 140.0]])
     return Frame(tifffile.imread(path), ("RG", "GB"), level, 4095.0, 1.0)

@@ -15,7 +15,7 @@ from faintfield.pipelines.commands.verify import verify
 from faintfield.pipelines.errors import BadValue, ResultDamaged
 from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds, with_digest
 from faintfield.pipelines.formats.results.result_files import results_below
-from faintfield.pipelines.formats.results.verification import records_of, verify_results
+from faintfield.pipelines.formats.results.verification import records_below, records_of, verify_results
 from tests.pipelines.by_hand import write_by_hand
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -187,6 +187,16 @@ class TestReading:
         with pytest.raises(BadValue, match="is not a result that can be shown"):
             results_below(planes)
 
+    def test_results_that_a_link_leads_to_are_not_shown_as_those_of_the_folder(
+        self, planes: Path, tmp_path: Path
+    ) -> None:
+        apart = tmp_path / "apart"
+        apart.mkdir()
+        (apart / "method").symlink_to(planes, target_is_directory=True)
+        (apart / "noise.json").symlink_to(planes / "reconstruction.json")
+        assert records_below(apart) == []
+        assert records_below(planes) != []
+
     def test_a_file_that_is_a_pipe_or_a_link_out_is_refused(self, planes: Path) -> None:
         plane = planes / "plane_00500.0.tiff"
         plane.unlink()
@@ -268,7 +278,7 @@ class TestVerify:
         view.write_bytes(view.read_bytes() + b"\0")
         ended = faintfield("verify", planes)
         assert ended.returncode == 1
-        assert "was made from another view_r0_c0.tiff than" in ended.stderr
+        assert "view_r0_c0.tiff was altered since it was made from it" in ended.stderr
         scene = Path(shutil.move(planes.with_name("scene"), tmp_path / "deep" / "below"))
         ended = faintfield("verify", planes)
         assert ended.returncode == 0
@@ -311,5 +321,5 @@ def test_of_two_sets_that_are_described_alike_the_one_with_the_same_images_is_me
     shutil.copyfile(other / "view_r0_c1.tiff", other / "view_r0_c0.tiff")
     assert "from another" not in done("verify", planes).stderr
     shutil.rmtree(planes.parent / "scene")
-    with pytest.raises(ResultDamaged, match=r"was made from another view_r0_c0\.tiff"):
+    with pytest.raises(ResultDamaged, match=r"view_r0_c0\.tiff .* since it was made from it"):
         verify(planes)

@@ -13,9 +13,10 @@ _MAX_LEVELS_BELOW = 3
 
 
 def files_below(directory: Path, name: str) -> list[Path]:
-    """Return the files of a name in a folder and down to three folders below it, in order."""
-    levels = range(_MAX_LEVELS_BELOW + 1)
-    return sorted({path for level in levels for path in directory.glob("*/" * level + name)})
+    """Return the files of a name in a folder and down to three folders below it, in order; no link out of it counts."""
+    whole = directory.resolve()
+    found = {path for level in range(_MAX_LEVELS_BELOW + 1) for path in directory.glob("*/" * level + name)}
+    return sorted(path for path in found if path.resolve().is_relative_to(whole))
 
 
 def read_result[Record](path: Path, kind: type[Record]) -> Record:

@@ -102,11 +102,13 @@ def records_of(path: Path) -> list[Path]:
     if path.is_dir():
         found = records_below(path)
         if not found:
-            raise MissingFile(f"{path}: holds no session and no result; name the folder of one")
+            raise MissingFile(
+                f"{path}: holds no session and no result; name the folder of one, and that of a set by --inputs"
+            )
         return found
     if not path.is_file() or not is_record(path):
         raise MissingFile(
-            f"{path}: is no folder and no record of a result ({', '.join(_KINDS)}); name one of these, or its folder"
+            f"{path}: is not there, or is no record of a result ({', '.join(_KINDS)}); name one of these, or its folder"
         )
     if path.name != RECONSTRUCTION_FILE:
         return [path]
@@ -233,14 +235,16 @@ class _Verification:
         """Compare one file with the SHA-256 by which a record names it."""
         fault = problem_of_file(path, one.folder, one.sha256, hashed)
         if fault and one.is_input:
-            self.problems.append(f"{one.record}: was made from another {one.name} than {path}, which {fault}")
+            self.problems.append(
+                f"{one.record}: {path} {fault} since it was made from it, or is another input of that name"
+            )
         elif fault:
             self.problems.append(f"{path}: {fault}")
 
 
 def inputs_in(folder: Path) -> FindInputs:
     """Return a function that says that all inputs are in one folder."""
-    return lambda _, __: folder
+    return lambda _, __: folder.resolve()
 
 
 def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:

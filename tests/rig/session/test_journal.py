@@ -3,6 +3,7 @@
 import shutil
 import sqlite3
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -498,3 +499,61 @@ def test_an_interrupted_session_of_the_earlier_version_is_resumed(tmp_path: Path
     assert (verdict.present, verdict.sealed, verdict.interrupted) == (FRAMES, True, ())
     with Journal(folder / "journal.sqlite", read_only=True) as journal:
         assert journal.format == 1
+
+
+class Interruptible:
+    """A connection at whose n-th statement from now on Ctrl-C is pressed, before or after it takes effect."""
+
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+        self.statements_left = 0
+        self.after = False
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._db, name)
+
+    def execute(self, *words: Any) -> sqlite3.Cursor:
+        self.statements_left -= 1
+        if self.statements_left == 0 and not self.after:
+            raise KeyboardInterrupt
+        cursor = self._db.execute(*words)
+        if self.statements_left == 0:
+            raise KeyboardInterrupt
+        return cursor
+
+
+@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
+@pytest.mark.parametrize("statement", range(1, 12))
+def test_an_interrupt_at_any_statement_leaves_a_sound_journal(
+    statement: int, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "journal.sqlite"
+    opened: list[Interruptible] = []
+
+    def connect(*words: Any, **options: Any) -> Interruptible:
+        opened.append(Interruptible(database.connect(*words, **options)))
+        return opened[-1]
+
+    with monkeypatch.context() as patch:
+        patch.setattr("faintfield.rig.session.journal.connect", connect)
+        journal = Journal(path, create=True)
+    journal.event("first")
+    journal.record(1.0, "sent", b"before")
+    opened[0].statements_left, opened[0].after = statement, after
+    interrupted = False
+    try:
+        journal.event("second")
+    except KeyboardInterrupt:
+        interrupted = True
+    assert interrupted == (statement <= 10), "the statements of one entry and its traffic were counted wrongly"
+    opened[0].statements_left = 0
+    journal.record(2.0, "sent", b"later")
+    journal.close()
+    with Journal(path) as again:
+        kinds = [event.kind for event in again.events()]
+        assert kinds in (["first"], ["first", "second"])
+        assert interrupted or kinds == ["first", "second"]
+        assert [data for _, _, data in again.traffic()] == [b"before", b"later"]
+        again.event("third")
+    with Journal(path, read_only=True) as last:
+        assert [event.kind for event in last.events()] == [*kinds, "third"]

@@ -234,7 +234,7 @@ def test_only_the_port_may_change(session: Path) -> None:
         replace(SMALL_RIG, step=SMALL_RIG.step[:1]),
         replace(SMALL_RIG, camera=replace(SMALL_RIG.camera, seed=2)),
     ):
-        with pytest.raises(PlanRefused, match=r"is not what the session was begun with; restore it"):
+        with pytest.raises(PlanRefused, match=r"is not what the plan.json of the session says; restore the one"):
             check_same_rig(frozen, other)
 
 

@@ -177,7 +177,7 @@ def test_settings_are_checked() -> None:
     assert open_stage(StageSettings(protocol="simulated")).settings.protocol == "grbl"
 
 
-@pytest.mark.parametrize("scheme", ["spy", "loop", "alt", "hwgrep", "file"])
+@pytest.mark.parametrize("scheme", ["spy", "loop", "cp2110", "file"])
 def test_a_rig_file_opens_no_url_that_does_more_than_carry_bytes(scheme: str, tmp_path: Path) -> None:
     written = tmp_path / "written"
     with pytest.raises(ValueError, match=r"stage.port = .*; give a serial device, or a URL that begins with socket://"):
@@ -185,6 +185,8 @@ def test_a_rig_file_opens_no_url_that_does_more_than_carry_bytes(scheme: str, tm
     assert not written.exists()
 
 
-@pytest.mark.parametrize("port", ["/dev/ttyUSB0", "COM3", "socket://10.0.0.7:7000", "rfc2217://10.0.0.7:7000"])
+@pytest.mark.parametrize(
+    "port", ["/dev/ttyUSB0", "COM3", "socket://10.0.0.7:7000", "rfc2217://10.0.0.7:7000", "hwgrep://1a86:7523"]
+)
 def test_a_rig_file_names_devices_and_device_servers(port: str) -> None:
     assert StageSettings("grbl", port=port).port == port
