@@ -151,7 +151,7 @@ class SetAtAGlance:
 def look_at(loaded: ElementalSet) -> SetAtAGlance:
     """Return a set at a glance; all its views share one grey scale.
 
-    Every file of the set is read, so that one that cannot be used is found before planes are made.
+    Every view is read, so that one that cannot be used is found before planes are made.
 
     Raises
     ------
@@ -196,7 +196,9 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
     try:
         msgspec.json.decode(msgspec.json.encode(record), type=Overview)  # null stands for what is not finite
     except msgspec.ValidationError as failure:
-        raise BadValue(f"{loaded.folder}: its light is not finite ({failure}); correct its noise model") from failure
+        raise BadValue(
+            f"{loaded.folder}: its light is not finite ({failure}); correct its noise model or object region"
+        ) from failure
     return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
 
 
