@@ -466,10 +466,9 @@ def test_any_flipped_bit_is_found_or_does_no_harm(journal_file: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_every_flipped_bit_is_found_or_does_no_harm(journal_file: Path) -> None:
+def test_any_of_many_flipped_bits_is_found_or_does_no_harm(journal_file: Path) -> None:
     expected, written = content(journal_file), journal_file.read_bytes()
-    for bit in range(8 * len(written)):
+    for bit in flips(written, each=61):
         flip(journal_file, written, bit)
         is_refused(journal_file, expected)
 
