@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.errors import BadValue, UnreadableImage
 from faintfield.pipelines.formats.files import write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
@@ -165,8 +165,7 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
     columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
     small = [
-        grey_levels(_every_nth(read_frame(path, size_px).pixels_dn, small_px), white, black)
-        for path in loaded.image_paths
+        grey_levels(_every_nth(_pixels_like(reference, path), small_px), white, black) for path in loaded.image_paths
     ]
     pictures = {
         INTEGRAL_IMAGE: contact_sheet(small, columns),
@@ -200,6 +199,18 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
             f"{loaded.folder}: its light is not finite ({failure}); correct its noise model or object region"
         ) from failure
     return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
+
+
+def _pixels_like(reference: NDArray[Any], path: Path) -> NDArray[Any]:
+    """Return the pixels of a view, which must have the shape of the reference view's."""
+    height, width = reference.shape[:2]
+    pixels = read_frame(path, (width, height)).pixels_dn
+    if pixels.shape != reference.shape:
+        kind = "colour" if pixels.ndim == 3 else "grey"
+        raise UnreadableImage(
+            f"{path}: is {kind}, unlike the set's reference view; all views must be of one kind; export all alike"
+        )
+    return pixels
 
 
 def write_overview(glance: SetAtAGlance, out: Path) -> None:
