@@ -64,6 +64,27 @@ def plane_from_ray(
     return homographies
 
 
+def ray_from_surface(
+    rt_cam_ref: NDArray[np.floating], principal_shift: NDArray[np.floating] | None = None
+) -> NDArray[np.float64]:
+    """Return the matrices (view, 3, 4) from directions of the reference view, with 1/depth, to rays of each view.
+
+    The point in direction (x, y, 1) at depth d lies at `R (x, y, 1) d + t` in a camera of pose (R, t), on the ray
+    `[R | t] (x, y, 1, 1/d)`.
+
+    Parameters
+    ----------
+    rt_cam_ref : array (view, 6)
+        Rodrigues rad and mm, from reference to camera.
+    principal_shift : array (view, 2), optional
+        As for `plane_from_ray`; it is subtracted from the rays.
+    """
+    matrices = np.array([np.column_stack([rotation_matrix(rt), rt[3:]]) for rt in np.asarray(rt_cam_ref, np.float64)])
+    if principal_shift is not None:
+        matrices[:, :2] -= np.asarray(principal_shift)[:, :, np.newaxis] * matrices[:, 2:]
+    return matrices
+
+
 def image_lattice(size_px: tuple[int, int], across: int = _POINTS_ACROSS) -> NDArray[np.float64]:
     """Return `across` by `across` pixels (point, 2) spread evenly over an image, as column, row."""
     shares = (np.arange(across) + 0.5) / across

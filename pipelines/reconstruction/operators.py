@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
+from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray, ray_from_surface
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
@@ -16,6 +16,7 @@ from faintfield.recon.likelihood.images import ElementalImages, binned
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.surface_operator import SurfaceOperator
 
 # Limit of the samples of a plane: one seen at a grazing angle would have most of its samples far away.
 _MAX_SAMPLES_PER_PIXEL = 16
@@ -133,6 +134,12 @@ class OperatorFactory:
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
         return PlaneOperator(self._homographies(place), self._rays, grid, **self._shared())
+
+    def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
+        """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""
+        matrices = ray_from_surface(self._loaded.poses_rt_cam_ref, self._principal_shift)
+        matrices = np.repeat(matrices, self._phases, axis=0)
+        return SurfaceOperator(matrices, self._rays, grid, inverse_depth, **self._shared())
 
     def of_scene(
         self, grids: Mapping[Place, PlaneGrid], transmission: NDArray[np.float32] | None = None

@@ -56,6 +56,9 @@ def scene_geometry(
         maps.reshape(-1),
         valid.reshape(-1).view(np.uint8),
         transmission.reshape(-1),
+        np.zeros(0, dtype),
+        np.zeros(0, np.int16),
+        dtype.type(0),
         np.tile(np.array([0, padded], np.intp), (views, rows, 1)),
     )
 

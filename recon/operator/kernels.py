@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
 from faintfield.recon.numba_tools import advanced, compiled, index, pointer, prefetch
 from faintfield.recon.operator.blocks import copy, gather, prefetch_block, scatter, weigh
-from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, weights_of
+from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, unpack_relief, weights_of
 
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
@@ -49,6 +49,13 @@ class SceneGeometry(NamedTuple):
         Zero for pixels that do not count in this view; of size zero when all do.
     transmission : array (plane × view × row × column,)
         Fraction of a plane's light that reaches a pixel; of size zero when all light does.
+    slopes : array (view × 9,)
+        Change of the homographies per 1/depth, for the one surface of a scene; of size zero for planes.
+    relief : int16 array (view × row × column,)
+        How much nearer than the depth of the homographies each pixel meets the surface, in `relief_step` of 1/depth;
+        `UNSEEN` where it sees no part of it. Of size zero for planes.
+    relief_step : float
+        Unit of the relief.
     reach : int array (view, row, 2)
         First and past-the-last padded column at which a row's pixels see any plane. Written by `REACH`.
     """
@@ -60,6 +67,9 @@ class SceneGeometry(NamedTuple):
     maps: NDArray[Any]
     valid: NDArray[np.uint8]
     transmission: NDArray[Any]
+    slopes: NDArray[Any]
+    relief: NDArray[np.int16]
+    relief_step: Any
     reach: NDArray[np.intp]
 
 
@@ -116,6 +126,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
     valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
     masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
+    bent, slopes, relief_at = geometry.relief.size > 0, pointer(geometry.slopes), pointer(geometry.relief)
     per_plane = count_of_views * index(rows * columns)
     model, level = pixels.model, pixels.level
     value = 0.0
@@ -126,16 +137,19 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                 begin, end = geometry.reach[view, row, 0], geometry.reach[view, row, 1]
                 met_from, met_to = end, begin
                 for first in range(begin, end, BLOCK_PX):
+                    at = index((view * rows + row) * columns + first)
+                    count = index(min(BLOCK_PX, columns - first))
+                    if bent:
+                        unpack_relief(relief_at, at, count, geometry.relief_step, scratch)
                     at = index((lattice * rows + row) * padded + first)
                     if not locate_on_all(
                         homographies, index(9 * view), count_of_views, layout, count_of_planes, samples,
-                        maps, layer, at, scratch, blocks,
+                        maps, layer, at, slopes, bent, scratch, blocks,
                     ):  # fmt: skip
                         continue
                     met_from, met_to = min(met_from, first), first + BLOCK_PX
                     if operation == REACH:
                         continue
-                    count = index(min(BLOCK_PX, columns - first))
                     at = index((view * rows + row) * columns + first)
                     if masked:
                         prefetch(valid_at, at + index(columns))

@@ -26,14 +26,19 @@ MARGIN = 16
 PRODUCT_PX = BLOCK_PX + 2 * MARGIN
 PRODUCTS = 2 * BLOCK_PX + MARGIN
 
+# Then how much nearer, in 1/depth, each pixel meets a surface than the depth of its homographies.
 # Then three rows for each plane: column (less the pixel's number), row, and weight of each pixel.
-_PLACES = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * PRODUCT_PX
+NEARER = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * PRODUCT_PX
+_PLACES = NEARER + BLOCK_PX
 COLUMN, ROW, WEIGHT = (row * BLOCK_PX for row in range(3))
 _PLACE_SIZE = 3 * BLOCK_PX
 
 # A pixel this far outside the samples (in samples) still sees their edge: rounding must not decide whether the border
 # of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
 EDGE_TOLERANCE = 1e-3
+
+# Code of a pixel that sees no part of a surface.
+UNSEEN = -(2**15)
 
 # How a block lies on a plane; the last four are in step with it, with so many rows and columns of taps.
 OUTSIDE, SCATTERED, IN_STEP_2_2, IN_STEP_2_3, IN_STEP_3_3, IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
@@ -79,7 +84,9 @@ def weights_of(plane):
 
 
 @compiled
-def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, scratch, blocks):
+def locate_on_all(
+    homographies, matrix, views, layout, planes, samples, maps, layer, pixel, slopes, bent, scratch, blocks
+):  # fmt: skip
     """Find where a block of pixels lies on every plane; return whether it sees any.
 
     `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that sample's row and column.
@@ -89,8 +96,9 @@ def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, la
         start = layout[index(3) * plane]
         height, width = layout[index(3) * plane + index(1)], layout[index(3) * plane + index(2)]
         row_from, row_to, column_from, column_to = _locate(
-            homographies, matrix + index(9) * plane * views, maps, layer, pixel, height, width, scratch, place_of(plane)
-        )
+            homographies, matrix + index(9) * plane * views, maps, layer, pixel, slopes, matrix, bent, height, width,
+            scratch, place_of(plane),
+        )  # fmt: skip
         start += row_from * width + column_from
         how = _arrangement(row_from, row_to, column_from, column_to, start, width, samples)
         block = index(4) * plane
@@ -101,7 +109,9 @@ def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, la
 
 
 @compiled
-def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, place):
+def _locate(
+    homographies, matrix, maps, layer, pixel, slopes, slope, bent, height, width, scratch, place
+):  # fmt: skip
     """Find where a block's rays meet a plane; return the range of the rows, and that of column minus pixel.
 
     Rows `_COLUMN` (minus the pixel's number), `_ROW` and `_WEIGHT` of `place` are written. The weight is the pixel's
@@ -117,12 +127,20 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
     a, b, c = homographies[matrix], homographies[matrix + index(1)], homographies[matrix + index(2)]
     d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
     g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
+    p, q, r, s, t, u = zero, zero, zero, zero, zero, zero
+    if bent:
+        p, q, r = slopes[slope], slopes[slope + index(1)], slopes[slope + index(2)]
+        s, t, u = slopes[slope + index(3)], slopes[slope + index(4)], slopes[slope + index(5)]
     for k in range(index(BLOCK_PX)):
         at = pixel + k
         x, y, response = maps[at], maps[at + layer], maps[at + layer + layer]
         scale = g * x + h * y + i
         inverse = one / scale
         column, row = (a * x + b * y + c) * inverse, (d * x + e * y + f) * inverse
+        if bent:
+            nearer = scratch[index(NEARER) + k] * inverse
+            column += (p * x + q * y + r) * nearer
+            row += (s * x + t * y + u) * nearer
         # Comparisons with NaN are false: such a pixel is placed at zero, and does not see the plane
         within_column = column if column > zero else zero
         within_column = within_column if within_column < last_column else last_column
@@ -139,6 +157,17 @@ def _locate(homographies, matrix, maps, layer, pixel, height, width, scratch, pl
         column_from = min(column_from, whole_column if sees else greatest)
         column_to = max(column_to, whole_column if sees else least)
     return row_from, row_to, column_from, column_to
+
+
+@compiled
+def unpack_relief(relief, at, count, step, scratch):
+    """Set `NEARER` of a block's pixels from the codes of a relief; NaN, which sees nothing, where the code is lowest."""
+    number = type(scratch[0])
+    for k in range(index(BLOCK_PX)):
+        scratch[index(NEARER) + k] = number(np.nan)
+    for k in range(count):
+        code = relief[at + k]
+        scratch[index(NEARER) + k] = number(code) * step if code != UNSEEN else number(np.nan)
 
 
 @inlined

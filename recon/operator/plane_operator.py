@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.relief import Relief
 from faintfield.recon.operator.scene_operator import SceneOperator
 
 
@@ -37,6 +38,7 @@ class PlaneOperator(SceneOperator):
         lattice_of_view: NDArray[np.intp] | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
+        surface: tuple[NDArray[np.floating], Relief] | None = None,
     ) -> None:
         super().__init__(
             plane_from_ray[np.newaxis],
@@ -47,6 +49,7 @@ class PlaneOperator(SceneOperator):
             lattice_of_view=lattice_of_view,
             dtype=dtype,
             workers=workers,
+            surface=surface,
         )
         self.grid = grid
         self.samples_shape = grid.shape

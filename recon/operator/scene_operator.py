@@ -13,6 +13,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
 from faintfield.recon.operator.geometry import scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.relief import Relief
 from faintfield.recon.operator.placement import make_workspace
 from faintfield.recon.threads import run_in_threads
 
@@ -75,6 +76,7 @@ class SceneOperator:
         lattice_of_view: NDArray[np.intp] | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
+        surface: tuple[NDArray[np.floating], Relief] | None = None,
     ) -> None:
         self.grids = tuple(grids)
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
@@ -83,6 +85,13 @@ class SceneOperator:
         self._geometry = scene_geometry(
             plane_from_ray, rays, self.grids, flat, valid, transmission, lattice_of_view, self.dtype
         )
+        if surface is not None:
+            slopes, relief = surface
+            self._geometry = self._geometry._replace(
+                slopes=np.ascontiguousarray(slopes, dtype).reshape(-1),
+                relief=relief.codes.reshape(-1),
+                relief_step=self.dtype.type(relief.step),
+            )
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
         self._size = sum(grid.shape[0] * grid.shape[1] for grid in self.grids)
