@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.placement import UNSEEN
 from faintfield.recon.operator.relief import draw_relief
 
 
@@ -42,6 +43,7 @@ class SurfaceOperator(PlaneOperator):
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
         lattices = np.zeros(len(ray_from_surface), np.intp) if lattice_of_view is None else lattice_of_view
         relief = draw_relief(inverse_depth, grid, ray_from_surface, rays, lattices.tolist(), workers)
+        self._relief = relief
         at_zero, slope = homographies_of_surface(ray_from_surface)
         in_samples = np.einsum("ij,vjk->vik", grid.index_from_plane(), slope)
         super().__init__(
@@ -55,3 +57,8 @@ class SurfaceOperator(PlaneOperator):
             workers=workers,
             surface=(in_samples, relief),
         )
+
+    def inverse_depth_of_pixels(self) -> NDArray[np.float32]:
+        """Return 1/depth at which each pixel (view, row, column) meets the surface, 0 where it sees no part of it."""
+        codes, step, origin = self._relief
+        return np.where(codes == UNSEEN, np.float32(0), codes * np.float32(step) + np.float32(origin))
