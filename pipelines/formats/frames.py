@@ -141,6 +141,8 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
         raise UnreadableImage(
             f"{path}: holds an array of shape {shape}; one grey or RGB picture is wanted; export it as such"
         )
+    if frame.pixels_dn.dtype.kind not in "buif":
+        raise UnreadableImage(f"{path}: holds {frame.pixels_dn.dtype} pixels; real numbers are wanted; export it so")
     return frame
 
 

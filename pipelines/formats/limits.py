@@ -14,6 +14,9 @@ MAX_PREVIEW_BYTES = 200_000_000
 # Longest exposure: eleven days.
 MAX_EXPOSURE_S = 1e6
 
+# Largest light of a pixel, a million times what a pixel holds; its square is far from the limit of float32.
+MAX_LIGHT_E = 1e12
+
 # Largest row or column of a node.
 MAX_NODE = 100_000
 

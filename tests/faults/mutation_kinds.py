@@ -259,6 +259,10 @@ def _figures(folder: Path) -> None:
 
 
 _NOTHING = ("",)
+
+# A session whose seal is missing is open: frames may be set aside, taken again and sealed.
+_IN_SESSION = ("IN/session", "IN/session/*")
+
 _RECONSTRUCT = "reconstruct IN --out OUT --depth-mm 500 --passes 2 --penalty-weight 0.1"
 _BACKPROJECT = "reconstruct IN --out OUT --depth-mm 500 --method backprojection"
 
@@ -270,7 +274,7 @@ _READ_SET = (
     Call("export colmap IN OUT --binary"),
     Call("export mrcal IN OUT"),
 )
-_RESUME = Call("capture IN/rig.toml IN/session --yes", ("IN/session", "IN/session/*"), then="verify IN/session")
+_RESUME = Call("capture IN/rig.toml IN/session --yes", _IN_SESSION, then="verify IN/session")
 
 _JOURNAL = "session/journal.sqlite"
 _OF_SESSION = ("session/plan.json", _JOURNAL, _JOURNAL, "session/frames/*", "session/lock", "rig.toml")
@@ -339,7 +343,7 @@ KINDS: Mapping[str, Kind] = {
         (*_OF_SESSION, "session/SHA256SUMS"),
         (
             *(_VERIFY, _VERIFY, _VERIFY),
-            Call("capture IN/rig.toml IN/session --yes", _NOTHING),  # there is nothing left to capture
+            Call("capture IN/rig.toml IN/session --yes", _IN_SESSION),
             Call("noise IN/session --out OUT"),
         ),
         usual=30,
@@ -353,7 +357,7 @@ KINDS: Mapping[str, Kind] = {
             *("session/reconstructions/*", "session/cameras/*"),
         ),
         (
-            Call("run IN/session --depth-mm 700 --method backprojection", ("IN/session", "IN/session/*")),
+            Call("run IN/session --depth-mm 700 --method backprojection", _IN_SESSION),
             Call("report IN/session", ("IN/session/report.html",)),
             Call("reconstruct IN/session --out OUT --depth-mm 700 --method backprojection"),
             Call("verify IN/session", _NOTHING),

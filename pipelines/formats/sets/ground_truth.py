@@ -7,8 +7,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.errors import WrongSize
+from faintfield.pipelines.errors import UnreadableImage, WrongSize
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.limits import MAX_LIGHT_E
 from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.toml_files import inside
@@ -72,6 +73,11 @@ def texture_and_region(folder: Path, plane: TruePlane) -> tuple[NDArray[Any], ND
     if visible.shape != texture.shape[:2]:
         raise WrongSize(
             f"{folder / plane.visible}: is {visible.shape}, {plane.texture} {texture.shape[:2]} (rows, columns); "
+            "simulate the set again"
+        )
+    if not (np.abs(texture) <= MAX_LIGHT_E).all():
+        raise UnreadableImage(
+            f"{folder / plane.texture}: holds light that is not a number of at most {MAX_LIGHT_E:g} electrons; "
             "simulate the set again"
         )
     return texture, visible > 127

@@ -177,10 +177,16 @@ def test_a_folder_with_other_things_is_no_place_for_a_session(tmp_path: Path) ->
         pass
 
 
-def test_a_complete_session_is_not_written_to(session: Path) -> None:
+@pytest.mark.parametrize("altered", [None, "plan.json", "journal.sqlite", "SHA256SUMS", "frames"])
+def test_a_complete_session_is_not_written_to(session: Path, altered: str | None) -> None:
+    if altered is not None:  # whatever else is wrong with it
+        path = frame_files(session)[0] if altered == "frames" else session / altered
+        path.write_bytes(b"altered" + path.read_bytes())
+    before = {path: path.read_bytes() if path.is_file() else None for path in session.rglob("*")}
     with pytest.raises(SessionCorrupt, match="is complete and is not written to"):
         capture_small(session)
-    assert verify(session).problems == ()
+    assert before == {path: path.read_bytes() if path.is_file() else None for path in session.rglob("*")}
+    assert altered is not None or verify(session).problems == ()
 
 
 def test_orphans_are_set_aside_and_nothing_is_deleted(unsealed: Path) -> None:
