@@ -1,17 +1,20 @@
 """What the views say of each depth of each sample: log-likelihood ratios against a surface assumed so far."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather
+from faintfield.recon.threads import run_in_threads
 
 # Weights of total variation in units of the noise: of the light at each depth, and of the light of the surface.
 _OF_DEPTH, _OF_SURFACE = 0.6, 1.15
@@ -24,114 +27,185 @@ _FEW_VIEWS = 8.0
 
 # Scales of blurs in samples: of light that few views see, of a view where it sees no part of the surface, and of the
 # surface's light, from which its detail is counted.
-_SPARSE, _UNSEEN_LIGHT, _DETAIL = 4.0, 5.0, 4.0
+_SPARSE, _UNSEEN_LIGHT, _DETAIL = 4.0, 5.0, 2.0
+
+# The same of light at one depth while no surface is known, and the scale of the light in the variance.
+_COARSE_DETAIL, _MEAN_LIGHT = 12.0, 8.0
 
 # A view does not count where something hides a sample that lies at least this many samples away from it in the picture.
 _REACH = 8.0
 
 
-@dataclass(frozen=True)
-class Half:
-    """One half of the views: its numbers, its images, and its operators."""
+class Halves(NamedTuple):
+    """Two halves of the views, which share the scene but not the noise; views in neither are left out."""
 
-    views: NDArray[np.intp]
-    light_e: Image
+    first: NDArray[np.intp]
+    second: NDArray[np.intp]
+
+
+class Ratios(NamedTuple):
+    """Log-likelihood ratios (row, column, depth) of each depth against a surface.
+
+    Attributes
+    ----------
+    own : float array (row, column, depth)
+        Of the light that the views show at each depth.
+    both : float array (row, column, depth)
+        The mean of these and of those of the surface's own light at each depth.
+    """
+
+    own: Image
+    both: Image
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A surface, and the light on it as each half of the views shows it."""
+
+    operator: SurfaceOperator
+    lights: list[Image]
+
+    def light(self) -> NDArray[np.float32]:
+        """Return the light (row, column) by both halves."""
+        return np.asarray(np.mean(self.lights, axis=0), np.float32)
 
 
 class DepthEvidence:
-    """The evidence for each depth of a sweep, from two halves of the views that share the scene but not the noise.
+    """The evidence for each depth of a sweep.
 
     Parameters
     ----------
+    views : PinholeViews
+        The views.
     inverse_depths : float array (depth,)
         1/depth, ascending in equal steps.
-    planes : sequence of PlaneOperator
-        H of the plane at each.
-    surface : callable
-        Returns H of the surface with 1/depth (row, column).
-    images : ElementalImages
-        The views.
-    halves : two int arrays
-        The views of each half.
-    reach : float array (view,)
-        Parallax of each view in samples per 1/depth.
+    halves : Halves
+        The views that count, in two halves: depths are found in one by the light of the other.
     """
 
-    def __init__(
-        self,
-        inverse_depths: NDArray[np.float64],
-        planes: Sequence[PlaneOperator],
-        surface: Callable[[NDArray[np.floating]], SurfaceOperator],
-        images: ElementalImages,
-        halves: tuple[NDArray[np.intp], NDArray[np.intp]],
-        reach: NDArray[np.floating],
-    ) -> None:
-        self.inverse_depths = inverse_depths
-        self._planes, self._surface, self._halves = planes, surface, halves
-        self._light = images.electrons - np.float32(images.background_e)
-        middle = planes[len(planes) // 2]
-        mean = _ratio(middle.adjoint(self._light), middle.sensitivity(), _DETAIL * 2)
-        self.variance = np.maximum(mean, 0) + np.float32(np.mean(images.known_variance_e2()))
-        self._reach = reach.astype(np.float32)
-        self._blurred = [
-            np.stack([cv2.GaussianBlur(image, (0, 0), _UNSEEN_LIGHT) for image in self._light[half]]) for half in halves
-        ]
+    def __init__(self, views: PinholeViews, inverse_depths: NDArray[np.float64], halves: Halves) -> None:
+        self.views, self.inverse_depths, self.halves = views, inverse_depths, halves
+        self._numbers = np.concatenate(halves)
+        self._half = np.repeat(np.arange(2), [len(half) for half in halves])
+        self._subset = _of_views(views, self._numbers)
+        middle = self._sums(self._stack(), float(np.median(inverse_depths)), self._nothing(), self._anywhere())
+        mean = _ratio(middle[0, 1] + middle[1, 1], middle[0, 0] + middle[1, 0], _MEAN_LIGHT)
+        self.variance = np.maximum(mean, 0) + np.float32(views.variance_e2)
 
-    def against(self, index: NDArray[np.floating] | None) -> Image:
-        """Return the evidence (row, column, depth) for each depth given a surface, as fractional index of the depths."""
-        shape = self._planes[0].samples_shape
-        evidence = np.zeros((*shape, len(self._planes)), np.float32)
-        if index is None:
-            for number, plane in enumerate(self._planes):
-                sums = [(plane.adjoint(self._light, half), plane.sensitivity(half)) for half in self._halves]
-                lights = [self._denoised(*pair, _OF_DEPTH) for pair in sums]
-                for (sum_e, views), other in zip(sums, reversed(lights), strict=True):
-                    detail, seen = _detail(other, views, 3 * _DETAIL), _detail(sum_e / np.maximum(views, 0.5), views, 3 * _DETAIL)
-                    evidence[:, :, number] += views * (seen * detail - 0.5 * detail**2) / self.variance
-            return evidence
-        q = np.interp(index, np.arange(len(self._planes)), self.inverse_depths)
-        operator = self._surface(q)
-        relief = operator.inverse_depth_of_pixels()
-        lights = [self._denoised(operator.adjoint(self._light, half), operator.sensitivity(half), _OF_SURFACE) for half in self._halves]
+    def at_first(self) -> Image:
+        """Return the evidence (row, column, depth) before any surface is known: where both halves show alike detail."""
+        stack, nothing, anywhere = self._stack(), self._nothing(), self._anywhere()
+
+        def ratio(inverse_depth: float) -> list[Image]:
+            sums = self._sums(stack, inverse_depth, nothing, anywhere)
+            lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e in sums]
+            total = np.zeros_like(self.variance)
+            for (count, sum_e), other in zip(sums, reversed(lights), strict=True):
+                light = _detail(other, count, _COARSE_DETAIL)
+                seen = _detail(sum_e / np.maximum(count, 0.5), count, _COARSE_DETAIL)
+                total += count * (seen * light - 0.5 * light**2)
+            return [total]
+
+        return self._of_all_depths(ratio, 1)[0]
+
+    def explained(self, index: NDArray[np.floating]) -> Explained:
+        """Return the light of a surface, given as fractional index of the depths (row, column)."""
+        q = np.interp(index, np.arange(len(self.inverse_depths)), self.inverse_depths)
+        operator = self.views.surface_operator(q)
+        light = self.views.light_e
+        return Explained(
+            operator,
+            [
+                self._denoised(operator.adjoint(light, half), operator.sensitivity(half), _OF_SURFACE, workers=None)
+                for half in self.halves
+            ],
+        )
+
+    def against(self, known: Explained) -> Ratios:
+        """Return the evidence for each depth against a surface and its light."""
+        relief = known.operator.inverse_depth_of_pixels()
+        stack = self._stack(self._explanation(known, relief))
+        relief, tolerance = relief[self._numbers], _REACH / np.maximum(self._subset.reach, np.float32(1e-9))
+        details = [_detail(light, np.ones_like(light), _DETAIL) for light in known.lights]
+
+        def ratio(inverse_depth: float) -> list[Image]:
+            sums = self._sums(stack, inverse_depth, relief, tolerance)
+            lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e, _ in sums]
+            own, matched = np.zeros_like(self.variance), np.zeros_like(self.variance)
+            for (count, sum_e, of_known), light, detail in zip(sums, reversed(lights), reversed(details), strict=True):
+                own += sum_e * light - np.float32(0.5) * count * light**2 - of_known
+                matched += count * _detail(sum_e / np.maximum(count, 0.5), count, _DETAIL) * detail
+            return [own, np.float32(0.5) * (own + matched)]
+
+        return Ratios(*self._of_all_depths(ratio, 2))
+
+    def _explanation(self, known: Explained, relief: NDArray[np.float32]) -> Image:
+        """Return the part of each pixel's log-likelihood (view, row, column) that its light by the surface explains."""
         explained = []
-        for half, light, blurred in zip(self._halves, reversed(lights), self._blurred, strict=True):
-            expected = np.where(relief[half] > 0, operator.forward(light, half), blurred)
-            explained.append(self._light[half] * expected - 0.5 * expected**2)
-        details = [_detail(light, np.ones_like(light), _DETAIL) for light in lights]
-        for number, plane in enumerate(self._planes):
-            nearer = (relief - np.float32(self.inverse_depths[number])) * self._reach[:, np.newaxis, np.newaxis]
-            visible = nearer <= _REACH
-            sums = []
-            for half, known in zip(self._halves, explained, strict=True):
-                stack = np.zeros_like(self._light)
-                stack[half] = visible[half]
-                views = plane.adjoint(stack, half)
-                stack[half] *= self._light[half]
-                sum_e = plane.adjoint(stack, half)
-                stack[half] = known * visible[half]
-                sums.append((sum_e, views, plane.adjoint(stack, half)))
-            own = [self._denoised(sum_e, views, _OF_DEPTH) for sum_e, views, _ in sums]
-            for (sum_e, views, known), light, detail in zip(sums, reversed(own), reversed(details), strict=True):
-                ratio = sum_e * light - 0.5 * views * light**2 - known
-                matched = views * _detail(sum_e / np.maximum(views, 0.5), views, _DETAIL) * detail
-                evidence[:, :, number] += 0.5 * (ratio + matched) / self.variance
-        return evidence
+        for half, light in zip(self.halves, reversed(known.lights), strict=True):
+            expected = known.operator.forward(light, half)
+            for view, seen in zip(half, expected, strict=True):
+                picture = self.views.light_e[view]
+                around = cv2.GaussianBlur(np.where(picture > UNKNOWN, picture, 0), (0, 0), _UNSEEN_LIGHT)
+                light_e = np.where(relief[view] > 0, seen, around)
+                explained.append(picture * light_e - np.float32(0.5) * light_e**2)
+        return np.stack(explained)
 
-    def _denoised(self, sum_e: Image, views: Image, strength: float) -> Image:
+    def _stack(self, *further: Image) -> NDArray[np.float32]:
+        """Return pictures (view, row, column, number) of the views that count: their light, and further numbers."""
+        return np.stack([self._subset.light_e, *further], axis=-1)
+
+    def _nothing(self) -> NDArray[np.float32]:
+        return np.zeros((len(self._numbers), *self.views.light_e.shape[1:]), np.float32)
+
+    def _anywhere(self) -> NDArray[np.float32]:
+        return np.full(len(self._numbers), np.inf, np.float32)
+
+    def _sums(self, stack: Image, inverse_depth: float, relief: Image, tolerance: Image) -> Image:
+        return gather(self._subset, stack, inverse_depth, relief, tolerance, self._half)
+
+    def _of_all_depths(self, ratios: Callable[[float], list[Image]], count: int) -> list[Image]:
+        """Return what a function gives for each depth (row, column, depth), per unit of the noise's variance."""
+        volumes = [np.empty((*self.variance.shape, len(self.inverse_depths)), np.float32) for _ in range(count)]
+        workers = int(numba.config.NUMBA_NUM_THREADS)
+
+        def work(first: int) -> None:
+            for number in range(first, len(self.inverse_depths), workers):
+                for volume, found in zip(volumes, ratios(float(self.inverse_depths[number])), strict=True):
+                    volume[:, :, number] = found / self.variance
+
+        run_in_threads(work, range(workers))
+        return volumes
+
+    def _denoised(self, sum_e: Image, count: Image, strength: float, workers: int | None = 1) -> Image:
         """Return light (row, column) from its sum over views, smoothed by total variation as its noise asks for."""
-        share = np.clip(views / _FEW_VIEWS, 0, 1)
-        light = share * sum_e / np.maximum(views, 0.5) + (1 - share) * _ratio(sum_e, views, _SPARSE)
-        metric = np.maximum(views, 1.0) / self.variance
+        share = np.clip(count / np.float32(_FEW_VIEWS), 0, 1)
+        light = share * sum_e / np.maximum(count, np.float32(0.5)) + (1 - share) * _ratio(sum_e, count, _SPARSE)
+        metric = np.maximum(count, np.float32(1)) / self.variance
         weight = strength * float(np.sqrt(np.median(metric)))
-        dual = DualField.zero([light.shape], light.dtype)
-        return dual.prox(light.astype(np.float32), metric.astype(np.float32), weight, Penalty(), lambda _: 0.0, _STEPS).plane
+        dual = DualField.zero([light.shape], np.dtype(np.float32))
+        dual = dual if workers is None else DualField(dual.vectors, workers)
+        return dual.prox(light, metric, weight, Penalty(), lambda _: 0.0, _STEPS).plane
 
 
-def _ratio(sum_e: Image, views: Image, scale: float) -> Image:
+def _of_views(views: PinholeViews, numbers: NDArray[np.intp]) -> PinholeViews:
+    """Return some of the views."""
+    return PinholeViews(
+        np.ascontiguousarray(views.light_e[numbers]),
+        views.variance_e2,
+        views.ray_from_surface[numbers],
+        views.focal_px,
+        views.centre_px,
+        views.grid,
+    )
+
+
+def _ratio(sum_e: Image, count: Image, scale: float) -> Image:
     """Return blurred sums over blurred numbers of views."""
-    return np.asarray(cv2.GaussianBlur(sum_e, (0, 0), scale) / np.maximum(cv2.GaussianBlur(views, (0, 0), scale), 0.3))
+    blurred = cv2.GaussianBlur(count, (0, 0), scale)
+    return np.asarray(cv2.GaussianBlur(sum_e, (0, 0), scale) / np.maximum(blurred, np.float32(0.3)))
 
 
-def _detail(light: Image, views: Image, scale: float) -> Image:
+def _detail(light: Image, count: Image, scale: float) -> Image:
     """Return light less its mean over neighbours, weighted by the views that see them."""
-    return np.asarray(light - _ratio(light * views, views, scale))
+    return np.asarray(light - _ratio(light * count, count, scale))

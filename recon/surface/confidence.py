@@ -1,0 +1,93 @@
+"""How sure a depth is: the probability that it is right within 2 %, from what is known to go wrong."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from faintfield.recon.surface.edges import near_side, values_at
+
+# Relative error of a depth that still counts as right.
+RIGHT_WITHIN = 0.02
+
+# Probability above which a depth is called sure, and below which none is stated.
+SURE, UNKNOWN_BELOW = 0.9, 0.15
+
+# Samples from an edge beyond which it does not matter, and within which depths often are those of the other side.
+_FAR_FROM_EDGE, _BESIDE_EDGE = 12.0, 4.0
+
+# Sharpness of the costs as a probability.
+_SHARPNESS = 0.1
+
+# Scale of the blur in samples before the slope of the depths is measured.
+_SLOPE_SCALE = 2.0
+
+# Alternatives to a depth lie at least this many steps away from it.
+_APART_STEPS = 3.0
+
+# Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
+COEFFICIENTS = (-2.58, 1.25, 1.07, -0.24, 1.82, 0.42, 0.24, -0.16, -1.33)
+
+# No probability is stated above this: scenes contain what no model has.
+_MAX_CONFIDENCE = 0.95
+
+
+def confidence(
+    index: NDArray[np.floating], costs: NDArray[np.floating], inverse_depths: NDArray[np.floating]
+) -> NDArray[np.float32]:
+    """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
+
+    A logistic model of `features`. Its coefficients were fitted on rendered scenes whose depth is known, at two levels of light.
+
+    Parameters
+    ----------
+    index : float array (row, column)
+        The depths, as fractional index.
+    costs : float array (row, column, depth)
+        Costs by paths, see `sum_over_paths`.
+    inverse_depths : float array (depth,)
+        1/depth.
+    """
+    logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths), 1)
+    return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), _MAX_CONFIDENCE), np.float32)
+
+
+def features(
+    index: NDArray[np.floating], costs: NDArray[np.floating], inverse_depths: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """Return what the probability depends on (feature, row, column); the first is one everywhere.
+
+    In order: one; the log odds of the depths within the tolerance, by the costs; by how much alternatives cost more
+    (logarithm), or less; the distance to the next edge; whether one is near; the slope of the depths; the difference
+    between the depths before and after they were made piecewise plane; the tolerance in steps (both logarithms).
+    """
+    q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
+    tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
+    away = np.empty_like(costs)
+    np.subtract(np.arange(costs.shape[2], dtype=costs.dtype), index[:, :, np.newaxis], out=away)
+    np.abs(away, out=away)
+    own = values_at(costs, index)
+    least = costs.min(axis=2)
+    others = np.where(away <= np.maximum(2 * tolerance, _APART_STEPS)[:, :, np.newaxis], np.float32(np.inf), costs)
+    margin = np.minimum(others.min(axis=2) - own, np.float32(1e6))
+    del others
+    chances = np.exp(np.float32(_SHARPNESS) * (least[:, :, np.newaxis] - costs))
+    share = np.where(away <= tolerance[:, :, np.newaxis], chances, 0).sum(axis=2) / chances.sum(axis=2)
+    near = near_side(index)
+    edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
+    smooth = cv2.GaussianBlur(np.asarray(index, np.float32), (0, 0), _SLOPE_SCALE)
+    slope = np.hypot(*np.gradient(smooth))
+    moved = np.abs(costs.argmin(axis=2) - index) / tolerance
+    return np.stack(
+        [
+            np.ones_like(q),
+            np.log((share + 0.01) / (1.01 - share)),
+            np.log1p(np.maximum(margin, 0)),
+            0.1 * np.minimum(margin, 0),
+            edge / _FAR_FROM_EDGE,
+            edge < _BESIDE_EDGE,
+            np.log(0.05 + slope),
+            np.log(0.05 + moved),
+            np.log(tolerance),
+        ]
+    )

@@ -1,0 +1,153 @@
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+"""The views as ideal pinhole cameras see them, and their sums over what each depth brings together, compiled."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.numba_tools import compiled, index, pointer
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.surface_operator import SurfaceOperator
+
+# Light of a pixel without a valid number.
+UNKNOWN = np.float32(-1e30)
+
+
+@dataclass(frozen=True)
+class PinholeViews:
+    """All views of one scene as pinhole cameras see them, all colours together.
+
+    Attributes
+    ----------
+    light_e : float32 array (view, row, column)
+        Electrons of light, the background subtracted and the response divided out; `UNKNOWN` where there is no number.
+    variance_e2 : float
+        Variance of a pixel without that of its light.
+    ray_from_surface : float array (view, 3, 4)
+        From (x, y, 1, 1/depth) in the frame of the reference view to the ray of a view, homogeneous.
+    focal_px, centre_px : (float, float)
+        Of the pinhole camera, in pixels of these images, right and down.
+    grid : PlaneGrid
+        The samples of the surface, at unit depth.
+    """
+
+    light_e: NDArray[np.float32]
+    variance_e2: float
+    ray_from_surface: NDArray[np.float64]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    grid: PlaneGrid
+
+    def rays(self) -> NDArray[np.float32]:
+        """Return where pixels look (row, column, 2)."""
+        rows, columns = np.indices(self.light_e.shape[1:], np.float32)
+        (cx, cy), (fx, fy) = self.centre_px, self.focal_px
+        return np.stack([(columns - np.float32(cx)) / np.float32(fx), (rows - np.float32(cy)) / np.float32(fy)], -1)
+
+    @cached_property
+    def pixel_from_surface(self) -> NDArray[np.float32]:
+        """Matrices (view, 3, 4) from (x, y, 1, 1/depth) to column, row, homogeneous."""
+        (cx, cy), (fx, fy) = self.centre_px, self.focal_px
+        pixel_from_ray = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        return np.asarray(pixel_from_ray @ self.ray_from_surface, np.float32)
+
+    @cached_property
+    def reach(self) -> NDArray[np.float32]:
+        """Parallax of each view, in samples per unit of 1/depth."""
+        reach = np.linalg.norm(self.ray_from_surface[:, :2, 3], axis=1) / self.grid.pitch_mm
+        return np.asarray(reach, np.float32)
+
+    def surface_operator(self, inverse_depth: NDArray[np.floating]) -> SurfaceOperator:
+        """Return H of a surface with the given 1/depth (row, column)."""
+        return SurfaceOperator(
+            self.ray_from_surface, self.rays(), self.grid, inverse_depth, valid=self.light_e > UNKNOWN
+        )
+
+
+def gather(
+    views: PinholeViews,
+    pictures: NDArray[np.float32],
+    inverse_depth: float,
+    relief: NDArray[np.float32],
+    tolerance: NDArray[np.float32],
+    half: NDArray[np.intp],
+) -> Image:
+    """Return sums over the views of what they show of the samples, were these all at one depth.
+
+    Pixels are interpolated between their four neighbours. A view does not count where something nearer hides it.
+
+    Parameters
+    ----------
+    views : PinholeViews
+        Where the views look.
+    pictures : float32 array (view, row, column, number)
+        The numbers to add up; the first is `UNKNOWN` where a pixel does not count.
+    inverse_depth : float
+        1/depth of all samples.
+    relief : float32 array (view, row, column)
+        1/depth of what each pixel sees.
+    tolerance : float32 array (view,)
+        By how much that may be larger than the samples' own.
+    half : int array (view,)
+        The sum that each view belongs to, 0 or 1.
+
+    Returns
+    -------
+    float32 array (2, 1 + number, row, column)
+        Numbers of views of both halves, and sums.
+    """
+    sums = np.zeros((2, 1 + pictures.shape[3], *views.grid.shape), np.float32)
+    x0, y0 = views.grid.origin_mm
+    _gather(
+        pictures,
+        relief,
+        tolerance,
+        half,
+        views.pixel_from_surface,
+        np.float32(inverse_depth),
+        (np.float32(x0), np.float32(y0), np.float32(views.grid.pitch_mm)),
+        sums,
+    )
+    return sums
+
+
+@compiled
+def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
+    """Add what views show to `sums` (half, count and numbers, row, column)."""
+    count, rows, columns, numbers = pictures.shape
+    x0, y0, pitch = lattice
+    zero, one, nearest = np.float32(0), np.float32(1), np.float32(0.5)
+    last_row, last_column = np.float32(rows - 1), np.float32(columns - 1)
+    row_step, column_step = index(columns * numbers), index(numbers)
+    width, size = index(sums.shape[3]), index(sums.shape[2] * sums.shape[3])
+    for view in range(count):
+        m, hidden = matrices[view], q + tolerance[view]
+        picture, seen, total = pointer(pictures[view]), pointer(relief[view]), pointer(sums[half[view]])
+        for i in range(sums.shape[2]):
+            y = y0 + pitch * np.float32(i)
+            a = m[0, 1] * y + m[0, 2] + m[0, 3] * q
+            b = m[1, 1] * y + m[1, 2] + m[1, 3] * q
+            c = m[2, 1] * y + m[2, 2] + m[2, 3] * q
+            for j in range(sums.shape[3]):
+                x = x0 + pitch * np.float32(j)
+                scale = one / (c + m[2, 0] * x)
+                column, row = (a + m[0, 0] * x) * scale, (b + m[1, 0] * x) * scale
+                if not (zero <= row < last_row and zero <= column < last_column):
+                    continue
+                if seen[index(np.int32(row + nearest)) * index(columns) + index(np.int32(column + nearest))] > hidden:
+                    continue
+                r, k = np.int32(row), np.int32(column)
+                upper = index(r) * row_step + index(k) * column_step
+                lower = upper + row_step
+                if min(min(picture[upper], picture[upper + column_step]), min(picture[lower], picture[lower + column_step])) == UNKNOWN:
+                    continue
+                down, right = row - np.float32(r), column - np.float32(k)
+                at = index(i) * width + index(j)
+                total[at] += one
+                for n in range(numbers):
+                    high = picture[upper + index(n)] + right * (picture[upper + column_step + index(n)] - picture[upper + index(n)])
+                    low = picture[lower + index(n)] + right * (picture[lower + column_step + index(n)] - picture[lower + index(n)])
+                    total[at + index(n + 1) * size] += high + down * (low - high)
