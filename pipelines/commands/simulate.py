@@ -38,12 +38,14 @@ def simulate(
     rotation_error_mrad: NotNegative = _DEFAULT.rotation_error_mrad,
     poses: Literal["true", "nominal"] = _DEFAULT.poses,
     colour: Literal["grey", "bayer"] = _DEFAULT.colour,
+    objects: Literal["toys", "surfaces"] = "toys",
     overwrite: bool = False,
 ) -> Simulated:
     """Simulate the paper's experiment: a toy truck at 500 mm and a toy airplane at 700 mm, almost dark.
 
     Writes the dark set, a noise-reference image, the same views without noise (`noise_free`, a set of its own), and
-    the ground truth: the objects' textures, where they are visible, and the poses.
+    the ground truth: the objects' textures and where they are visible, or the true depth and picture of surfaces; and
+    the poses.
 
     Parameters
     ----------
@@ -71,10 +73,15 @@ def simulate(
         Poses that elemental.toml states: those the camera really had (true), or those it was sent to (nominal).
     colour
         Sensor without colour filters (grey), or with a Bayer mosaic.
+    objects
+        The flat toys, or a scene that fills the view: a slanted wall, a rising floor, a ball, a tilted page and a thin
+        rod (surfaces), at 517 to 1009 mm.
     overwrite
         Replace an earlier set in OUT.
     """
     options = {name: value for name, value in locals().items() if name not in ("out", "overwrite")}
+    if objects == "toys":
+        del options["objects"]
     truth = write_synthetic_set(out, SyntheticOptions(**options), overwrite=overwrite)
     inform(
         f"{out}: {rows} x {columns} views, SNR {truth.snr:.3f}; photons per pixel on the object: "

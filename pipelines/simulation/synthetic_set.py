@@ -1,7 +1,7 @@
 """The elemental set of a synthetic scene with its ground truth, and the exposures of a simulated sensor."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
-from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, Truth
+from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, TrueSurface, Truth
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION
 from faintfield.recon.metrics import (
     expected_snr_from_powers,
@@ -27,9 +27,10 @@ from faintfield.recon.metrics import (
     signal_scale_for_snr,
 )
 from faintfield.rig.plan import grid_nodes
-from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
+from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment, surface_experiment
 from faintfield.rig.simulation.scene import render
 from faintfield.rig.simulation.sensor import SimulatedSensor, through_mosaic
+from faintfield.rig.simulation.surfaces import true_depth_mm
 
 NOISE_FREE = "noise_free"
 
@@ -53,10 +54,12 @@ class SyntheticOptions(msgspec.Struct, frozen=True, kw_only=True):
     rotation_error_mrad: float = 3.5
     poses: Literal["true", "nominal"] = "true"
     colour: Literal["grey", "bayer"] = "grey"
+    # Sets of toys, which were the only ones once, do not record it
+    objects: Literal["toys", "surfaces"] | msgspec.UnsetType = msgspec.UNSET
 
 
 def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool = False) -> Truth:
-    """Write the dark set of the paper's experiment, the same set without noise, and its ground truth; return that.
+    """Write the dark set of an experiment, the same set without noise, and its ground truth; return that.
 
     Raises
     ------
@@ -66,10 +69,8 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         The detector is too small to show the objects.
     """
     generator = np.random.default_rng(options.seed)
-    paper = paper_experiment(*options.size_px)
-    grid = (options.rows, options.columns, options.pitch_mm)
-    experiment = SimulatedExperiment(paper.planes, paper.optics, paper.sensor, *grid, options.exposure_s)
-    sensor = paper.sensor
+    experiment = _experiment(options)
+    sensor = experiment.sensor
     dark_e = sensor.dark_current_e_per_s * options.exposure_s
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None) as folder:
         true = experiment.poses_rt_cam_ref(options.position_error_mm, options.rotation_error_mrad * 1e-3, generator)
@@ -85,6 +86,18 @@ def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool
         truth = write_ground_truth(folder, scene, white_e, options.snr, options.poses)
         write_json(folder / "provenance.json", provenance("simulate", options, {}))
     return truth
+
+
+def _experiment(options: SyntheticOptions) -> SimulatedExperiment:
+    """Return the experiment that the options ask for."""
+    made = surface_experiment if options.objects == "surfaces" else paper_experiment
+    return replace(
+        made(*options.size_px),
+        rows=options.rows,
+        columns=options.columns,
+        pitch_mm=options.pitch_mm,
+        exposure_s=options.exposure_s,
+    )
 
 
 def stated_noise(sensor: SimulatedSensor) -> Noise:
@@ -188,10 +201,10 @@ def render_scene(
     samples_per_px : int
         Rays along each side of a pixel.
     """
-    planes = [plane if mosaic else plane.grey() for plane in experiment.planes]
     views = np.empty((len(poses_rt_cam_ref), *experiment.optics.size_px[::-1]), np.float32)
     object_region = np.zeros(views.shape[1:], bool)
-    rendering = render(planes, experiment.optics, poses_rt_cam_ref, samples_per_px=samples_per_px)
+    coloured = experiment if mosaic else experiment.grey()
+    rendering = coloured.render(poses_rt_cam_ref, samples_per_px=samples_per_px)
     for index, view in enumerate(progress(rendering, "rendering views", len(poses_rt_cam_ref))):
         views[index] = view.light if mosaic is None else through_mosaic(view.light, mosaic)
         if index == experiment.reference_view:
@@ -229,7 +242,8 @@ def write_ground_truth(folder: Path, scene: RenderedScene, white_e: float, snr: 
         noise_free=NOISE_FREE,
         poses=poses,
         true_rt_cam_ref=[tuple(pose) for pose in scene.poses_rt_cam_ref.tolist()],
-        planes=_write_textures(folder, scene, white_e),
+        planes=_write_textures(folder, scene, white_e) if scene.experiment.planes else [],
+        surface=_write_surface(folder, scene, white_e) if scene.experiment.surfaces else None,
     )
     write_json(folder / TRUTH_FILE, truth)
     return truth
@@ -259,3 +273,13 @@ def _write_textures(folder: Path, scene: RenderedScene, white_e: float) -> list[
         write_png(folder / visible, mask_picture(all_visible[plane.name] > 0.5))
         entries.append(TruePlane(plane.name, plane.depth_mm, texture, visible))
     return entries
+
+
+def _write_surface(folder: Path, scene: RenderedScene, white_e: float) -> TrueSurface:
+    """Write the true depths, and the picture in electrons, of the ideal reference view."""
+    coloured = scene.experiment if scene.mosaic else scene.experiment.grey()
+    ideal = replace(coloured, optics=coloured.optics.ideal())
+    surface = TrueSurface("truth/true_depth_mm.tiff", "truth/true_picture.tiff")
+    write_plane(folder / surface.depth_mm, true_depth_mm(ideal.surfaces, ideal.optics), pitch_mm=1.0)
+    write_plane(folder / surface.picture, next(ideal.render(np.zeros((1, 6)))).light * white_e, pitch_mm=1.0)
+    return surface

@@ -1,5 +1,6 @@
-"""The paper's experiment: toys, a grid of nodes, a lens and a cooled 16-bit sensor."""
+"""The paper's experiment: toys, a grid of nodes, a lens and a cooled 16-bit sensor; and the same with surfaces."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,8 +9,10 @@ from numpy.typing import NDArray
 from faintfield.rig.plan import centre_node, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.objects import toy_airplane, toy_truck
 from faintfield.rig.simulation.optics import SimulatedOptics
-from faintfield.rig.simulation.scene import TexturedPlane
+from faintfield.rig.simulation.scene import RenderedView, TexturedPlane, render
 from faintfield.rig.simulation.sensor import SimulatedSensor
+from faintfield.rig.simulation.surface_objects import surface_scene
+from faintfield.rig.simulation.surfaces import Surface, render_surfaces
 
 
 @dataclass(frozen=True)
@@ -19,13 +22,15 @@ class SimulatedExperiment:
     Parameters
     ----------
     planes : tuple of TexturedPlane
-        The scene, before a black background.
+        The scene, before a black background; none if it consists of surfaces.
     optics, sensor : SimulatedOptics, SimulatedSensor
         The camera.
     rows, columns, pitch_mm : int, int, float
         The grid.
     exposure_s : float
         Exposure time of one view of the dark scene.
+    surfaces : tuple of Surface
+        The scene, if it is not flat.
     """
 
     planes: tuple[TexturedPlane, ...]
@@ -35,6 +40,7 @@ class SimulatedExperiment:
     columns: int = 7
     pitch_mm: float = 50.0
     exposure_s: float = 0.1
+    surfaces: tuple[Surface, ...] = ()
 
     @property
     def reference_view(self) -> int:
@@ -55,19 +61,37 @@ class SimulatedExperiment:
         errors[self.reference_view] = 0
         return np.asarray(poses + errors)
 
+    def render(self, poses_rt_cam_ref: NDArray[np.float64], *, samples_per_px: int = 2) -> Iterator[RenderedView]:
+        """Yield the view of each pose (view, 6), see `scene.render` and `surfaces.render_surfaces`."""
+        if self.surfaces:
+            return render_surfaces(self.surfaces, self.optics, poses_rt_cam_ref, samples_per_px=samples_per_px)
+        return render(self.planes, self.optics, poses_rt_cam_ref, samples_per_px=samples_per_px)
+
     def grey(self) -> "SimulatedExperiment":
         """Return the experiment as a sensor without colour filters sees it."""
-        return replace(self, planes=tuple(plane.grey() for plane in self.planes))
+        planes = tuple(plane.grey() for plane in self.planes)
+        return replace(self, planes=planes, surfaces=tuple(surface.grey() for surface in self.surfaces))
 
 
 def paper_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedExperiment:
-    """Return the paper's scene: a toy truck at 500 mm and a toy airplane at 700 mm.
+    """Return the paper's scene: a toy truck at 500 mm and a toy airplane at 700 mm."""
+    planes = (toy_truck(-62.0, 50.0, 500.0), toy_airplane(78.0, -55.0, 700.0))
+    return SimulatedExperiment(planes, _paper_optics(width_px, height_px))
 
-    The lens has the field of view of 800 px focal length at 640 px width, slight barrel distortion, and a principal
-    point off the centre, as real lenses have.
+
+def surface_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedExperiment:
+    """Return the paper's camera and grid before a scene of slanted, curved and thin objects that fills its views."""
+    return SimulatedExperiment((), _paper_optics(width_px, height_px), surfaces=surface_scene())
+
+
+def _paper_optics(width_px: int, height_px: int) -> SimulatedOptics:
+    """Return the paper's lens for a detector.
+
+    It has the field of view of 800 px focal length at 640 px width, slight barrel distortion, and a principal point off
+    the centre, as real lenses have.
     """
     f_px = 800.0 * width_px / 640.0
-    optics = SimulatedOptics(
+    return SimulatedOptics(
         size_px=(width_px, height_px),
         fx_px=f_px,
         fy_px=f_px,
@@ -75,5 +99,3 @@ def paper_experiment(width_px: int = 640, height_px: int = 480) -> SimulatedExpe
         cy_px=(height_px - 1) / 2 - 0.004 * height_px,
         distortion=(-0.08, 0.02, 0.0005, -0.0003, 0.0),
     )
-    planes = (toy_truck(-62.0, 50.0, 500.0), toy_airplane(78.0, -55.0, 700.0))
-    return SimulatedExperiment(planes, optics)

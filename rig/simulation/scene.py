@@ -104,9 +104,9 @@ def _render_view(
     for plane in sorted(planes, key=lambda plane: _plane_in_camera(plane, rt_cam_ref)[0][2]):
         reflected, opacity = _sample(plane, rays, rt_cam_ref)
         light += reflected * (unhidden if not colours else unhidden[:, :, np.newaxis])
-        visible[plane.name] = _pixel_means(opacity * unhidden, samples_per_px)
+        visible[plane.name] = pixel_means(opacity * unhidden, samples_per_px)
         unhidden *= 1 - opacity
-    light = _pixel_means(light, samples_per_px)
+    light = pixel_means(light, samples_per_px)
     return RenderedView(light * (illumination if not colours else illumination[:, :, np.newaxis]), visible)
 
 
@@ -156,7 +156,7 @@ def _plane_in_camera(
     return origin_mm, r_cam_plane[:, 0], r_cam_plane[:, 1]
 
 
-def _pixel_means(samples: NDArray[np.float32], samples_per_px: int) -> NDArray[np.float32]:
+def pixel_means(samples: NDArray[np.float32], samples_per_px: int) -> NDArray[np.float32]:
     """Return the mean of the samples of each pixel, (row, column, …)."""
     if samples_per_px == 1:
         return samples

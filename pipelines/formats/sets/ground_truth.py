@@ -29,8 +29,23 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     visible: str
 
 
-class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`truth.json`; file names are relative to the set."""
+class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the reference camera would see without distortion and vignetting, on the samples of its own pixels.
+
+    Attributes
+    ----------
+    depth_mm : str
+        File of the depths along its axis, at the centres of the pixels, NaN at nothing.
+    picture : str
+        File of the expected electrons, the mean over each pixel.
+    """
+
+    depth_mm: str
+    picture: str
+
+
+class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """`truth.json`; file names are relative to the set. A scene consists of flat objects or is one surface."""
 
     snr: float
     photons_linear: float
@@ -40,6 +55,7 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses: Poses
     true_rt_cam_ref: list[tuple[float, float, float, float, float, float]]
     planes: list[TruePlane]
+    surface: TrueSurface | None = None
 
 
 def read_truth(folder: Path) -> Truth | None:
@@ -48,7 +64,10 @@ def read_truth(folder: Path) -> Truth | None:
     if not is_file(path):
         return None
     truth = read_json(path, Truth, what="the truth of a simulated set", remedy="simulate the set again, or remove it")
-    for name in (truth.noise_free, *(name for plane in truth.planes for name in (plane.texture, plane.visible))):
+    names = [name for plane in truth.planes for name in (plane.texture, plane.visible)]
+    if truth.surface is not None:
+        names += [truth.surface.depth_mm, truth.surface.picture]
+    for name in (truth.noise_free, *names):
         inside(folder, name, f"{path}: file")
     return truth
 
