@@ -52,10 +52,10 @@ class SceneGeometry(NamedTuple):
     slopes : array (view × 9,)
         Change of the homographies per 1/depth, for the one surface of a scene; of size zero for planes.
     relief : int16 array (view × row × column,)
-        How much nearer than the depth of the homographies each pixel meets the surface, in `relief_step` of 1/depth;
+        How much nearer than the depth of the homographies each pixel meets the surface, in units of `relief_step`;
         `UNSEEN` where it sees no part of it. Of size zero for planes.
     relief_step : float
-        Unit of the relief.
+        Unit of the relief, in 1/depth.
     reach : int array (view, row, 2)
         First and past-the-last padded column at which a row's pixels see any plane. Written by `REACH`.
     """
