@@ -161,7 +161,7 @@ def _locate(
 
 @compiled
 def unpack_relief(relief, at, count, step, scratch):
-    """Set `NEARER` of a block's pixels from the codes of a relief; NaN, which sees nothing, where the code is lowest."""
+    """Set `NEARER` of a block's pixels from the codes of a relief; NaN, which sees nothing, where it is `UNSEEN`."""
     number = type(scratch[0])
     for k in range(index(BLOCK_PX)):
         scratch[index(NEARER) + k] = number(np.nan)

@@ -46,8 +46,8 @@ class Relief(NamedTuple):
     -----
     Rounding to codes moves the place that a pixel sees by at most 1/131 064 of the parallax between the nearest sample
     and the farthest: less than 0.01 px up to a parallax of 1310 px. A view 150 mm from the reference has that much, if
-    the focal length is 7500 px (6000 px over 44°), between 300 mm and 463 mm or from 860 mm to infinity; from 300 mm to
-    infinity it is moved by up to 0.03 px.
+    the focal length is 7500 px (6000 px over 44°), between 300 mm and 455 mm or from 870 mm to infinity; from 300 mm to
+    infinity the place moves by up to 0.03 px.
     """
 
     codes: NDArray[np.int16]
@@ -129,7 +129,7 @@ def _whole_cells(inverse_depth: NDArray[np.floating], tear: float) -> NDArray[np
         return ~((differences <= tear) | (differences <= _MAX_BEND * np.minimum(before, after)))
 
     across, down = crossed(1), crossed(0)
-    return ~(across[:-1] | across[1:] | down[:, :-1] | down[:, 1:])
+    return np.asarray(~(across[:-1] | across[1:] | down[:, :-1] | down[:, 1:]))
 
 
 def _continued(heights: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -146,7 +146,7 @@ def _buffer_from_sample(
     first = np.array([[1, 0, -_BORDER], [0, 1, -_BORDER], [0, 0, 1]])
     at_origin = ray_from_surface[:, :3] + origin * np.outer(ray_from_surface[:, 3], [0, 0, 1])
     matrix = np.column_stack([at_origin @ np.linalg.inv(grid.index_from_plane()) @ first, ray_from_surface[:, 3]])
-    return buffer_grid.index_from_plane() @ matrix
+    return np.asarray(buffer_grid.index_from_plane() @ matrix)
 
 
 @compiled

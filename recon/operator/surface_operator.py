@@ -86,11 +86,11 @@ class SurfaceOperator(PlaneOperator):
         workers: int | None = None,
     ) -> None:
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
-        ray_from_surface = np.asarray(ray_from_surface, np.float64)
-        lattices = np.zeros(len(ray_from_surface), np.intp) if lattice_of_view is None else np.asarray(lattice_of_view)
-        _check_surface(ray_from_surface, rays, grid, inverse_depth, lattices)
-        self._relief = draw_relief(inverse_depth, grid, ray_from_surface, rays, lattices.tolist(), workers)
-        at_infinity, slopes = homographies_of_surface(ray_from_surface)
+        matrices = ray_from_surface.astype(np.float64)
+        lattices = np.zeros(len(matrices), np.intp) if lattice_of_view is None else np.asarray(lattice_of_view)
+        _check_surface(matrices, rays, grid, inverse_depth, lattices)
+        self._relief = draw_relief(inverse_depth, grid, matrices, rays, lattices.tolist(), workers)
+        at_infinity, slopes = homographies_of_surface(matrices)
         super().__init__(
             at_infinity + self._relief.origin * slopes,
             rays,
