@@ -109,7 +109,7 @@ def draw_relief(
             buffer.fill(-np.inf)
             matrix = _buffer_from_sample(distinct[number].reshape(3, 4), grid, buffer_grid, relief.origin)
             _draw(heights, whole, matrix, buffer)
-            for view in np.flatnonzero(drawing == number):
+            for view in np.flatnonzero(drawing == number).tolist():
                 of_lattice = maps[lattice_of_view[view]]
                 _read(buffer, of_lattice, left, top, 1 / grid.pitch_mm, 2 * tear, relief.step, relief.codes[view])
 
@@ -126,7 +126,7 @@ def _whole_cells(inverse_depth: NDArray[np.floating], tear: float) -> NDArray[np
         beside = np.pad(differences, ends, constant_values=np.inf)
         length = differences.shape[axis]
         before, after = (np.take(beside, np.arange(length) + shift, axis) for shift in (0, 2))
-        return ~((differences <= tear) | (differences <= _MAX_BEND * np.minimum(before, after)))
+        return np.asarray(~((differences <= tear) | (differences <= _MAX_BEND * np.minimum(before, after))))
 
     across, down = crossed(1), crossed(0)
     return np.asarray(~(across[:-1] | across[1:] | down[:, :-1] | down[:, 1:]))
