@@ -67,6 +67,7 @@ def scene_geometry(
         np.ascontiguousarray(slopes, dtype).reshape(-1),
         relief.codes.reshape(-1),
         dtype.type(relief.step),
+        () if surface is None else (True,),
         np.tile(np.array([0, padded], np.intp), (views, rows, 1)),
     )
 
