@@ -10,6 +10,10 @@ from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.placement import BLOCK_PX
+from faintfield.recon.operator.relief import Relief
+
+# How homographies (view, 3, 3) to samples change with 1/depth, and where each pixel meets the surface.
+type Surface = tuple[NDArray[np.float64], Relief]
 
 
 def scene_geometry(
@@ -21,8 +25,11 @@ def scene_geometry(
     transmission: NDArray[Any] | None,
     lattice_of_view: NDArray[np.intp] | None,
     dtype: np.dtype[Any],
+    surface: Surface | None = None,
 ) -> SceneGeometry:
     """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2); `reach` covers whole rows.
+
+    With a `surface`, the only plane is the one at 1/depth `origin` of its relief, and pixels meet it nearer or farther.
 
     Raises
     ------
@@ -48,6 +55,7 @@ def scene_geometry(
     maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
     homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
     starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
+    slopes, relief = surface or (np.zeros(0), Relief(np.zeros((0, 0, 0), np.int16), 0.0, 0.0))
     return SceneGeometry(
         np.ascontiguousarray(homographies, dtype).reshape(-1),
         np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp),
@@ -56,9 +64,10 @@ def scene_geometry(
         maps.reshape(-1),
         valid.reshape(-1).view(np.uint8),
         transmission.reshape(-1),
-        np.zeros(0, dtype),
-        np.zeros(0, np.int16),
-        dtype.type(0),
+        np.ascontiguousarray(slopes, dtype).reshape(-1),
+        relief.codes.reshape(-1),
+        dtype.type(relief.step),
+        () if surface is None else (True,),
         np.tile(np.array([0, padded], np.intp), (views, rows, 1)),
     )
 

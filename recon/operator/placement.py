@@ -128,7 +128,7 @@ def _locate(
     d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
     g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
     p, q, r, s, t, u = zero, zero, zero, zero, zero, zero
-    if bent:
+    if len(bent) > 0:
         p, q, r = slopes[slope], slopes[slope + index(1)], slopes[slope + index(2)]
         s, t, u = slopes[slope + index(3)], slopes[slope + index(4)], slopes[slope + index(5)]
     for k in range(index(BLOCK_PX)):
@@ -137,7 +137,7 @@ def _locate(
         scale = g * x + h * y + i
         inverse = one / scale
         column, row = (a * x + b * y + c) * inverse, (d * x + e * y + f) * inverse
-        if bent:
+        if len(bent) > 0:
             nearer = scratch[index(NEARER) + k] * inverse
             column += (p * x + q * y + r) * nearer
             row += (s * x + t * y + u) * nearer
@@ -161,7 +161,7 @@ def _locate(
 
 @compiled
 def unpack_relief(relief, at, count, step, scratch):
-    """Set `NEARER` of a block's pixels from the codes of a relief; NaN, which sees nothing, where the code is lowest."""
+    """Set `NEARER` of a block's pixels from the codes of a relief; NaN, which sees nothing, where it is `UNSEEN`."""
     number = type(scratch[0])
     for k in range(index(BLOCK_PX)):
         scratch[index(NEARER) + k] = number(np.nan)

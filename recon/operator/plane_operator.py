@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.operator.geometry import Surface
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.relief import Relief
 from faintfield.recon.operator.scene_operator import SceneOperator
 
 
@@ -16,7 +16,7 @@ class PlaneOperator(SceneOperator):
     plane_from_ray : array (view, 3, 3)
         Homography from a ray (x, y, 1) to plane coordinates (x, y, 1) in mm; the homogeneous scale is positive for
         points in front of the camera.
-    rays, flat, valid, lattice_of_view, dtype, workers
+    rays, flat, valid, lattice_of_view, dtype, workers, surface
         As for `recon.operator.scene_operator.SceneOperator`.
     grid : PlaneGrid
         The samples of the plane.
@@ -38,7 +38,7 @@ class PlaneOperator(SceneOperator):
         lattice_of_view: NDArray[np.intp] | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
-        surface: tuple[NDArray[np.floating], Relief] | None = None,
+        surface: Surface | None = None,
     ) -> None:
         super().__init__(
             plane_from_ray[np.newaxis],

@@ -17,7 +17,17 @@ from faintfield.recon.threads import run_in_threads
 # surface. Beyond it, a difference that is this many times those beside it is a step, with nothing between the two.
 _MAX_STEP, _MAX_BEND = 1.0, 2.5
 
+# The surface is continued by so many samples on each side: pixels on its outermost samples must not miss a neighbour.
+_BORDER = 2
+
+# Codes run from minus this to this.
 _HIGHEST = 2**15 - 1
+
+# Cells may be drawn this much too large (in cells), so that rounding leaves no cracks between them.
+_OVERLAP = np.float32(1e-3)
+
+# Samples must be this far in front of a view, relative to their depth in the reference view.
+_NEAREST = 1e-6
 
 
 class Relief(NamedTuple):
@@ -30,7 +40,14 @@ class Relief(NamedTuple):
     step : float
         Unit of the codes, in 1/depth.
     origin : float
-        1/depth of code zero.
+        1/depth of code zero, midway between the nearest sample and the farthest.
+
+    Notes
+    -----
+    Rounding to codes moves the place that a pixel sees by at most 1/131 064 of the parallax between the nearest sample
+    and the farthest: less than 0.01 px up to a parallax of 1310 px. A view 150 mm from the reference has that much, if
+    the focal length is 7500 px (6000 px over 44°), between 300 mm and 455 mm or from 870 mm to infinity; from 300 mm to
+    infinity the place moves by up to 0.03 px.
     """
 
     codes: NDArray[np.int16]
@@ -48,129 +65,166 @@ def draw_relief(
 ) -> Relief:
     """Draw a surface into every view.
 
-    Cells of four samples are drawn as two triangles into a depth buffer of the pitch of the samples; cells across a
-    step are left out. Each pixel then reads the buffer where its ray
-    passes.
+    Cells of four samples are drawn as two triangles into a depth buffer, which has the pitch of the samples and keeps
+    the nearest. Cells across a step are left out. Each pixel then interpolates 1/depth between the four numbers around
+    its ray. It sees nothing where one of these is missing, or where they belong to two surfaces.
 
     Parameters
     ----------
     inverse_depth : array (row, column)
-        1/depth of each sample; NaN where there is no surface.
+        1/depth of each sample, in 1/mm; NaN where there is no surface.
     grid : PlaneGrid
         The samples at unit depth.
     ray_from_surface : array (view, 3, 4)
         From (x, y, 1, 1/depth) of a sample to the ray of a view, homogeneous.
     rays : array (lattice, row, column, 2)
-        Where detector pixels look.
+        Where detector pixels look: x, y at unit depth.
     lattice_of_view : sequence of int
         The lattice of each view.
+    workers : int, optional
+        Number of threads; as many as the process may use by default. The result does not depend on it.
     """
-    known = inverse_depth[np.isfinite(inverse_depth)]
+    known = inverse_depth[np.isfinite(inverse_depth)].astype(np.float64)
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    origin, step = 0.5 * (low + high), (high - low) / (2 * (_HIGHEST - 1))
-    lattices, rows, columns = rays.shape[:3]
-    codes = np.empty((len(ray_from_surface), rows, columns), np.int16)
-    surface = np.ascontiguousarray(inverse_depth, np.float32)
-    left, top = rays.reshape(-1, 2).min(axis=0)
-    right, bottom = rays.reshape(-1, 2).max(axis=0)
-    pitch = grid.pitch_mm
-    shape = (int((bottom - top) / pitch) + 3, int((right - left) / pitch) + 3)
-    corner = np.array([left - pitch, top - pitch])
-    maps = [np.ascontiguousarray(part, np.float32) for part in rays]
-    # Same view, same buffer: views of a mosaic appear once per lattice
-    distinct, number = np.unique(ray_from_surface.reshape(len(codes), -1), axis=0, return_inverse=True)
+    relief = Relief(
+        np.empty((len(ray_from_surface), *rays.shape[1:3]), np.int16),
+        (high - low) / (2 * (_HIGHEST - 1)),
+        0.5 * (low + high),
+    )
     farthest = float(np.abs(ray_from_surface[:, :2, 3]).max())
-    tear = _MAX_STEP * pitch / farthest if farthest > 0 else np.inf
-    whole = _whole_cells(surface, tear)
+    tear = _MAX_STEP * grid.pitch_mm / farthest if farthest > 0 else np.inf
+    whole = np.pad(_whole_cells(inverse_depth, tear), _BORDER, mode="edge")
+    heights = _continued(inverse_depth - relief.origin).astype(np.float32)
+    (left, top), (right, bottom) = (of(rays.reshape(-1, 2), axis=0) - grid.pitch_mm for of in (np.min, np.max))
+    shape = (int((bottom - top) / grid.pitch_mm) + 3, int((right - left) / grid.pitch_mm) + 3)
+    buffer_grid = PlaneGrid(shape, grid.pitch_mm, (float(left), float(top)))
+    maps = [np.ascontiguousarray(lattice, np.float32) for lattice in rays]
+    # Views of a mosaic appear once per lattice, but are drawn once
+    distinct, drawing = np.unique(ray_from_surface.reshape(-1, 12), axis=0, return_inverse=True)
+    workers = min(workers or int(numba.config.NUMBA_NUM_THREADS), len(distinct))
 
-    def work(view: int) -> None:
-        buffer = np.zeros(shape, np.float32)
-        matrix = distinct[view].reshape(3, 4)
-        _draw(surface, whole, *grid.origin_mm, pitch, matrix, buffer, corner[0], corner[1])
-        for index in np.flatnonzero(number == view):
-            _read(buffer, maps[lattice_of_view[index]], corner[0], corner[1], pitch, tear, origin, step, codes[index])
+    def work(worker: int) -> None:
+        buffer = np.empty(shape, np.float32)
+        for number in range(worker, len(distinct), workers):
+            buffer.fill(-np.inf)
+            matrix = _buffer_from_sample(distinct[number].reshape(3, 4), grid, buffer_grid, relief.origin)
+            _draw(heights, whole, matrix, buffer)
+            for view in np.flatnonzero(drawing == number).tolist():
+                of_lattice = maps[lattice_of_view[view]]
+                _read(buffer, of_lattice, left, top, 1 / grid.pitch_mm, 2 * tear, relief.step, relief.codes[view])
 
-    run_in_threads(work, range(len(distinct)))
-    return Relief(codes, step, origin)
+    run_in_threads(work, range(workers))
+    return relief
 
 
-def _whole_cells(surface: NDArray[np.float32], tear: float) -> NDArray[np.bool_]:
+def _whole_cells(inverse_depth: NDArray[np.floating], tear: float) -> NDArray[np.bool_]:
     """Return which cells (row, column) of four samples no step crosses."""
 
     def crossed(axis: int) -> NDArray[np.bool_]:
-        differences = np.abs(np.diff(surface, axis=axis))
+        differences = np.abs(np.diff(inverse_depth, axis=axis))
         ends = [(1, 1) if index == axis else (0, 0) for index in range(2)]
         beside = np.pad(differences, ends, constant_values=np.inf)
         length = differences.shape[axis]
         before, after = (np.take(beside, np.arange(length) + shift, axis) for shift in (0, 2))
-        return ~((differences <= tear) | (differences <= _MAX_BEND * np.minimum(before, after)))
+        return np.asarray(~((differences <= tear) | (differences <= _MAX_BEND * np.minimum(before, after))))
 
     across, down = crossed(1), crossed(0)
-    return ~(across[:-1] | across[1:] | down[:, :-1] | down[:, 1:])
+    return np.asarray(~(across[:-1] | across[1:] | down[:, :-1] | down[:, 1:]))
+
+
+def _continued(heights: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return heights continued linearly by `_BORDER` samples on every side."""
+    for _ in range(_BORDER):
+        heights = np.pad(heights, 1, mode="reflect", reflect_type="odd")
+    return heights
+
+
+def _buffer_from_sample(
+    ray_from_surface: NDArray[np.float64], grid: PlaneGrid, buffer_grid: PlaneGrid, origin: float
+) -> NDArray[np.float64]:
+    """Return the matrix (3, 4) from (column, row, 1, height) of a continued sample to the buffer's (column, row, 1)."""
+    first = np.array([[1, 0, -_BORDER], [0, 1, -_BORDER], [0, 0, 1]])
+    at_origin = ray_from_surface[:, :3] + origin * np.outer(ray_from_surface[:, 3], [0, 0, 1])
+    matrix = np.column_stack([at_origin @ np.linalg.inv(grid.index_from_plane()) @ first, ray_from_surface[:, 3]])
+    return np.asarray(buffer_grid.index_from_plane() @ matrix)
 
 
 @compiled
-def _draw(surface, whole, x0, y0, pitch, matrix, buffer, left, top):
-    """Draw all cells of a surface into the depth buffer of a view, which holds the largest 1/depth so far."""
-    rows, columns = surface.shape
-    above = np.empty((columns, 2))
-    below = np.empty((columns, 2))
+def _draw(heights, whole, matrix, buffer):
+    """Draw all cells of a surface into the depth buffer of a view, which holds the largest height so far."""
+    rows, columns = heights.shape
+    above, below = np.empty((2, columns), np.float32), np.empty((2, columns), np.float32)
     for i in range(rows):
         above, below = below, above
-        for j in range(columns):
-            q = surface[i, j]
-            x, y = x0 + pitch * j, y0 + pitch * i
-            z = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] + matrix[2, 3] * q
-            below[j, 0] = ((matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] + matrix[0, 3] * q) / z - left) / pitch
-            below[j, 1] = ((matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] + matrix[1, 3] * q) / z - top) / pitch
-            if not z > 0:
-                below[j, 0] = np.nan
+        _project(heights[i], i, matrix, below[0], below[1])
         if i == 0:
             continue
         for j in range(columns - 1):
-            if not whole[i - 1, j]:
-                continue
-            a, b, c, d = surface[i - 1, j], surface[i - 1, j + 1], surface[i, j], surface[i, j + 1]
-            _fill(buffer, above[j], above[j + 1], below[j], a, b, c)
-            _fill(buffer, below[j + 1], below[j], above[j + 1], d, c, b)
+            if whole[i - 1, j]:
+                a, b, c, d = heights[i - 1, j], heights[i - 1, j + 1], heights[i, j], heights[i, j + 1]
+                _fill(
+                    buffer, above[0, j], above[1, j], above[0, j + 1], above[1, j + 1],
+                    below[0, j], below[1, j], below[0, j + 1], below[1, j + 1], a, b, c, d,
+                )  # fmt: skip
 
 
 @compiled
-def _fill(buffer, one, two, three, q1, q2, q3):
-    """Draw a triangle."""
-    x1, y1, x2, y2, x3, y3 = one[0], one[1], two[0], two[1], three[0], three[1]
-    area = (x2 - x1) * (y3 - y1) - (x3 - x1) * (y2 - y1)
-    if not area > 0:  # seen from behind, or of no size
+def _project(heights, row, matrix, x, y):
+    """Set x and y to where the samples of a row lie in the buffer; NaN for those that are not in front of the view."""
+    x0, x1, x3 = matrix[0, 1] * row + matrix[0, 2], matrix[0, 0], matrix[0, 3]
+    y0, y1, y3 = matrix[1, 1] * row + matrix[1, 2], matrix[1, 0], matrix[1, 3]
+    z0, z1, z3 = matrix[2, 1] * row + matrix[2, 2], matrix[2, 0], matrix[2, 3]
+    for j in range(heights.size):
+        z = z0 + z1 * j + z3 * heights[j]
+        inverse = 1 / z if z > _NEAREST else np.nan
+        x[j], y[j] = (x0 + x1 * j + x3 * heights[j]) * inverse, (y0 + y1 * j + y3 * heights[j]) * inverse
+
+
+@compiled
+def _fill(buffer, xa, ya, xb, yb, xc, yc, xd, yd, a, b, c, d):
+    """Draw a cell with the corners a b above c d: the triangle a b c, and d c b."""
+    one, zero = np.float32(1), np.float32(0)
+    upper = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
+    lower = (xc - xd) * (yb - yd) - (xb - xd) * (yc - yd)
+    if not (upper > zero or lower > zero) or np.isnan(upper + lower):  # seen from behind, or from a view within it
         return
     rows, columns = buffer.shape
-    first_row, last_row = max(0, int(np.ceil(min(y1, min(y2, y3)) - 1e-4))), min(rows - 1, int(np.floor(max(y1, max(y2, y3)) + 1e-4)))
-    first, last = max(0, int(np.ceil(min(x1, min(x2, x3)) - 1e-4))), min(columns - 1, int(np.floor(max(x1, max(x2, x3)) + 1e-4)))
+    first = max(0, int(np.ceil(min(min(xa, xb), min(xc, xd)) - _OVERLAP)))
+    last = min(columns - 1, int(np.floor(max(max(xa, xb), max(xc, xd)) + _OVERLAP)))
+    first_row = max(0, int(np.ceil(min(min(ya, yb), min(yc, yd)) - _OVERLAP)))
+    last_row = min(rows - 1, int(np.floor(max(max(ya, yb), max(yc, yd)) + _OVERLAP)))
+    per_upper, per_lower = one / upper, one / lower
     for row in range(first_row, last_row + 1):
         for column in range(first, last + 1):
-            s = ((column - x1) * (y3 - y1) - (x3 - x1) * (row - y1)) / area
-            t = ((x2 - x1) * (row - y1) - (column - x1) * (y2 - y1)) / area
-            if s >= -1e-3 and t >= -1e-3 and s + t <= 1 + 1e-3:
-                q = np.float32(q1 + s * (q2 - q1) + t * (q3 - q1))
-                if q > buffer[row, column]:
-                    buffer[row, column] = q
+            x, y, q = np.float32(column), np.float32(row), buffer[row, column]
+            s = ((x - xa) * (yc - ya) - (xc - xa) * (y - ya)) * per_upper
+            t = ((xb - xa) * (y - ya) - (x - xa) * (yb - ya)) * per_upper
+            if upper > zero and s >= -_OVERLAP and t >= -_OVERLAP and s + t <= one + _OVERLAP:
+                q = max(q, a + s * (b - a) + t * (c - a))
+            s = ((x - xd) * (yb - yd) - (xb - xd) * (y - yd)) * per_lower
+            t = ((xc - xd) * (y - yd) - (x - xd) * (yc - yd)) * per_lower
+            if lower > zero and s >= -_OVERLAP and t >= -_OVERLAP and s + t <= one + _OVERLAP:
+                q = max(q, d + s * (c - d) + t * (b - d))
+            buffer[row, column] = q
 
 
 @compiled
-def _read(buffer, rays, left, top, pitch, tear, origin, step, codes):
+def _read(buffer, rays, left, top, per_mm, tear, step, codes):
     """Write the codes of a view's pixels; a pixel between two surfaces, or beside one, sees neither."""
     rows, columns = codes.shape
+    last_row, last_column = buffer.shape[0] - 2, buffer.shape[1] - 2
+    per_step = 1 / step if step > 0 else 0.0
     for i in range(rows):
         for j in range(columns):
-            x, y = (rays[i, j, 0] - left) / pitch, (rays[i, j, 1] - top) / pitch
-            column, row = int(x), int(y)
+            x, y = (rays[i, j, 0] - left) * per_mm, (rays[i, j, 1] - top) * per_mm
+            column, row = min(max(int(x), 0), last_column), min(max(int(y), 0), last_row)
+            a, b = buffer[row, column], buffer[row, column + 1]
+            c, d = buffer[row + 1, column], buffer[row + 1, column + 1]
+            nearest, farthest = max(max(a, b), max(c, d)), min(min(a, b), min(c, d))
             code = UNSEEN
-            if 0 <= column < buffer.shape[1] - 1 and 0 <= row < buffer.shape[0] - 1:
-                a, b = buffer[row, column], buffer[row, column + 1]
-                c, d = buffer[row + 1, column], buffer[row + 1, column + 1]
-                nearest, farthest = max(max(a, b), max(c, d)), min(min(a, b), min(c, d))
-                if farthest > 0 and nearest - farthest <= tear:
-                    right, down = x - column, y - row
-                    upper, lower = a + right * (b - a), c + right * (d - c)
-                    q = upper + down * (lower - upper)
-                    code = int(np.rint((q - origin) / step)) if step > 0 else 0
+            if farthest > -np.inf and nearest - farthest <= tear:
+                right, down = x - column, y - row
+                upper, lower = a + right * (b - a), c + right * (d - c)
+                code = int(np.rint((upper + down * (lower - upper)) * per_step))
+                code = min(max(code, -_HIGHEST), _HIGHEST)
             codes[i, j] = code

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
-from faintfield.recon.operator.geometry import scene_geometry
+from faintfield.recon.operator.geometry import Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.relief import Relief
 from faintfield.recon.operator.placement import make_workspace
 from faintfield.recon.threads import run_in_threads
 
@@ -52,6 +51,8 @@ class SceneOperator:
         Type of samples and images: float32 for work, float64 for tests.
     workers : int, optional
         Number of threads; as many as the process may use by default. The last digits of sums depend on it.
+    surface : (array (view, 3, 3), Relief), optional
+        For `recon.operator.surface_operator.SurfaceOperator`: what bends the only plane to a surface.
 
     Raises
     ------
@@ -76,22 +77,15 @@ class SceneOperator:
         lattice_of_view: NDArray[np.intp] | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
-        surface: tuple[NDArray[np.floating], Relief] | None = None,
+        surface: Surface | None = None,
     ) -> None:
         self.grids = tuple(grids)
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
         self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
         self._geometry = scene_geometry(
-            plane_from_ray, rays, self.grids, flat, valid, transmission, lattice_of_view, self.dtype
+            plane_from_ray, rays, self.grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
         )
-        if surface is not None:
-            slopes, relief = surface
-            self._geometry = self._geometry._replace(
-                slopes=np.ascontiguousarray(slopes, dtype).reshape(-1),
-                relief=relief.codes.reshape(-1),
-                relief_step=self.dtype.type(relief.step),
-            )
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
         self._size = sum(grid.shape[0] * grid.shape[1] for grid in self.grids)

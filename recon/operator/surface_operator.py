@@ -3,29 +3,74 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.placement import UNSEEN
+from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.relief import draw_relief
 
 
 def homographies_of_surface(
     ray_from_surface: NDArray[np.floating],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return homographies (view, 3, 3) from rays to directions (x, y, 1) of the reference, and their change with 1/depth.
+    """Return the homographies from rays to a plane at infinity, and their change with 1/depth.
 
-    A sample in direction a = (x, y, 1) at 1/depth q is seen along the ray `A a + q b` of a view. With s = A⁻¹ r and
-    c = −A⁻¹ b, the ray r meets it at `a ∝ s + q (s₃ c − c₃ s)`, whose third component is s₃.
+    A point in direction a = (x, y, 1) of the reference view at 1/depth q is seen along the ray `r ∝ A a + q b` of a
+    view. With s = A⁻¹ r and the view's centre c = −A⁻¹ b, the ray meets the plane at q where
+
+        a ∝ s + q (s₃ c − c₃ s),
+
+    whose third component is s₃: the direction, and so the place on the samples, is linear in q.
+
+    Parameters
+    ----------
+    ray_from_surface : array (view, 3, 4)
+        [A | b] of each view.
+
+    Returns
+    -------
+    homographies, slopes : array (view, 3, 3)
+        `homographies + q slopes` maps rays (x, y, 1) to directions, homogeneous; the third row of the slopes is zero.
     """
     inverse = np.linalg.inv(ray_from_surface[:, :, :3])
     centre = -np.einsum("vij,vj->vi", inverse, ray_from_surface[:, :, 3])
-    slope = centre[:, :, np.newaxis] * inverse[:, np.newaxis, 2] - centre[:, 2, np.newaxis, np.newaxis] * inverse
-    slope[:, 2] = 0
-    return inverse, slope
+    slopes = centre[:, :, np.newaxis] * inverse[:, np.newaxis, 2] - centre[:, 2, np.newaxis, np.newaxis] * inverse
+    slopes[:, 2] = 0
+    return inverse, slopes
 
 
 class SurfaceOperator(PlaneOperator):
-    """H of a surface given by the depth of each sample of the reference view."""
+    """H of a surface given by the depth of each sample of the reference view.
+
+    As for a plane, H interpolates the picture bilinearly at each pixel, and Hᵀ spreads with the same weights. Where a
+    pixel sees the picture depends on the depth of the surface there, which `recon.operator.relief` draws into each
+    view with a depth buffer. Pixels that see no part of the surface (they look past it, or behind a step) or both sides
+    of a step have weights of zero: they take no part in any likelihood. A surface of one depth d is the plane at d,
+    whose samples are those of `grid` times d.
+
+    Parameters
+    ----------
+    ray_from_surface : array (view, 3, 4)
+        From (x, y, 1, 1/depth), a direction of the reference view with a depth, to the ray of each view, homogeneous;
+        the scale is positive for points in front of the camera.
+    rays, flat, valid, lattice_of_view, dtype, workers
+        As for `recon.operator.scene_operator.SceneOperator`.
+    grid : PlaneGrid
+        The samples at unit depth: the directions of the reference view that they lie in.
+    inverse_depth : array (row, column)
+        1/depth of each sample in 1/mm, zero for points at infinity; NaN where there is no surface.
+
+    Raises
+    ------
+    GeometryMismatch
+        Shapes do not fit together, a number is not finite, a depth is negative, a view does not see the directions of
+        the reference view, or no pixel of any view sees the surface.
+
+    Notes
+    -----
+    The light of a surface is that of its samples in every direction (Lambert), however the surface is inclined; see
+    docs/physics.md, "Through a surface".
+    """
 
     def __init__(
         self,
@@ -41,13 +86,13 @@ class SurfaceOperator(PlaneOperator):
         workers: int | None = None,
     ) -> None:
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
-        lattices = np.zeros(len(ray_from_surface), np.intp) if lattice_of_view is None else lattice_of_view
-        relief = draw_relief(inverse_depth, grid, ray_from_surface, rays, lattices.tolist(), workers)
-        self._relief = relief
-        at_zero, slope = homographies_of_surface(ray_from_surface)
-        in_samples = np.einsum("ij,vjk->vik", grid.index_from_plane(), slope)
+        matrices = ray_from_surface.astype(np.float64)
+        lattices = np.zeros(len(matrices), np.intp) if lattice_of_view is None else np.asarray(lattice_of_view)
+        _check_surface(matrices, rays, grid, inverse_depth, lattices)
+        self._relief = draw_relief(inverse_depth, grid, matrices, rays, lattices.tolist(), workers)
+        at_infinity, slopes = homographies_of_surface(matrices)
         super().__init__(
-            at_zero + relief.origin * slope,
+            at_infinity + self._relief.origin * slopes,
             rays,
             grid,
             flat=flat,
@@ -55,10 +100,39 @@ class SurfaceOperator(PlaneOperator):
             lattice_of_view=lattice_of_view,
             dtype=dtype,
             workers=workers,
-            surface=(in_samples, relief),
+            surface=(grid.index_from_plane() @ slopes, self._relief),
         )
 
     def inverse_depth_of_pixels(self) -> NDArray[np.float32]:
         """Return 1/depth at which each pixel (view, row, column) meets the surface, 0 where it sees no part of it."""
         codes, step, origin = self._relief
         return np.where(codes == UNSEEN, np.float32(0), codes * np.float32(step) + np.float32(origin))
+
+
+def _check_surface(
+    ray_from_surface: NDArray[np.float64],
+    rays: NDArray[np.floating],
+    grid: PlaneGrid,
+    inverse_depth: NDArray[np.floating],
+    lattice_of_view: NDArray[np.intp],
+) -> None:
+    """Refuse what cannot be drawn; the rest is checked with the geometry."""
+    if ray_from_surface.ndim != 3 or ray_from_surface.shape[1:] != (3, 4) or rays.ndim != 4 or rays.shape[3] != 2:
+        raise GeometryMismatch(
+            f"matrices {ray_from_surface.shape} and rays {rays.shape} do not fit; give (view, 3, 4), (row, column, 2)"
+        )
+    if lattice_of_view.shape != (len(ray_from_surface),) or not set(lattice_of_view.tolist()) <= set(range(len(rays))):
+        raise GeometryMismatch(
+            f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {len(ray_from_surface)} views one of "
+            f"{len(rays)} lattices, counted from 0"
+        )
+    if inverse_depth.shape != grid.shape:
+        raise GeometryMismatch(
+            f"inverse_depth has shape {inverse_depth.shape}, the samples {grid.shape}; give it that shape"
+        )
+    if np.isinf(inverse_depth).any() or (inverse_depth < 0).any():
+        raise GeometryMismatch("a depth of the surface is zero or negative; give 1/depth ≥ 0, or NaN for no surface")
+    if not (np.isfinite(ray_from_surface).all() and np.isfinite(rays).all()):
+        raise GeometryMismatch("a pose or ray is not a finite number; check the calibration they came from")
+    if (np.linalg.det(ray_from_surface[:, :, :3]) <= 0).any():
+        raise GeometryMismatch("a view sees a mirror image of the directions of the reference; check its pose")

@@ -1,0 +1,154 @@
+"""H of a surface with steps, against rays cast one by one; pixels that see nothing; the rounding of depths."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from faintfield.calib.homography import ray_from_surface
+from faintfield.recon.likelihood.images import ElementalImages, LikelihoodName, PixelLikelihood
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.surface_operator import SurfaceOperator
+from faintfield.recon.solver.data_fit import DataFit
+from tests.recon import step_scene
+from tests.recon.step_scene import FAR, NEAR, NEITHER, SHAPE
+
+PITCH = 1 / step_scene.FOCAL_PX
+GRID = PlaneGrid(SHAPE, PITCH, (-step_scene.AXIS[0] * PITCH, -step_scene.AXIS[1] * PITCH))
+
+
+@cache
+def poses() -> NDArray[np.float64]:
+    """A grid of 5 x 3 views, not symmetric, all but three of them turned and off their plane."""
+    x_mm, y_mm = np.meshgrid([-60.0, -20.0, 0.0, 30.0, 60.0], [-40.0, 0.0, 50.0])
+    generator, found = np.random.default_rng(2), np.zeros((15, 6))
+    found[:, 3], found[:, 4] = -x_mm.ravel(), -y_mm.ravel()
+    found[3:, :3], found[3:, 5] = generator.uniform(-0.03, 0.03, (12, 3)), generator.uniform(-9, 9, 12)
+    return found
+
+
+def operator_of_step(inverse_depth: NDArray[np.float64] | None = None, **options: Any) -> SurfaceOperator:
+    inverse_depth = step_scene.picture()[1] if inverse_depth is None else inverse_depth
+    return SurfaceOperator(
+        ray_from_surface(poses()), step_scene.rays(), GRID, inverse_depth, **{"dtype": np.float64, **options}
+    )
+
+
+@cache
+def cast_views() -> tuple[NDArray[np.int_], NDArray[np.float64], NDArray[np.bool_]]:
+    """What each pixel (view, row, column) sees, its light, and which pixels are two pixels away from all edges."""
+    sights = [step_scene.cast(rt) for rt in poses()]
+    what = np.stack([sight.what for sight in sights])
+    away = [(x, y) for x in (-2.0, -1.0, 0.0, 1.0, 2.0) for y in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    beside = [np.stack([step_scene.cast(rt, shift).what for rt in poses()]) == what for shift in away]
+    return what, np.stack([sight.light for sight in sights]), np.all(beside, axis=0)
+
+
+@pytest.mark.parametrize(("dtype", "atol"), [(np.float64, 1e-9), (np.float32, 1e-4)])
+def test_away_from_edges_each_pixel_sees_the_nearest_surface_and_nothing_where_the_reference_sees_none(
+    dtype: type[np.float32] | type[np.float64], atol: float
+) -> None:
+    what, light, clear = cast_views()
+    assert min((clear & (what == kind)).sum() for kind in (NEAR, FAR, NEITHER)) > 5000
+    seen = operator_of_step(dtype=dtype).forward(step_scene.picture()[0].astype(dtype))
+    np.testing.assert_allclose(seen[clear], light[clear], atol=atol)
+
+
+def test_the_depth_that_pixels_meet_is_that_of_the_cast_rays() -> None:
+    what, _, clear = cast_views()
+    expected = np.choose(what, [0, 1 / step_scene.NEAR_MM, 1 / step_scene.FAR_MM])
+    np.testing.assert_allclose(operator_of_step().inverse_depth_of_pixels()[clear], expected[clear], atol=1e-7)
+
+
+def test_few_pixels_are_lost_at_edges_and_fewer_see_the_wrong_side() -> None:
+    what, light, _ = cast_views()
+    operator = operator_of_step()
+    seen, sees = operator.forward(step_scene.picture()[0]), operator.forward(np.ones(SHAPE)) > 0
+    left, right, top, bottom = step_scene.EDGES_PX
+    # Views see the edge of the square as long as the reference view does
+    edge_px = 2 * len(what) * ((right - left) + (bottom - top))
+    there = what != NEITHER
+    lost, invented = there & ~sees, ~there & sees
+    wrong = there & sees & (np.abs(seen - light) > 0.1)
+    assert 0 < lost.sum() <= 1.75 * edge_px
+    assert wrong.sum() + invented.sum() <= 0.12 * edge_px
+
+
+def test_a_surface_is_torn_where_it_steps_and_whole_where_it_is_steep() -> None:
+    """Parallax of 1.5 samples per sample, seen from the side from which it looks wide, and a step of 1.5 samples."""
+    column = np.arange(60.0)
+    centre = -1.0  # mm, along x
+    for inverse, whole in ((1.5 * column, True), (np.where(column < 30, 0.0, 1.5), False)):
+        matrices = np.array([np.eye(3, 4)])
+        matrices[0, 0, 3] = -centre
+        rays = np.stack(np.meshgrid(np.arange(1.0, 58.0, 0.5), [1.0, 2.0]), axis=-1)
+        surface = SurfaceOperator(
+            matrices, rays, PlaneGrid((4, 60), 1.0, (0.0, 0.0)), np.tile(inverse, (4, 1)), dtype=np.float64
+        )
+        seen = surface.forward(np.tile(column, (4, 1)))[0, 0]
+        if whole:
+            np.testing.assert_allclose(seen, rays[0, :, 0] / 2.5, atol=1e-3)
+        else:
+            between = (rays[0, :, 0] > 29) & (rays[0, :, 0] < 31.5)
+            np.testing.assert_array_equal(seen[between], 0)
+            assert (seen > 0).sum() >= (~between).sum() - 4
+
+
+@pytest.mark.parametrize("name", ["shifted-poisson", "poisson-gaussian", "least-squares"])
+def test_pixels_that_see_no_part_of_a_surface_take_no_part_in_its_likelihood(name: LikelihoodName) -> None:
+    operator, truth = operator_of_step(), step_scene.picture()[0]
+    sees = operator.forward(np.ones(SHAPE)) > 0
+    assert 5000 < (~sees).sum() < sees.size / 3
+    likelihood = PixelLikelihood(name, level_e=5.0) if name == "least-squares" else PixelLikelihood(name)
+    generator = np.random.default_rng(3)
+    electrons = generator.normal(5.0, 3.0, operator.images_shape)
+    results = []
+    for other in (0.0, -50.0, 1000.0):
+        images = ElementalImages(np.where(sees, electrons, other), 0.5, 2.0, likelihood=likelihood)
+        fit = DataFit(operator, images, 5.0)
+        value, gradient = fit.value_and_gradient(truth)
+        held_out = operator.negative_log_likelihood(truth, images, [0, 4, 11])
+        results.append(np.concatenate([[value, held_out], gradient.ravel(), fit.metric(truth).ravel()]))
+    np.testing.assert_array_equal(results[1], results[0])
+    np.testing.assert_array_equal(results[2], results[0])
+    assert np.isfinite(results[0]).all()
+
+
+def test_samples_that_explain_all_that_they_can_are_pulled_by_no_pixel() -> None:
+    operator, truth = operator_of_step(), step_scene.picture()[0]
+    seen = operator.forward(truth)
+    images = ElementalImages(np.where(seen > 0, seen, 70.0), 0.0, 2.0)
+    _, gradient = DataFit(operator, images, 5.0).value_and_gradient(truth)
+    np.testing.assert_allclose(gradient, 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("nearest_mm", "farthest_mm", "error_px"), [(300.0, 455.0, 0.01), (870.0, np.inf, 0.01), (300.0, np.inf, 0.03)]
+)
+def test_the_rounding_of_depths_moves_what_a_pixel_sees_by_less_than_a_share_of_its_parallax(
+    nearest_mm: float, farthest_mm: float, error_px: float
+) -> None:
+    """A corner view of 7 x 7 at a pitch of 50 mm, 6000 px at a focal length of 7500 px, and a slanted plane."""
+    centre_mm, pitch = 150.0, 20 / 7500
+    near, far = 1 / nearest_mm, 1 / farthest_mm
+    grid = PlaneGrid((4, 301), pitch, (-0.4, -0.01))
+    x = grid.origin_mm[0] + pitch * np.arange(301)
+    slope = (near - far) / (x[-1] - x[0])
+    inverse = np.tile(far + slope * (x - x[0]), (4, 1))
+    matrices = np.eye(3, 4)[np.newaxis].copy()
+    matrices[0, 0, 3] = -centre_mm
+    # Rays through points spread over the plane
+    at = np.random.default_rng(6).uniform(x[3], x[-4], 20_000)
+    depth = far + slope * (at - x[0])
+    rays = np.stack([at - centre_mm * depth, np.full_like(at, -0.005)], axis=-1)[np.newaxis]
+    surface = SurfaceOperator(matrices, rays, grid, inverse, dtype=np.float64)
+    found = surface.forward(np.tile(x, (4, 1)))[0, 0]
+    inside = found != 0
+    worst_px = 7500 * np.abs(found[inside] - at[inside]).max()
+    assert inside.mean() > 0.99
+    assert worst_px < error_px
+    assert worst_px > 0.5 * error_px
+    # Of the parallax: half a code, and what float32 adds
+    assert 7500 * np.abs(surface.inverse_depth_of_pixels()[0, 0] - depth).max() * centre_mm < 1.05 * error_px
