@@ -5,9 +5,31 @@ The patches of a group are kept as an array (row, column, member) of the patch, 
 over whole rows of the patch, so they are vectorised whatever the size of the patches.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.recon.numba_tools import advanced, compiled, index, pointer
+
+
+class Transform(NamedTuple):
+    """The transform of a patch, and what depends on it.
+
+    Attributes
+    ----------
+    cosines, transposed : float32 array (k, i), array (i, k)
+        Orthonormal cosines.
+    variances : float32 array (k, l)
+        Variance of each coefficient of a patch of noise of variance one.
+    window : float32 array (row, column)
+        Weights of the samples of a patch.
+    """
+
+    cosines: NDArray[np.float32]
+    transposed: NDArray[np.float32]
+    variances: NDArray[np.float32]
+    window: NDArray[np.float32]
 
 
 @compiled
@@ -22,14 +44,13 @@ def filter_rows(picture, pilot, variance, rows, columns, search, transform, abov
         First row and column of the reference patches.
     search : (int, int)
         How far from its reference a member may lie, along rows and columns, and the largest number of members.
-    transform : (array (k, i), array (k, l), array (row, column))
-        Orthonormal cosines, the variance of each coefficient of a patch of noise of variance one, and the weights of
-        the samples of a patch.
+    transform : Transform
+        The transform of patches, and their size.
     above, below : float32 array (row, column)
         Sums to which the filtered patches times their weights, and the weights, are added.
     """
     radius, members = search
-    size = transform[0].shape[0]
+    size = transform.window.shape[0]
     distances = np.empty((columns.size, members), np.float32)
     places = np.empty((columns.size, members, 2), np.int32)
     found = np.empty(columns.size, np.intp)
@@ -108,8 +129,7 @@ def _insert(distance, row, column, distances, places, found, k):
 @compiled
 def _filter_group(picture, pilot, variance, places, transform, patches, above, below):
     """Filter the patches of a group with the gain `U²/(U² + v c)` of each coefficient, and add them to the sums."""
-    cosines, shares, window = transform
-    size, count = cosines.shape[0], places.shape[0]
+    size, count = transform.window.shape[0], places.shape[0]
     y, u, scratch = patches[0], patches[1], patches[2]
     half = size // 2
     level = np.float32(0)
@@ -119,11 +139,11 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
     _read(picture, places, size, y)
     _read(pilot, places, size, u)
     for group in (y, u):
-        _cosine_transform(group, scratch, cosines, count)
+        _cosine_transform(group, scratch, transform.cosines, count)
         _haar(group, size * size, count)
     left = np.float32(0)
     for k in range(index(size * size)):
-        noise = level * shares[k // index(size), k % index(size)]
+        noise = level * transform.variances[k // index(size), k % index(size)]
         first = k * index(count)
         kept = np.float32(0)
         for m in range(index(count)):
@@ -133,9 +153,9 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
             kept += gain * gain
         left += kept * noise
     _inverse_haar(y, size * size, count)
-    _cosine_transform(y, scratch, cosines.T.copy(), count)
+    _cosine_transform(y, scratch, transform.transposed, count)
     weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(1e-3) * level)
-    _add(y, places, size, window, weight, above, below)
+    _add(y, places, size, transform.window, weight, above, below)
 
 
 @compiled
