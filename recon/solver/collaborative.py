@@ -1,4 +1,4 @@
-"""Detail that total variation lost, from the back-projection: a collaborative Wiener filter with the picture as pilot."""
+"""Detail that a penalty removed, found in the back-projection by a collaborative Wiener filter."""
 
 from itertools import product
 from typing import NamedTuple
@@ -13,9 +13,6 @@ from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.collaborative_kernels import Transform, filter_rows
 from faintfield.recon.solver.initialization import back_projection, well_seen_samples
 from faintfield.recon.threads import run_in_threads
-
-# Fraction of the filter's change w − u that is added to the picture.
-_SHARE = 0.8
 
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
 _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
@@ -40,20 +37,30 @@ class Noise(NamedTuple):
 
 
 class Patches(NamedTuple):
-    """Patches of `size` x `size` samples, every `step` samples, and how far from each others like it are sought."""
+    """How groups of alike patches are formed.
 
-    size: int
-    step: int
-    radius: int
+    Attributes
+    ----------
+    size : int
+        Samples of a patch along each side, a multiple of four.
+    step : int
+        Samples from one reference patch to the next.
+    radius : int
+        How far from its reference a patch may lie, along rows and columns.
+    members : int
+        Largest number of patches in a group.
+    """
+
+    size: int = 12
+    step: int = 6
+    radius: int = 18
+    members: int = 64
 
 
-_PATCHES = (Patches(8, 4, 16), Patches(12, 5, 18))
+def refined(operator: SceneOperator, images: ElementalImages, plane: Image) -> Image:
+    """Return a picture with the detail that its penalty removed: `( f + w − u )₊`.
 
-
-def refined(operator: SceneOperator, images: ElementalImages, plane: Image, share: float = _SHARE) -> Image:
-    """Return a picture with the detail that its penalty removed: `( f + share · (w − u) )₊`.
-
-    u is the back-projection of H f, as blurred as that of the data, y, and w is y filtered with u as pilot.
+    u is the back-projection of H f, as blurred as that of the data, y; and w is y filtered with u as its pilot.
 
     Parameters
     ----------
@@ -63,16 +70,13 @@ def refined(operator: SceneOperator, images: ElementalImages, plane: Image, shar
         The data.
     plane : float array (row, column)
         f, in electrons.
-    share : float
-        Fraction of the change that is added.
     """
     coverage = operator.coverage()
     u = operator.adjoint_of_forward(plane)
-    u = np.divide(u, coverage, out=np.zeros_like(u), where=coverage > 0)
+    np.divide(u, coverage, out=u, where=coverage > 0)  # where none sees, u is zero anyway
     noise = noise_of_back_projection(operator, images, plane)
-    y = back_projection(operator, images)
-    change = collaborative_wiener(y, u, noise) - u
-    return np.asarray(np.maximum(plane + plane.dtype.type(share) * change, 0), plane.dtype)
+    w = collaborative_wiener(back_projection(operator, images), u, noise)
+    return np.maximum(plane + (w - u).astype(plane.dtype), 0)
 
 
 def noise_of_back_projection(
@@ -136,9 +140,8 @@ def collaborative_wiener(
     picture: Image,
     pilot: Image,
     noise: Noise,
+    patches: Patches | None = None,
     *,
-    patches: tuple[Patches, ...] = _PATCHES,
-    members: int = 32,
     workers: int | None = None,
 ) -> NDArray[np.float32]:
     """Return a picture (row, column) without its noise, filtered in groups of patches that are alike in the pilot.
@@ -155,66 +158,55 @@ def collaborative_wiener(
     noise : Noise
         Covariance of the noise of y. Patches with a sample of infinite variance join no group: samples that are in no
         other patch keep the pilot's value.
-    patches : tuple of Patches
-        The results of several sizes of patches are averaged.
-    members : int
-        Largest number of patches in a group, a power of two.
+    patches : Patches, optional
+        How groups are formed.
     workers : int, optional
         Number of threads; the result does not depend on it.
 
     Raises
     ------
     ValueError
-        Shapes differ, or the picture is smaller than a patch.
+        Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    pilot = np.ascontiguousarray(pilot, np.float32)
-    picture = np.ascontiguousarray(picture, np.float32)
-    largest = max(size for size, _, _ in patches)
-    if not picture.shape == pilot.shape == noise.variance.shape or min(picture.shape) < largest:
-        raise ValueError(
-            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {noise.variance.shape}; give "
-            f"them one shape of at least {largest} samples a side"
-        )
-    total = np.zeros_like(pilot)
-    for kind in patches:
-        total += _filtered(picture, pilot, noise, kind, members, workers or int(numba.config.NUMBA_NUM_THREADS))
-    total /= np.float32(len(patches))
-    return total
-
-
-def _filtered(
-    picture: NDArray[np.float32],
-    pilot: NDArray[np.float32],
-    noise: Noise,
-    patches: Patches,
-    members: int,
-    workers: int,
-) -> NDArray[np.float32]:
-    """Return the picture filtered in patches of one size.
-
-    The groups of a strip of rows reach into the neighbouring strips, but no farther. So the even strips are
-    filtered at the same time, and then the odd ones, and sums do not depend on the number of workers.
-    """
-    above, below = np.zeros_like(pilot), np.zeros_like(pilot)
-    # A distance to NaN is NaN, and less than none
+    patches = patches or Patches()
+    picture, pilot = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot))
+    _check(picture, pilot, noise, patches)
+    # A distance to NaN is below none
     seen = np.where(np.isfinite(noise.variance), pilot, np.float32(np.nan))
+    above, below = np.zeros_like(pilot), np.zeros_like(pilot)
+    transform = _transform(noise.kernel, patches.size)
     rows, columns = (_corners(length, patches) for length in pilot.shape)
-    strip = rows // (2 * patches.radius + patches.size)
-    strips = [rows[strip == k] for k in range(strip[-1] + 1)]
-    transform, search = _transform(noise.kernel, patches.size), (patches.radius, members)
 
-    def work(parts: list[NDArray[np.intp]]) -> None:
-        for part in parts:
-            filter_rows(picture, seen, noise.variance, part, columns, search, transform, above, below)
+    def work(strips: list[NDArray[np.intp]]) -> None:
+        for strip in strips:
+            search = (patches.radius, patches.members)
+            filter_rows(picture, seen, noise.variance, strip, columns, search, transform, above, below)
 
-    for every_other in (strips[::2], strips[1::2]):
-        run_in_threads(work, [every_other[worker::workers] for worker in range(workers)])
+    # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
+    strip_of_row = rows // (2 * patches.radius + patches.size)
+    for turn in (0, 1):
+        strips = [rows[strip_of_row == k] for k in range(turn, strip_of_row[-1] + 1, 2)]
+        count = min(workers or int(numba.config.NUMBA_NUM_THREADS), len(strips))
+        run_in_threads(work, [strips[worker::count] for worker in range(count)])
     np.copyto(above, pilot, where=below == 0)
     return np.divide(above, below, out=above, where=below > 0)
 
 
+def _check(picture: Image, pilot: Image, noise: Noise, patches: Patches) -> None:
+    """Refuse shapes that differ or are too small for a patch, and sizes that are not multiples of four (ValueError)."""
+    if not picture.shape == pilot.shape == noise.variance.shape:
+        raise ValueError(
+            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {noise.variance.shape}; give "
+            "all the same"
+        )
+    if patches.size < 4 or patches.size % 4 or patches.size > min(picture.shape):
+        raise ValueError(
+            f"patches of {patches.size} samples in a picture {picture.shape}; give a multiple of four that fits into it"
+        )
+
+
 def _corners(length: int, patches: Patches) -> NDArray[np.intp]:
-    """Return the first samples of the patches along one axis, with one at the far edge."""
+    """Return the first samples of the reference patches along one axis, the last of which ends at the edge."""
     last = length - patches.size
     return np.unique(np.append(np.arange(0, last, patches.step), last))
 
@@ -231,7 +223,5 @@ def _transform(kernel: NDArray[np.float64], size: int) -> Transform:
         )
         variances += kernel[1 + down, 1 + right] * np.outer(along_rows, along_columns)
     window = np.kaiser(size, _KAISER_BETA)
-    cosines, variances, weights = (
-        np.ascontiguousarray(array, np.float32) for array in (cosines, variances, np.outer(window, window))
-    )
-    return Transform(cosines, np.ascontiguousarray(cosines.T), variances, weights)
+    arrays = cosines, cosines.T, variances, np.outer(window, window)
+    return Transform(*(np.ascontiguousarray(array, np.float32) for array in arrays))

@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 
 from faintfield.recon.numba_tools import advanced, compiled, index, pointer
 
+# Variance in squared electrons below which a picture counts as free of noise.
+_LEAST_VARIANCE = 1e-20
+
+# Share of the noise that the weight of a group assumes to be left at least.
+_LEAST_LEFT = 1e-3
+
 
 class Transform(NamedTuple):
     """The transform of a patch, and what depends on it.
@@ -73,7 +79,7 @@ def _outwards(step):
 
 @compiled
 def _find_alike(pilot, row, columns, size, radius, distances, places, found):
-    """Find the patches nearest to each reference patch of a row, by their squared distance in the pilot, nearest first."""
+    """Find the patches nearest to each reference patch of a row, by squared distance in the pilot, nearest first."""
     height, width = pilot.shape
     squares = np.empty(width, np.float32)
     found[:] = 0
@@ -135,7 +141,7 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
     level = np.float32(0)
     for m in range(count):
         level += variance[places[m, 0] + half, places[m, 1] + half]
-    level /= np.float32(count)
+    level = max(level / np.float32(count), np.float32(_LEAST_VARIANCE))
     _read(picture, places, size, y)
     _read(pilot, places, size, u)
     for group in (y, u):
@@ -154,7 +160,7 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
         left += kept * noise
     _inverse_haar(y, size * size, count)
     _cosine_transform(y, scratch, transform.transposed, count)
-    weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(1e-3) * level)
+    weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(_LEAST_LEFT) * level)
     _add(y, places, size, transform.window, weight, above, below)
 
 
