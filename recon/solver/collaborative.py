@@ -17,6 +17,9 @@ from faintfield.recon.threads import run_in_threads
 # Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
 _WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
 
+# Where the variance is smaller, there is none.
+_TINY = 1e-30
+
 # Shape parameter of the Kaiser window that weights the samples of a patch.
 _KAISER_BETA = 2.0
 
@@ -52,7 +55,7 @@ class Patches(NamedTuple):
     """
 
     size: int = 12
-    step: int = 6
+    step: int = 5
     radius: int = 18
     members: int = 64
 
@@ -105,11 +108,12 @@ def noise_of_back_projection(
     for draw in range(draws):
         light = _back_projected_noise(operator, images, plane, (seed, draw))
         squares += np.square(light)
-        products += _products_of_neighbours(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, 1e-30)))
-    factor = blurred(squares, _WIDE_BLUR) / (draws * np.maximum(blurred(variance, _WIDE_BLUR), 1e-30))
-    per_sample = np.square(np.maximum(blurred(coverage, _NARROW_BLUR), 1e-30))
-    variance = factor * blurred(variance, _NARROW_BLUR) / per_sample
-    return Noise(np.where(seen, variance, np.inf).astype(np.float32), products / products[1, 1])
+        products += _products_of_neighbours(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
+    factor = blurred(squares, _WIDE_BLUR) / (draws * np.maximum(blurred(variance, _WIDE_BLUR), _TINY))
+    factor *= blurred(variance, _NARROW_BLUR)
+    of_mean = np.full(coverage.shape, np.inf, np.float32)
+    np.divide(factor, np.square(blurred(coverage, _NARROW_BLUR)), out=of_mean, where=seen)
+    return Noise(of_mean, products / products[1, 1])
 
 
 def _back_projected_noise(
@@ -184,8 +188,9 @@ def collaborative_wiener(
 
     # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
     strip_of_row = rows // (2 * patches.radius + patches.size)
-    for turn in (0, 1):
-        strips = [rows[strip_of_row == k] for k in range(turn, strip_of_row[-1] + 1, 2)]
+    strips_of_all = [rows[strip_of_row == k] for k in range(strip_of_row[-1] + 1)]
+    for turn in range(min(2, len(strips_of_all))):
+        strips = strips_of_all[turn::2]
         count = min(workers or int(numba.config.NUMBA_NUM_THREADS), len(strips))
         run_in_threads(work, [strips[worker::count] for worker in range(count)])
     np.copyto(above, pilot, where=below == 0)

@@ -37,7 +37,7 @@ def views_displaced_by(
     return PlaneOperator(homographies, rays, PlaneGrid(shape, 1.0, (0.0, 0.0)), workers=1)
 
 
-def inner(plane: NDArray[np.generic]) -> NDArray[np.generic]:
+def inner(plane: NDArray[np.floating]) -> NDArray[np.floating]:
     return plane[4:-4, 4:-4]
 
 
