@@ -91,14 +91,14 @@ def test_noise_follows_the_light_and_the_number_of_views_sample_by_sample() -> N
     images = without_light(operator, 0.5, 4.0)
     found = noise_of_back_projection(operator, images, plane).variance
     draws = []
-    for _ in range(150):
+    for _ in range(80):
         sd = np.sqrt(operator.forward(plane) + 4.5)
         noise = generator.standard_normal(sd.shape, np.float32) * sd + np.float32(0.5)
         draws.append(back_projection(operator, ElementalImages(noise, 0.5)))
     drawn = np.var(draws, axis=0)
     for part in (np.s_[4:40, 4:50], np.s_[56:-4, 4:50], np.s_[4:40, 62:-4], np.s_[56:-4, 62:-4]):
         assert np.median(found[part] / drawn[part]) == pytest.approx(1, rel=0.15)
-        assert np.mean(abs(np.log(found[part] / drawn[part]))) < 0.25  # of single samples, 0.12 is that of the draws
+        assert np.mean(abs(np.log(found[part] / drawn[part]))) < 0.25  # of single samples, 0.13 is that of the draws
     left, right = found[4:40, 4:50].mean(), found[4:40, 62:-4].mean()
     assert left / right == pytest.approx(2, rel=0.25)
     # A column on either side of a border must not take the mean of both
