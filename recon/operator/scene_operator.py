@@ -111,6 +111,18 @@ class SceneOperator:
         images = self._checked("images", images, self.images_shape)
         return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images)[1]
 
+    def adjoint_of_view(self, image: Image, view: int) -> Image:
+        """Return Hᵀ g (samples) of the image (row, column) of one view, as if all others were zero."""
+        image = self._checked("an image", image, self.images_shape[1:])
+        return self._sweep(kernels.ADJOINT, self._views([view]), np.zeros_like(self.all_views), images=image)[1]
+
+    def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
+        """Return Hᵀ H f (samples), view by view, with no array as large as the images."""
+        total = np.zeros(self.samples_shape, self.dtype)
+        for view in self._views(views).tolist():
+            total += self.adjoint_of_view(self.forward(samples, [view])[0], view)
+        return total
+
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
         return self._sweep(kernels.ADJOINT, self._views(views), self.lattice_of_view, images=self._map(value))[1]
@@ -123,9 +135,7 @@ class SceneOperator:
         """Return Hᵀ H 1 (samples), by which a back-projection is divided to keep constant planes constant."""
         if self.row_sums_are_response:
             return self.adjoint_of_map(self.response(), views)
-        seen, chosen = np.zeros(self.images_shape, self.dtype), self._views(views)
-        seen[chosen] = self.forward(np.ones(self.samples_shape, self.dtype), chosen)
-        return self.adjoint(seen, chosen)
+        return self.adjoint_of_forward(np.ones(self.samples_shape, self.dtype), views)
 
     @cached_property
     def seeing_views(self) -> NDArray[np.intp]:

@@ -28,7 +28,7 @@ def check_linear_operator() -> LinearOperatorCheck:
         _check_adjoint(operator, x, y)
         _check_matrix(operator, dense, x, y)
         _check_fused_ratio(operator, dense, generator)
-        _check_views(operator, x, y)
+        _check_views(operator, dense, x, y)
         return dense
 
     return check
@@ -59,6 +59,8 @@ def _check_matrix(operator: PlaneOperator, dense: Image, x: Image, y: Image) -> 
     np.testing.assert_allclose(operator.sensitivity(), dense.sum(axis=0).reshape(shape), atol=_ROUNDING)
     coverage = dense.T @ dense.sum(axis=1)
     np.testing.assert_allclose(operator.coverage(), coverage.reshape(shape), atol=_ROUNDING)
+    both_ways = (dense.T @ (dense @ x.ravel())).reshape(shape)
+    np.testing.assert_allclose(operator.adjoint_of_forward(x), both_ways, atol=_ROUNDING)
 
 
 def _check_fused_ratio(operator: PlaneOperator, dense: Image, generator: np.random.Generator) -> None:
@@ -77,10 +79,15 @@ def _check_fused_ratio(operator: PlaneOperator, dense: Image, generator: np.rand
     assert operator.negative_log_likelihood(plane, images) == pytest.approx(value, rel=1e-12)
 
 
-def _check_views(operator: PlaneOperator, x: Image, y: Image) -> None:
+def _check_views(operator: PlaneOperator, dense: Image, x: Image, y: Image) -> None:
     some, others = operator.all_views[::-2], operator.all_views[-2::-2]
     np.testing.assert_array_equal(operator.forward(x, some), operator.forward(x)[some])
     both = operator.adjoint(y, some) + operator.adjoint(y, others)
     np.testing.assert_allclose(both, operator.adjoint(y), atol=_ROUNDING)
+    of_last = dense[-y[-1].size :].T @ y[-1].ravel()
+    last = int(operator.all_views[-1])
+    np.testing.assert_allclose(operator.adjoint_of_view(y[-1], last), of_last.reshape(x.shape), atol=_ROUNDING)
+    both = operator.adjoint_of_forward(x, some) + operator.adjoint_of_forward(x, others)
+    np.testing.assert_allclose(both, operator.adjoint_of_forward(x), atol=_ROUNDING)
     both = operator.sensitivity(some) + operator.sensitivity(others)
     np.testing.assert_allclose(both, operator.sensitivity(), atol=_ROUNDING)

@@ -1,0 +1,260 @@
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+"""Groups of alike patches, found and filtered together, compiled.
+
+The patches of a group are kept as an array (row, column, member) of the patch, flat. All loops run along the members or
+over whole rows of the patch, so they are vectorised whatever the size of the patches.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.numba_tools import advanced, compiled, index, pointer
+
+# Variance in squared electrons below which a picture counts as free of noise.
+_LEAST_VARIANCE = 1e-20
+
+# Share of the noise that the weight of a group assumes to be left at least.
+_LEAST_LEFT = 1e-3
+
+
+class Transform(NamedTuple):
+    """The transform of a patch, and what depends on it.
+
+    Attributes
+    ----------
+    cosines, transposed : float32 array (k, i), array (i, k)
+        Orthonormal cosines.
+    variances : float32 array (k, l)
+        Variance of each coefficient of a patch of noise of variance one.
+    window : float32 array (row, column)
+        Weights of the samples of a patch.
+    """
+
+    cosines: NDArray[np.float32]
+    transposed: NDArray[np.float32]
+    variances: NDArray[np.float32]
+    window: NDArray[np.float32]
+
+
+@compiled
+def filter_rows(picture, pilot, variance, rows, columns, search, transform, above, below):
+    """Filter the groups of all reference patches whose first samples lie in `rows` x `columns`.
+
+    Parameters
+    ----------
+    picture, pilot, variance : float32 array (row, column)
+        y, u and the variance of y. No patch with a NaN in the pilot belongs to a group.
+    rows, columns : int array
+        First row and column of the reference patches.
+    search : (int, int)
+        How far from its reference a member may lie, along rows and columns, and the largest number of members.
+    transform : Transform
+        The transform of patches, and their size.
+    above, below : float32 array (row, column)
+        Sums to which the filtered patches times their weights, and the weights, are added.
+    """
+    radius, members = search
+    size = transform.window.shape[0]
+    distances = np.empty((columns.size, members), np.float32)
+    places = np.empty((columns.size, members, 2), np.int32)
+    found = np.empty(columns.size, np.intp)
+    patches = np.empty((3, size * size * members), np.float32)
+    for row in rows:
+        _find_alike(pilot, row, columns, size, radius, distances, places, found)
+        for k in range(columns.size):
+            count = 1
+            while 2 * count <= found[k]:
+                count *= 2
+            if found[k] > 0:
+                _filter_group(picture, pilot, variance, places[k, :count], transform, patches, above, below)
+
+
+@compiled
+def _outwards(step):
+    """Return 0, 1, −1, 2, −2 … for 0, 1, 2, 3, 4 …: nearer patches are alike more often, and found first."""
+    return (step + 1) // 2 if step % 2 else -(step // 2)
+
+
+@compiled
+def _find_alike(pilot, row, columns, size, radius, distances, places, found):
+    """Find the patches nearest to each reference patch of a row, by squared distance in the pilot, nearest first."""
+    height, width = pilot.shape
+    squares = np.empty(width, np.float32)
+    found[:] = 0
+    distances[:] = np.inf
+    for vertical in range(2 * radius + 1):
+        other = row + _outwards(vertical)
+        if other < 0 or other > height - size:
+            continue
+        for horizontal in range(2 * radius + 1):
+            shift = _outwards(horizontal)
+            start, stop = max(0, -shift), min(width, width - shift)
+            _sum_squares(pilot, row, other, shift, start, stop, size, squares)
+            for k in range(columns.size):
+                column = columns[k]
+                if column >= start and column + size <= stop:
+                    distance = np.float32(0)
+                    for j in range(index(size)):
+                        distance += squares[index(column) + j]
+                    if distance < distances[k, -1]:  # never for NaN
+                        _insert(distance, other, column + shift, distances, places, found, k)
+
+
+@compiled
+def _sum_squares(pilot, row, other, shift, start, stop, size, squares):
+    """Set `squares` from `start` to `stop` to the sums over `size` rows of `(u[row, x] − u[other, x + shift])²`."""
+    plane, width = pointer(pilot), pilot.shape[1]
+    total = advanced(pointer(squares), start)
+    count = index(stop - start)
+    for i in range(0, size, 4):
+        a = advanced(plane, (row + i) * width + start)
+        b = advanced(plane, (other + i) * width + start + shift)
+        for x in range(count):
+            sum_of_four = total[x] if i > 0 else np.float32(0)
+            for r in range(4):
+                difference = a[x + index(r * width)] - b[x + index(r * width)]
+                sum_of_four += difference * difference
+            total[x] = sum_of_four
+
+
+@compiled
+def _insert(distance, row, column, distances, places, found, k):
+    """Insert a patch into the list of those nearest to reference `k`, sorted by distance."""
+    at = distances.shape[1] - 1
+    found[k] = min(found[k] + 1, at + 1)
+    while at > 0 and distances[k, at - 1] > distance:
+        distances[k, at] = distances[k, at - 1]
+        places[k, at, 0], places[k, at, 1] = places[k, at - 1, 0], places[k, at - 1, 1]
+        at -= 1
+    distances[k, at] = distance
+    places[k, at, 0], places[k, at, 1] = row, column
+
+
+@compiled
+def _filter_group(picture, pilot, variance, places, transform, patches, above, below):
+    """Filter the patches of a group with the gain `U²/(U² + v c)` of each coefficient, and add them to the sums."""
+    size, count = transform.window.shape[0], places.shape[0]
+    y, u, scratch = patches[0], patches[1], patches[2]
+    half = size // 2
+    level = np.float32(0)
+    for m in range(count):
+        level += variance[places[m, 0] + half, places[m, 1] + half]
+    level = max(level / np.float32(count), np.float32(_LEAST_VARIANCE))
+    _read(picture, places, size, y)
+    _read(pilot, places, size, u)
+    for group in (y, u):
+        _cosine_transform(group, scratch, transform.cosines, count)
+        _haar(group, size * size, count)
+    left = np.float32(0)
+    for k in range(index(size * size)):
+        noise = level * transform.variances[k // index(size), k % index(size)]
+        first = k * index(count)
+        kept = np.float32(0)
+        for m in range(index(count)):
+            power = u[first + m] * u[first + m]
+            gain = power / (power + noise)
+            y[first + m] *= gain
+            kept += gain * gain
+        left += kept * noise
+    _inverse_haar(y, size * size, count)
+    _cosine_transform(y, scratch, transform.transposed, count)
+    weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(_LEAST_LEFT) * level)
+    _add(y, places, size, transform.window, weight, above, below)
+
+
+@compiled
+def _read(plane, places, size, group):
+    """Copy the patches at `places` to a group, each member to the slot with its bits in reverse order.
+
+    Then the halves of the group, `m` and `m + count/2`, are neighbours in the order of their distances.
+    """
+    count = index(places.shape[0])
+    for m in range(count):
+        row, column = places[m, 0], places[m, 1]
+        slot = _reversed_bits(m, count)
+        for i in range(size):
+            for j in range(size):
+                group[index(i * size + j) * count + slot] = plane[row + i, column + j]
+
+
+@compiled
+def _add(group, places, size, window, weight, above, below):
+    """Add the patches of a group times their weights, and the weights, to the sums."""
+    count = index(places.shape[0])
+    for m in range(count):
+        row, column = places[m, 0], places[m, 1]
+        slot = _reversed_bits(m, count)
+        for i in range(size):
+            for j in range(size):
+                share = weight * window[i, j]
+                above[row + i, column + j] += share * group[index(i * size + j) * count + slot]
+                below[row + i, column + j] += share
+
+
+@compiled
+def _reversed_bits(number, count):
+    """Return a number below `count`, a power of two, with its bits in reverse order."""
+    result, bit = index(0), index(1)
+    while bit < count:
+        result = index(2) * result + number % index(2)
+        number, bit = number // index(2), bit * index(2)
+    return result
+
+
+@compiled
+def _cosine_transform(group, scratch, cosines, count):
+    """Set a group to `Σᵢⱼ C[k, i] C[l, j] x[i, j]` of each patch."""
+    size = cosines.shape[0]
+    _multiply(cosines, group, scratch, index(size * count), index(0), index(0))
+    for k in range(size):
+        _multiply(cosines, scratch, group, index(count), index(k * size * count), index(k * size * count))
+
+
+@compiled
+def _multiply(matrix, source, target, length, read_from, write_to):
+    """Set rows of `length` numbers of the target to `Σᵢ C[k, i] x[i]`, with x the rows of the source."""
+    size = matrix.shape[0]
+    for k in range(size):
+        out = write_to + index(k) * length
+        for t in range(length):
+            target[out + t] = np.float32(0)
+        for i in range(0, size, 4):
+            a, b, c, d = matrix[k, i], matrix[k, i + 1], matrix[k, i + 2], matrix[k, i + 3]
+            at = read_from + index(i) * length
+            for t in range(length):
+                target[out + t] += (
+                    a * source[at + t]
+                    + b * source[at + length + t]
+                    + c * source[at + index(2) * length + t]
+                    + d * source[at + index(3) * length + t]
+                )
+
+
+@compiled
+def _haar(group, coefficients, count):
+    """Transform each coefficient's numbers along the members: the sums of halves are halved again."""
+    root = np.float32(np.sqrt(0.5))
+    for k in range(index(coefficients)):
+        first, half = k * index(count), index(count) // index(2)
+        while half > index(0):
+            for m in range(half):
+                a, b = group[first + m], group[first + half + m]
+                group[first + m] = root * (a + b)
+                group[first + half + m] = root * (a - b)
+            half //= index(2)
+
+
+@compiled
+def _inverse_haar(group, coefficients, count):
+    """Invert `_haar`, whose butterflies are their own inverses."""
+    root = np.float32(np.sqrt(0.5))
+    for k in range(index(coefficients)):
+        first, half = k * index(count), index(1)
+        while half < index(count):
+            for m in range(half):
+                a, b = group[first + m], group[first + half + m]
+                group[first + m] = root * (a + b)
+                group[first + half + m] = root * (a - b)
+            half *= index(2)
