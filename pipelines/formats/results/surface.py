@@ -129,7 +129,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     points : str, optional
         The samples whose depth is known as a point cloud, in mm; None if the unit is px.
     film : str, optional
-        The picture from viewpoints between the nodes; None if it could not be encoded.
+        The picture from viewpoints between the nodes; None if these do not differ, or it could not be encoded.
     shape : (int, int)
         Rows and columns.
     known_share, sure_share : float
