@@ -51,7 +51,7 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
         Number of their pixels that were compared.
     surface, planes, neighbours : float
         Mean deviance per pixel of their prediction by the surface; by the planes of best focus; and by the mean of each
-        view's neighbours, denoised. None if it was not computed. An image that is exactly right has 1 on average.
+        view's neighbours, denoised. None if it was not computed. Smaller is better.
     """
 
     views: list[Count]
