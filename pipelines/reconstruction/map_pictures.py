@@ -11,6 +11,9 @@ _MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
 # Widths in inches of the picture and of the map in it, and the height of what is not the map.
 _PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
+# Size of letters, to be read where a page shows the picture at half its size.
+_FONT_PT = 15
+
 # Quantiles of the known values between which a map is drawn if nothing else limits it.
 _QUANTILES = (0.01, 0.99)
 
@@ -37,7 +40,9 @@ def map_picture(values: NDArray[np.floating], label: str, low: float, high: floa
     axes.set_axis_off()
     below, above = bool((values < low).any()), bool((values > high).any())
     extend = {(True, True): "both", (True, False): "min", (False, True): "max"}.get((below, above), "neither")
-    figure.colorbar(shown, label=label, extend=extend)
+    bar = figure.colorbar(shown, extend=extend, fraction=0.05, pad=0.02)
+    bar.set_label(label, size=_FONT_PT)
+    bar.ax.tick_params(labelsize=_FONT_PT)
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
     return content.getvalue()

@@ -30,7 +30,7 @@ _MEDIAN_PX = 5
 _CRACK_PX = 2.0
 
 # Samples beside others from which they part by at least this in px are left out: their light is of both.
-_EDGE_PX = 4.0
+_EDGE_PX = 2.5
 
 # A gap is filled from the farthest of its sides; a side this many px away counts as one px nearer.
 _PX_AWAY = 10.0
