@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from faintfield.pipelines.formats.image_files import Picture, shrunk
 
@@ -34,6 +35,19 @@ _EDGE_PX = 2.5
 
 # A gap is filled from the farthest of its sides; a side this many px away counts as one px nearer.
 _PX_AWAY = 10.0
+
+
+def aperture_of(poses_rt_cam_ref: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the distances in mm of the outermost cameras along x and y.
+
+    Parameters
+    ----------
+    poses_rt_cam_ref : float array (view, 6)
+        Poses of the cameras, Rodrigues rad and mm.
+    """
+    turned = Rotation.from_rotvec(poses_rt_cam_ref[:, :3]).inv()
+    width_mm, height_mm, _ = np.ptp(turned.apply(poses_rt_cam_ref[:, 3:]), axis=0).tolist()
+    return width_mm, height_mm
 
 
 def viewpoints(

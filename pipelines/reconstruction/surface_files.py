@@ -54,7 +54,7 @@ class SurfaceMaps:
     inverse_depth : float array (row, column)
         Best estimate of 1/depth in 1/mm, everywhere: what the film is rendered from.
     aperture_mm : (float, float)
-        Distance of the outermost nodes along x and y.
+        Distance of the outermost nodes along x and y, see `parallax.aperture_of`.
     """
 
     grid: PlaneGrid

@@ -1,10 +1,11 @@
 """Films of scenes whose view from elsewhere is known in closed form: two planes, and a slanted one."""
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.pipelines.reconstruction.parallax import render_parallax, viewpoints
+from faintfield.pipelines.reconstruction.parallax import aperture_of, render_parallax, viewpoints
 
 SHAPE, PITCH = (120, 160), 1 / 200
 NEAR, FAR = 1 / 400, 1 / 800  # a mm of viewpoint moves them by 0.25 px against each other
@@ -102,3 +103,13 @@ def test_viewpoints_go_around_inside_the_nodes_and_end_where_they_begin(aperture
         assert np.ptp(places[:, 0]) / np.ptp(places[:, 1]) == pytest.approx(1.5, rel=1e-6)
     elif aperture_mm[0] == 2.0:
         assert np.ptp(places[:, 0]) == pytest.approx(2.0)  # as far as the nodes
+
+
+def test_the_aperture_is_that_of_the_centres_of_turned_cameras() -> None:
+    generator = np.random.default_rng(9)
+    centres = np.array([[-150.0, 20.0, 1.0], [100.0, -80.0, -2.0], [0.0, 120.0, 3.0]])
+    poses = np.zeros((3, 6))
+    for pose, centre in zip(poses, centres, strict=True):
+        pose[:3] = generator.uniform(-0.4, 0.4, 3)
+        pose[3:] = -cv2.Rodrigues(pose[:3])[0] @ centre
+    np.testing.assert_allclose(aperture_of(poses), (250, 200), rtol=1e-9)
