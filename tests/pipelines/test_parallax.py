@@ -51,6 +51,26 @@ def test_the_box_moves_whole_before_the_wall_and_uncovers_nothing_of_itself(move
     assert frame[uncovered].std() > 20  # and as rough
 
 
+def test_what_is_uncovered_continues_the_texture_beside_it() -> None:
+    picture, inverse_depth = _two_planes()
+    (frame,) = render_parallax(picture, inverse_depth, PITCH, np.array([[-48.0, 0.0]]))
+    uncovered = frame[40:80, 60 - 12 : 72 - 12].astype(float)  # 12 px are cut off
+    along = np.abs(np.diff(uncovered, axis=1))
+    assert along.mean() > 15  # of the wall itself it is 34; streaks of its rim have 0
+
+
+def test_light_of_both_sides_of_an_edge_stays_with_neither() -> None:
+    picture, inverse_depth = _two_planes()
+    rim = np.zeros(SHAPE, bool)
+    rim[39:81, 59:101] = True
+    rim[BOX] = False
+    picture[rim] = 190
+    (frame,) = render_parallax(picture, inverse_depth, PITCH, np.array([[-48.0, 0.0]]))
+    wall = np.ones(SHAPE, bool)
+    wall[38:82, 70:114] = False
+    assert not (frame[wall[:, 12:-12]] > 120).any()
+
+
 def test_a_slanted_plane_has_no_cracks() -> None:
     rows, columns = np.indices(SHAPE, float)
     inverse_depth = 1 / 800 + (1 / 400 - 1 / 800) * columns / 159

@@ -57,12 +57,17 @@ def test_points_of_a_slanted_plane_lie_on_it_and_have_its_normal(
     np.testing.assert_allclose(places[1], [X[1] * depth[0, 1], Y[0] * depth[0, 1], depth[0, 1]], rtol=1e-6)
 
 
-def test_normals_of_a_sphere_point_from_its_centre(tmp_path: Path) -> None:
+def _sphere(centre: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+    """Return the depth of a sphere along each ray (x, y, 1), NaN beside it."""
     rays = np.stack([*np.meshgrid(X, Y), np.ones(SHAPE)], axis=-1)
-    centre, radius = np.array([10.0, 5.0, 500.0]), 80.0
     along, squared = rays @ centre, (rays**2).sum(axis=-1)
     inside = along**2 - squared * (centre @ centre - radius**2)
-    depth = np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / squared, np.nan)
+    return np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / squared, np.nan)
+
+
+def test_normals_of_a_sphere_point_from_its_centre(tmp_path: Path) -> None:
+    centre, radius = np.array([10.0, 5.0, 500.0]), 80.0
+    depth = _sphere(centre, radius)
     write_points(tmp_path / "a.ply", depth, X, Y, _grey())
     points = _read(tmp_path / "a.ply")
     outwards = (_vectors(points, "x y z") - centre) / radius
@@ -71,6 +76,16 @@ def test_normals_of_a_sphere_point_from_its_centre(tmp_path: Path) -> None:
     in_front = outwards[:, 2] < -0.7  # towards the rim, differences of neighbours are coarse
     assert in_front.sum() > 200
     assert cosine[in_front].min() > 0.999
+
+
+def test_it_makes_no_difference_how_many_rows_are_computed_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    depth = _sphere(np.array([10.0, 5.0, 500.0]), 80.0)
+    write_points(tmp_path / "whole.ply", depth, X, Y, _grey())
+    monkeypatch.setattr(ply, "_ROWS", 7)
+    write_points(tmp_path / "parts.ply", depth, X, Y, _grey())
+    assert (tmp_path / "parts.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
 def test_normals_do_not_lean_across_a_step(tmp_path: Path) -> None:
