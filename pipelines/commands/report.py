@@ -16,7 +16,8 @@ def report(directory: Path, /) -> dict[str, str]:
     Parameters
     ----------
     directory
-        Folder with reconstruction.json, or whose folders have one: what `reconstruct` wrote, or a session.
+        Folder with reconstruction.json or surface.json, or whose folders have one: what `reconstruct` wrote,
+        or a session.
     """
     path = write_report(directory)
     inform(f"{path}")

@@ -1,5 +1,6 @@
 """Image files that are written: 16-bit frames, float planes with their scale, and previews."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.files import write_whole, writing
 
 type Picture = NDArray[np.uint8]
+
+# Of a lossy film, 0 to 100: above it, size grows faster than anyone can see.
+_FILM_QUALITY = 80
 
 
 def write_frame(path: Path, pixels: NDArray[Any]) -> None:
@@ -45,6 +49,23 @@ def encoded(picture: Picture, suffix: str) -> bytes:
     if not done:
         raise ValueError(f"no picture of shape {picture.shape} can be encoded as {suffix}")
     return content.tobytes()
+
+
+def encoded_film(frames: Sequence[Picture], frame_ms: int) -> bytes | None:
+    """Return pictures (row, column[, RGB]) of one size as an animated WebP that repeats for ever.
+
+    None if OpenCV cannot write one: it needs version 4.12, built with WebP.
+    """
+    if not hasattr(cv2, "imencodeanimation"):
+        return None
+    film = cv2.Animation(0)
+    film.frames = [cv2.cvtColor(one, cv2.COLOR_GRAY2BGR if one.ndim == 2 else cv2.COLOR_RGB2BGR) for one in frames]
+    film.durations = [frame_ms] * len(frames)
+    try:
+        done, content = cv2.imencodeanimation(".webp", film, [cv2.IMWRITE_WEBP_QUALITY, _FILM_QUALITY])
+    except cv2.error:
+        return None
+    return content.tobytes() if done else None
 
 
 def grey_levels(plane: NDArray[np.floating], white: float, black: float = 0.0) -> Picture:

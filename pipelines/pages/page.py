@@ -49,7 +49,7 @@ def figure(value: float | None, digits: int = 3) -> str:
 
 def data_uri(content: bytes, suffix: str) -> str:
     """Return the bytes of a picture's file as a data URI."""
-    kind = {".png": "png", ".jpg": "jpeg"}[suffix]
+    kind = {".png": "png", ".jpg": "jpeg", ".webp": "webp"}[suffix]
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 

@@ -20,6 +20,7 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.results.result_files import files_below, results_below
 from faintfield.pipelines.formats.results.stacks import at_depths
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
 from faintfield.pipelines.pages.page import figure, template
 from faintfield.pipelines.pages.report_calibration import (
@@ -33,6 +34,7 @@ from faintfield.pipelines.pages.report_depth import depth_sections
 from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
+from faintfield.pipelines.pages.report_surface import surface_sections
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,13 @@ class Fact:
 
 @dataclass(frozen=True)
 class Origin:
-    """A reconstruction, with its folder, method, options and time of writing as the page shows them."""
+    """A reconstruction or a surface, with its folder, method, options and time of writing as the page shows them."""
 
     where: str
     method: str
     written: str
     options: dict[str, object]
-    record: ReconstructionRecord
+    record: ReconstructionRecord | SurfaceFileRecord
 
 
 def write_report(directory: Path, *, noise: Path | None = None, geometry: Path | None = None) -> Path:
@@ -70,8 +72,10 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     MissingFile, BadValue
         There is no result in the folder, or one that cannot be read.
     """
-    results = results_below(directory)
+    surfaces = surfaces_below(directory)
+    results = results_below(directory, required=not surfaces)
     inputs = {digest for result in results.values() for digest in result.inputs.values()}
+    inputs |= {digest for made in surfaces.values() for digest in made.inputs.values()}
     noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
     of_noise = noise_section(directory, noise, inputs) if noise else None
     of_geometry = geometry_section(directory, geometry, inputs) if geometry else None
@@ -82,21 +86,23 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     facts = _light(the_set) if the_set else []
     facts.append(_poses(of_geometry, errors.geometry_off))
     facts += _noise(of_noise, the_set)
-    if best := errors.of(shown.best):
+    if shown.best and (best := errors.of(shown.best)):
         values = ", ".join(figure(row.mse_bright) for row in best)
         depths = ", ".join(f"{row.depth_mm:g}" for row in best)
         facts.append(Fact("Mean square error", values, f"at {depths} mm; objects 0…1, truth: plenty of light"))
     page = template("report.html").render(
-        title=_title(directory, results),
+        title=_title(directory, results, surfaces),
         facts=facts,
         sets=sets,
         **vars(shown),
         depth_maps=depth_sections(directory, results),
+        surfaces=surface_sections(directory, surfaces),
         noise=of_noise,
         geometry=of_geometry,
         **vars(errors),
         links=_links(directory),
         results=[_origin(directory, folder, result) for folder, result in results.items()],
+        surface_origins=[_surface_origin(directory, folder, made) for folder, made in surfaces.items()],
     )
     path = directory / REPORT_FILE
     write_whole(path, page)
@@ -116,12 +122,23 @@ def _links(directory: Path) -> list[tuple[str, str]]:
 
 def _origin(directory: Path, folder: Path, result: ReconstructionRecord) -> Origin:
     """Return how and when the planes of one folder were made."""
-    written = datetime.fromtimestamp(int((folder / RECONSTRUCTION_FILE).stat().st_mtime), UTC)
     where, method = folder.relative_to(directory).as_posix(), method_title(result.planes)
-    return Origin(where, method, f"{written:%Y-%m-%d %H:%M:%S} UTC", msgspec.to_builtins(result.options), result)
+    written = _written(folder / RECONSTRUCTION_FILE)
+    return Origin(where, method, written, msgspec.to_builtins(result.options), result)
 
 
-def _title(directory: Path, results: dict[Path, ReconstructionRecord]) -> str:
+def _surface_origin(directory: Path, folder: Path, made: SurfaceFileRecord) -> Origin:
+    """Return how and when the surface of one folder was made."""
+    where, written = folder.relative_to(directory).as_posix(), _written(folder / SURFACE_FILE)
+    return Origin(where, "Surface", written, msgspec.to_builtins(made.options), made)
+
+
+def _written(path: Path) -> str:
+    """Return when a file was written."""
+    return f"{datetime.fromtimestamp(int(path.stat().st_mtime), UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces: dict[Path, SurfaceFileRecord]) -> str:
     """Return the title of the page: what is reconstructed, and at which depths."""
     records = [plane for result in results.values() for plane in result.planes]
     depths = sorted({record.depth_mm for record in at_depths(records)})
@@ -129,6 +146,7 @@ def _title(directory: Path, results: dict[Path, ReconstructionRecord]) -> str:
     planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
     parts = [f"planes at {planes}"] if depths else []
     parts += list(dict.fromkeys(f"plane {record.name}" for record in records if record.rt_ref_plane is not UNSET))
+    parts += ["a surface" if len(surfaces) == 1 else f"{len(surfaces)} surfaces"] if surfaces else []
     return f"{_name(directory.resolve())}: {', '.join(parts)}"
 
 

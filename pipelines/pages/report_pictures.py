@@ -1,7 +1,7 @@
 """The pictures of a report: planes on one grey scale (side by side, on sliders), and their sigmas."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypedDict
 
 import numpy as np
@@ -62,12 +62,12 @@ class SliderColumn(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneSections:
-    """What the page shows of the planes; the names are those of the template.
+    """What the page shows of the planes, by default of none; the names are those of the template.
 
     Attributes
     ----------
     best, best_title : Plane, str
-        A plane of the column that the page leads with, and the title of the column.
+        If there are planes, one of the column that the page leads with, and the title of the column.
     left_out : str, optional
         Why occlusion was left out, if it was.
     blurred : bool
@@ -88,27 +88,29 @@ class PlaneSections:
         Depths at which the focus curve peaks.
     """
 
-    best: Plane
-    best_title: str
-    left_out: str | None
-    blurred: bool
-    best_planes: list[tuple[str, str]]
-    weight_curves: str | None
-    certificates: list[tuple[str, Certificate]]
-    columns: list[str]
-    rows: list[Row]
-    slider: list[SliderColumn] | None
-    slider_column: int
-    slider_depth: int
-    sigmas: Sigmas | None
-    depths: int
-    white: float
-    focus_curve: str | None
-    sharp_mm: list[float]
+    best: Plane | None = None
+    best_title: str = ""
+    left_out: str | None = None
+    blurred: bool = False
+    best_planes: list[tuple[str, str]] = field(default_factory=list)
+    weight_curves: str | None = None
+    certificates: list[tuple[str, Certificate]] = field(default_factory=list)
+    columns: list[str] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
+    slider: list[SliderColumn] | None = None
+    slider_column: int = 0
+    slider_depth: int = 0
+    sigmas: Sigmas | None = None
+    depths: int = 0
+    white: float = 0.0
+    focus_curve: str | None = None
+    sharp_mm: list[float] = field(default_factory=list)
 
 
 def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
     """Return what the page shows of the planes."""
+    if not planes:
+        return PlaneSections()
     depths = sorted({plane.depth_mm for plane in planes if not plane.name})
     places = sorted({plane.place for plane in planes})
     focus = next((result.focus for result in results if result.focus), None)

@@ -1,6 +1,5 @@
 """The depth map of a sweep, its confidence, and the all-in-focus picture: computed, written, recorded."""
 
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +18,7 @@ from faintfield.pipelines.formats.results.plane_files import Origin, read_curren
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.map_pictures import map_picture
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
 from faintfield.recon.depth.focus import SURE
@@ -27,12 +27,6 @@ from faintfield.recon.depth.focus import SURE
 _MIN_BINS_ACROSS = 8
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
-
-# Hatching of unknown depths in the preview: two levels of grey (0 to 1), and their period.
-_MARK_GREY, _MARK_DARK, _MARK_PERIOD_PX = 0.62, 0.5, 12
-
-# Widths in inches of the preview and of the map in it, and the height of what is not the map.
-_PICTURE_WIDTH_IN, _MAP_WIDTH_IN, _MARGIN_IN = 8.6, 7.2, 0.6
 
 
 @dataclass(frozen=True)
@@ -184,8 +178,8 @@ def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[s
     record = found.record
     label = "disparity (px)" if record.unit == "px" else "depth (mm)"
     pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
-        record.file: (found.values, _picture(found.values, label, min(found.scale), max(found.scale))),
-        record.confidence: (found.confidence, _picture(found.confidence, "probability of the depth", 0.0, 1.0)),
+        record.file: (found.values, map_picture(found.values, label, min(found.scale), max(found.scale))),
+        record.confidence: (found.confidence, map_picture(found.confidence, "probability of the depth", 0.0, 1.0)),
         record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
     }
     for name, (values, picture) in pictures.items():
@@ -193,26 +187,6 @@ def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[s
         write_whole((folder / name).with_suffix(".png"), picture)
     files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
     return {path.name: sha256(path) for path in files}
-
-
-def _picture(values: NDArray[np.floating], label: str, low: float, high: float) -> bytes:
-    """Return a map as PNG in colours, with a colour bar; unknown values are hatched grey."""
-    from matplotlib.figure import Figure  # loading it costs most of a second
-
-    rows, columns = np.indices(values.shape)
-    hatch = np.where((rows + columns) % _MARK_PERIOD_PX < 2, _MARK_DARK, _MARK_GREY)
-    figure = Figure(
-        figsize=(_PICTURE_WIDTH_IN, _MARGIN_IN + _MAP_WIDTH_IN * values.shape[0] / values.shape[1]),
-        layout="constrained",
-    )
-    axes = figure.subplots()
-    axes.imshow(hatch, cmap="gray", vmin=0, vmax=1, interpolation="nearest")
-    shown = axes.imshow(values, cmap="viridis", vmin=low, vmax=high, interpolation="nearest")
-    axes.set_axis_off()
-    figure.colorbar(shown, label=label)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=110, metadata={"Software": None})
-    return content.getvalue()
 
 
 def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> NDArray[np.float64]:

@@ -29,6 +29,7 @@ from faintfield.pipelines.formats.results.records import (
     Sha256,
 )
 from faintfield.pipelines.formats.results.result_files import problem_of_file
+from faintfield.pipelines.formats.results.surface import SurfaceFileRecord, SurfaceOptions
 
 # Folder of the colours of planes that still lack others.
 PARTS = ".parts"
@@ -180,8 +181,8 @@ class PlaneFiles:
         return stated == expected and len(record.focus) == len(expected) and named <= record.sha256.keys()
 
 
-def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, _Part)](
-    path: Path, kind: type[Record], origin: Origin
+def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, SurfaceFileRecord, _Part)](
+    path: Path, kind: type[Record], origin: Origin | Provenance[SurfaceOptions]
 ) -> Record | None:
     """Return a record of this origin that agrees with its digest and with its files, in the same folder; else None.
 

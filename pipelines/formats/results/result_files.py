@@ -74,18 +74,18 @@ def _is_within(path: Path, folder: Path) -> bool:
         return False
 
 
-def results_below(directory: Path) -> dict[Path, ReconstructionRecord]:
+def results_below(directory: Path, *, required: bool = True) -> dict[Path, ReconstructionRecord]:
     """Return each reconstruction.json in a folder and below it, by its folder.
 
     Raises
     ------
     MissingFile, BadValue
-        There is none, or one that cannot be read, or that names a file outside its folder.
+        There is none, unless none is `required`; or one that cannot be read, or that names a file outside its folder.
     """
     if not directory.is_dir():
         raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
     paths = files_below(directory, RECONSTRUCTION_FILE)
-    if not paths:
+    if not paths and required:
         raise MissingFile(f"{directory}: holds no {RECONSTRUCTION_FILE}; run `faintfield reconstruct` first")
     results = {path.parent: read_result(path, ReconstructionRecord) for path in paths}
     for folder, result in results.items():

@@ -30,12 +30,14 @@ from faintfield.pipelines.formats.results.records import (
     record_name,
 )
 from faintfield.pipelines.formats.results.result_files import files_below, problem_of_file, read_result
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord
 
 # The type of each record, by a pattern of its name; of geometry.json, a person may write the poses alone.
 _KINDS: dict[str, tuple[type[Struct], ...]] = {
     RECONSTRUCTION_FILE: (ReconstructionRecord,),
     "plane_*.json": (PlaneFileRecord,),
     DEPTH_MAP_FILE: (DepthMapFileRecord,),
+    SURFACE_FILE: (SurfaceFileRecord,),
     OVERVIEW_FILE: (Overview,),
     METRICS_FILE: (Metrics,),
     NOISE_FILE: (NoiseRecord,),
@@ -286,7 +288,7 @@ def _kinds_of(path: Path) -> tuple[type[Struct], ...]:
 def _beside(record: Struct) -> Mapping[str, str]:
     """Return the SHA-256 of each file beside a record for which it vouches, by name."""
     match record:
-        case PlaneFileRecord() | DepthMapFileRecord():
+        case PlaneFileRecord() | DepthMapFileRecord() | SurfaceFileRecord():
             return record.sha256
         case GeometryRecord():
             return record.sha256 or {}
@@ -297,12 +299,14 @@ def _beside(record: Struct) -> Mapping[str, str]:
 
 
 def _named_by(record: Struct) -> list[str]:
-    """Return the names of the files for which a record of a plane or a depth map has to vouch."""
+    """Return the names of the files for which a record of a plane, a depth map or a surface has to vouch."""
     match record:
         case PlaneFileRecord():
             return [name for plane in record.planes for name in plane.files]
         case DepthMapFileRecord():
             return record.depth_map.files
+        case SurfaceFileRecord():
+            return record.files
         case _:
             return []
 

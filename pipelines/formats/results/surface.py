@@ -1,0 +1,201 @@
+"""`surface.json`: the record of a picture that is sharp everywhere, with its depth, and of the files beside it.
+
+Its writer, its readers and its tests share these types. Light is in electrons, lengths are in the unit that the record
+states: mm, or px of disparity from one node to the next if the set knows no lengths.
+"""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.provenance import Provenance
+from faintfield.pipelines.formats.results.records import (
+    Certificate,
+    Count,
+    FileName,
+    Poses,
+    Sha256,
+    WeightScore,
+    preview_name,
+)
+from faintfield.pipelines.formats.results.result_files import file_within, files_below, read_result
+
+SURFACE_FILE = "surface.json"
+
+type Share = Annotated[float, Meta(ge=0, le=1)]
+
+
+class SurfaceOptions(Struct, frozen=True, kw_only=True):
+    """The options of `faintfield reconstruct --surface` as they took effect.
+
+    `depth_range_mm` is None if the range was to be found.
+    """
+
+    depth_range_mm: tuple[float, float] | None
+    penalty_weight: float | Literal["auto"]
+    penalty: str
+    likelihood: str
+    poses: Poses
+
+
+class HeldOutRecord(Struct, frozen=True, kw_only=True):
+    """How well views that were left out are predicted from the others.
+
+    Attributes
+    ----------
+    views : list of int
+        The views that were left out.
+    pixels : int
+        Number of their pixels that were compared.
+    surface, planes, neighbours : float
+        Mean deviance per pixel of their prediction by the surface; by the planes of best focus; and by the mean of each
+        view's neighbours, denoised. None if it was not computed. Smaller is better.
+    """
+
+    views: list[Count]
+    pixels: int
+    surface: float
+    planes: float | None = None
+    neighbours: float | None = None
+
+
+class SurfaceChannel(Struct, frozen=True, kw_only=True):
+    """How one colour of the picture was solved."""
+
+    channel: str
+    penalty_weight: float | None
+    penalty_weight_chosen: str
+    penalty_weight_curve: list[WeightScore] | None = None
+    certificate: Certificate | None
+    passes: int
+    likelihood: str
+    mean_e: float
+
+
+class SurfaceFacts(Struct, frozen=True, kw_only=True):
+    """What the estimation says of a surface, besides its maps.
+
+    Attributes
+    ----------
+    unit : str
+        Of all depths: "mm", or "px" of disparity from one node to the next.
+    searched : (float, float)
+        Nearest and farthest depth that were considered.
+    range_found : bool
+        This range was found in the views, not given.
+    depths : int
+        Number of depths that were compared.
+    bins_px : int
+        Width in detector pixels of the bins in which depths were first compared.
+    rounds : int
+        How often depth and picture were estimated in turn.
+    sure_above : float
+        Probability from which on a depth counts as sure.
+    held_out : HeldOutRecord, optional
+        How well the surface predicts views that were left out.
+    channels : list of SurfaceChannel
+        The picture, colour by colour.
+    wall_time_s : float
+        How long it took.
+    """
+
+    unit: Literal["mm", "px"]
+    searched: tuple[float, float]
+    range_found: bool
+    depths: int
+    bins_px: Count
+    rounds: Count
+    sure_above: Share
+    held_out: HeldOutRecord | None = None
+    channels: Annotated[list[SurfaceChannel], Meta(min_length=1)]
+    wall_time_s: float
+
+
+class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
+    """A surface: what the estimation says, the names of its files, and how much of it is known.
+
+    Attributes
+    ----------
+    picture, picture_sigma : str
+        The light of each sample and its standard deviation, in electrons.
+    depth, depth_sigma : str
+        The depth of each sample and its standard deviation, in `unit`; NaN where the depth is not known.
+    depth_confidence : str
+        Probability, 0 to 1, that the depth is right within 2 %.
+    visibility : str
+        Number of views that see each sample.
+    points : str, optional
+        The samples whose depth is known as a point cloud, in mm; None if the unit is px.
+    film : str, optional
+        The picture from viewpoints between the nodes; None if these do not differ, or it could not be encoded.
+    shape : (int, int)
+        Rows and columns.
+    known_share, sure_share : float
+        Shares of the samples whose depth is known, and whose depth is right with a probability of `sure_above`.
+    median : float, optional
+        Median of the known depths; None if there are none.
+    """
+
+    picture: FileName
+    picture_sigma: FileName
+    depth: FileName
+    depth_sigma: FileName
+    depth_confidence: FileName
+    visibility: FileName
+    points: FileName | None
+    film: FileName | None
+    shape: tuple[Count, Count]
+    known_share: Share
+    sure_share: Share
+    median: float | None
+
+    @property
+    def maps(self) -> list[str]:
+        """Names of the TIFFs, each of which has a preview."""
+        return [
+            self.picture,
+            self.picture_sigma,
+            self.depth,
+            self.depth_sigma,
+            self.depth_confidence,
+            self.visibility,
+        ]
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all files beside the record, previews included."""
+        others = [name for name in (self.points, self.film) if name is not None]
+        return [*self.maps, *map(preview_name, self.maps), *others]
+
+
+class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
+    """`surface.json`, which vouches for the files beside it."""
+
+    format: Literal[1]
+    surface: SurfaceRecord
+    sha256: dict[FileName, Sha256]
+
+    @property
+    def files(self) -> list[str]:
+        """Names of all files beside the record, previews included."""
+        return self.surface.files
+
+
+def surfaces_below(directory: Path) -> dict[Path, SurfaceFileRecord]:
+    """Return each surface.json in a folder and below it, by its folder.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        The folder does not exist, a record cannot be read, or one names a file outside its folder.
+    """
+    if not directory.is_dir():
+        raise MissingFile(f"{directory}: no such folder; name one that `faintfield reconstruct` wrote")
+    paths = files_below(directory, SURFACE_FILE)
+    surfaces = {path.parent: read_result(path, SurfaceFileRecord) for path in paths}
+    for folder, record in surfaces.items():
+        for name in record.files:
+            file_within(folder, name)
+    return surfaces

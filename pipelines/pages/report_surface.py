@@ -1,0 +1,155 @@
+"""What a report shows of a surface: its pictures, how much of it is known, and how well it predicts views left out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
+from faintfield.pipelines.formats.reading import read_content
+from faintfield.pipelines.formats.results.records import preview_name
+from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
+from faintfield.pipelines.pages.page import data_uri, figure
+
+# Kinds of films that browsers play.
+_FILMS = (".webp", ".png")
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture as data URI with its name and caption; `moving` is a film of it, if there is one."""
+
+    src: str
+    name: str
+    caption: str
+    moving: str | None = None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How well one way predicts the views that were left out."""
+
+    by: str
+    deviance: float
+    best: bool
+
+
+@dataclass(frozen=True)
+class SurfaceSection:
+    """What the page shows of one surface.
+
+    Attributes
+    ----------
+    title : str
+        Its folder.
+    made : SurfaceFileRecord
+        Its record, with its provenance.
+    picture : str, optional
+        The picture as data URI; None if the file is missing.
+    figures : list of Figure
+        Its pictures, the film first.
+    rows : list of (str, str, str)
+        Name, value and meaning of each number in the table.
+    predictions : list of Prediction
+        How well it and others predict the views that were left out; empty if none were.
+    verdict : str
+        What the predictions say of the surface.
+    """
+
+    title: str
+    made: SurfaceFileRecord
+    picture: str | None
+    figures: list[Figure]
+    rows: list[tuple[str, str, str]]
+    predictions: list[Prediction]
+    verdict: str
+
+
+def surface_sections(directory: Path, surfaces: dict[Path, SurfaceFileRecord]) -> list[SurfaceSection]:
+    """Return what the page shows of each surface."""
+    return [_section(directory, folder, made) for folder, made in surfaces.items()]
+
+
+def _section(directory: Path, folder: Path, made: SurfaceFileRecord) -> SurfaceSection:
+    """Return what the page shows of the surface in one folder."""
+    surface = made.surface
+    predictions = _predictions(surface.held_out) if surface.held_out else []
+    return SurfaceSection(
+        title=folder.relative_to(directory).as_posix(),
+        made=made,
+        picture=_embedded(folder / preview_name(surface.picture)),
+        figures=_figures(folder, surface),
+        rows=_rows(surface),
+        predictions=predictions,
+        verdict=_verdict(predictions),
+    )
+
+
+def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
+    """Return the pictures of a surface whose files are there."""
+    what, unit = ("depth", "mm") if surface.unit == "mm" else ("disparity", "px")
+    film = _embedded(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
+    circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
+    known = f"Where each sample is, in {unit}; hatched where that is not known"
+    entries = [
+        (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
+        (surface.depth, f"{what.capitalize()}, {unit}.", known),
+        (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within 2 %"),
+        (surface.depth_sigma, f"σ of the {what}, {unit}.", "Standard deviation, if the right surface was found"),
+        (surface.picture_sigma, "σ of the picture, e⁻.", "Standard deviation of the light of each sample"),
+        (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
+    ]
+    found = [
+        Figure(src, name, caption)
+        for file, name, caption in entries
+        if (src := _embedded(folder / preview_name(file))) is not None
+    ]
+    if film is not None:
+        still = _embedded(folder / preview_name(surface.picture)) or film
+        found.insert(1, Figure(still, "Moving.", circling, film))
+    return found
+
+
+def _embedded(path: Path) -> str | None:
+    """Return a picture as data URI, None if it is missing."""
+    return data_uri(read_content(path, MAX_PREVIEW_BYTES), path.suffix) if path.is_file() else None
+
+
+def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
+    """Return the numbers of a surface in plain words."""
+    what = "depth" if surface.unit == "mm" else "disparity"
+    first, last = (figure(value) for value in surface.searched)
+    how = "found in the views" if surface.range_found else "as asked for"
+    compared = f"{how}; {surface.depths} depths compared in bins of {surface.bins_px} × {surface.bins_px} pixels"
+    sure = f"the {what} is right within 2 % with a probability of at least {100 * surface.sure_above:.0f} %"
+    median = f"{figure(surface.median)} {surface.unit}" if surface.median is not None else "–"
+    return [
+        (f"{what.capitalize()} searched", f"{first} to {last} {surface.unit}", compared),
+        (f"Median {what}", median, "of all samples whose " + what + " is known"),
+        ("Known", _percent(surface.known_share), f"of the picture has a {what}"),
+        ("Sure", _percent(surface.sure_share), f"of the picture: {sure}"),
+    ]
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %"
+
+
+def _predictions(held_out: HeldOutRecord) -> list[Prediction]:
+    """Return how well views that were left out are predicted, in the order of the page."""
+    known = [
+        ("this surface", held_out.surface),
+        ("planes of best focus", held_out.planes),
+        ("the mean of each view’s neighbours, denoised", held_out.neighbours),
+    ]
+    deviances = [deviance for _, deviance in known if deviance is not None]
+    return [Prediction(by, deviance, deviance == min(deviances)) for by, deviance in known if deviance is not None]
+
+
+def _verdict(predictions: Sequence[Prediction]) -> str:
+    """Return in words what the predictions say of the surface, which is the first of them."""
+    if len(predictions) < 2:
+        return ""
+    if predictions[0].best:
+        return "The surface predicts them best: its depths explain what other cameras see."
+    best = next(one.by for one in predictions if one.best)
+    return f"They are predicted better by {best}: take the depths with caution."

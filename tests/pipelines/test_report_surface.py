@@ -1,0 +1,157 @@
+"""A report of surfaces, with planes beside them or by themselves."""
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pytest
+
+from faintfield.pipelines.formats.digests import DIGEST_KEY
+from faintfield.pipelines.pages import report_surface
+from faintfield.pipelines.pages.report import write_report
+from tests.pipelines.by_hand import write_by_hand
+from tests.pipelines.surfaces import write_example
+
+type Command = Callable[..., CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A surface in mm and one in px, to be read only."""
+    folder = tmp_path_factory.mktemp("surfaces")
+    write_example(folder / "in mm")
+    write_example(folder / "in px", unit="px", colours=3)
+    return folder
+
+
+@pytest.fixture
+def surface(written: Path, tmp_path: Path) -> Path:
+    """A copy of the surface in mm that a test may change."""
+    return Path(shutil.copytree(written / "in mm", tmp_path / "<toys & more>"))
+
+
+def _section(folder: Path, done: Command) -> str:
+    """Return the part of the page that shows the surface."""
+    done("report", folder)
+    page = (folder / "report.html").read_text()
+    return page[page.index('<section id="surface">') :].partition("</section>")[0]
+
+
+def _words(html: str) -> str:
+    return " ".join(re.sub(r"<[^>]*>", " ", html).split())
+
+
+def _change(folder: Path, **changes: object) -> None:
+    """Change the surface of a record as a person would."""
+    content = json.loads((folder / "surface.json").read_bytes())
+    content["surface"].update(changes)
+    write_by_hand(folder / "surface.json", content)
+
+
+def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command) -> None:
+    said = _words(_section(surface, done))
+    assert "Depth searched 400 to 900 mm found in the views; 64 depths compared in bins of 2 × 2 pixels" in said
+    assert "Known 98 % of the picture" in said
+    assert "Sure 12 % of the picture: the depth is right within 2 % with a probability of at least 90 %" in said
+    assert "3 of the views took no part" in said
+    assert "this surface 1.012" in said
+    assert "planes of best focus 1.340" in said
+    assert "The surface predicts them best" in said
+    page = (surface / "report.html").read_text()
+    assert "<title>faintfield · &lt;toys &amp; more&gt;: a surface</title>" in page
+    assert "What was there, sharp everywhere." in page
+    assert "The planes below" not in page
+    assert "within 0.40 % of the optimum" in page  # in the provenance
+    assert "total variation" in page
+
+
+def test_the_pictures_are_those_of_the_folder(surface: Path, done: Command) -> None:
+    section = _section(surface, done)
+    shown = {base64.b64decode(found) for found in re.findall(r'<img src="data:[^,]*,([^"]*)"', section)}
+    names = ("depth_mm.png", "depth_sigma_mm.png", "picture_sigma.png", "depth_confidence.png", "visibility.png")
+    assert shown == {(surface / name).read_bytes() for name in (*names, "parallax.webp")}
+    assert (
+        f'src="data:image/webp;base64,{base64.b64encode((surface / "parallax.webp").read_bytes()).decode()}"' in section
+    )
+    still = base64.b64encode((surface / "picture.png").read_bytes()).decode()
+    assert f'<source media="(prefers-reduced-motion: reduce), print" srcset="data:image/png;base64,{still}">' in section
+    above = (surface / "report.html").read_text().partition('<section id="surface">')[0]
+    assert still in above  # the picture leads the page
+
+
+def test_disparities_are_no_lengths(written: Path, tmp_path: Path, done: Command) -> None:
+    section = _section(Path(shutil.copytree(written / "in px", tmp_path / "out")), done)
+    said = _words(section)
+    assert "Disparity searched −14.0 to −6.00 px" in said
+    assert "Disparity, px." in said
+    assert not re.search(r"\bmm\b|\bdepth, |point cloud", said)
+
+
+def test_several_surfaces_are_told_apart(written: Path, tmp_path: Path, done: Command) -> None:
+    folder = Path(shutil.copytree(written, tmp_path / "both"))
+    said = _section(folder, done)
+    assert re.findall("<h3>(in ..)</h3>", said) == ["in mm", "in px"]
+    assert "both: 2 surfaces" in (folder / "report.html").read_text()
+
+
+def test_planes_and_a_surface_stand_on_one_page(
+    simulated_scene: Path, surface: Path, tmp_path: Path, done: Command
+) -> None:
+    out = tmp_path / "out"
+    done("reconstruct", simulated_scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
+    before = (out / "report.html").read_text()
+    assert 'id="surface"' not in before
+    shutil.copytree(surface, out / "surface")
+    section = _section(out, done)
+    assert section.count("<figure>") == 7
+    page = (out / "report.html").read_text()
+    assert "The planes below are by back-projection." in page
+    assert "What was there, sharp everywhere." not in page
+    assert "planes at 500 mm, a surface" in page
+
+
+def test_what_is_predicted_better_by_others_is_said(surface: Path, done: Command) -> None:
+    _change(surface, held_out={"views": [3], "pixels": 100, "surface": 1.5, "planes": 1.4, "neighbours": None})
+    said = _words(_section(surface, done))
+    assert "They are predicted better by planes of best focus: take the depths with caution." in said
+    assert "neighbours" not in said
+
+
+def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
+    _change(surface, held_out=None, film=None, points=None, median=None, range_found=False)
+    (surface / "visibility.png").unlink()
+    section = _section(surface, done)
+    said = _words(section)
+    assert "as asked for" in said
+    assert "Median depth –" in said
+    for absent in ("left out", "Moving.", "Seen by.", "point cloud", "webp"):
+        assert absent not in section
+
+
+def test_films_of_other_kinds_are_left_out(surface: Path, done: Command) -> None:
+    (surface / "parallax.svg").write_text("<svg/>")
+    _change(surface, film="parallax.svg")
+    assert "Moving." not in _section(surface, done)
+
+
+def test_an_altered_record_and_an_overlarge_picture_are_refused(
+    surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (surface / "surface.json").read_text()
+    assert DIGEST_KEY in text
+    (surface / "surface.json").write_text(text.replace('"rounds": 3', '"rounds": 4'))
+    ended = faintfield("report", surface)
+    assert (ended.returncode, "was altered after it was written" in ended.stderr) == (1, True)
+    (surface / "surface.json").write_text(text)
+    monkeypatch.setattr(report_surface, "MAX_PREVIEW_BYTES", 1000)
+    ended = faintfield("report", surface)
+    assert (ended.returncode, "MissingFile" in ended.stderr) == (1, True)
+
+
+def test_the_page_is_made_anew_alike(surface: Path) -> None:
+    pages = [write_report(surface).read_bytes() for _ in range(2)]
+    assert pages[0] == pages[1]

@@ -1,0 +1,265 @@
+"""The files of a surface: what is written is what was found, and nothing vouches for anything else."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.commands.verify import verify
+from faintfield.pipelines.errors import BadValue, CannotWrite, MissingFile, ResultDamaged
+from faintfield.pipelines.formats.digests import DIGEST_KEY, with_digest
+from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.results.plane_files import read_current
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
+from faintfield.pipelines.reconstruction import surface_files
+from faintfield.pipelines.reconstruction.map_pictures import robust_limits
+from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps
+from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_maps, write_example
+
+# Every file of a surface in mm.
+FILES = {
+    *(
+        f"{name}{suffix}"
+        for name in ("picture", "picture_sigma", "depth_mm", "depth_sigma_mm")
+        for suffix in (".tiff", ".png")
+    ),
+    *(f"{name}{suffix}" for name in ("depth_confidence", "visibility") for suffix in (".tiff", ".png")),
+    "surface.ply",
+    "parallax.webp",
+}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A surface, to be read only."""
+    folder = tmp_path_factory.mktemp("surface")
+    write_example(folder)
+    return folder
+
+
+@pytest.fixture
+def surface(written: Path, tmp_path: Path) -> Path:
+    """A copy of the surface that a test may change."""
+    return Path(shutil.copytree(written, tmp_path / "surface"))
+
+
+def _alter(folder: Path, **changes: Any) -> None:
+    """Change the surface in a record and give it a digest that agrees."""
+    path = folder / SURFACE_FILE
+    content = json.loads(path.read_bytes())
+    content["surface"].update(changes)
+    del content[DIGEST_KEY]
+    path.write_bytes(with_digest(json.dumps(content).encode()))
+
+
+def test_the_files_are_those_that_the_record_names(written: Path) -> None:
+    record = surfaces_below(written)[written]
+    assert {path.name for path in written.iterdir()} == FILES | {SURFACE_FILE}
+    assert set(record.files) == FILES == set(record.sha256)
+
+
+@pytest.mark.parametrize(
+    ("file", "field"),
+    [
+        ("picture.tiff", "picture"),
+        ("picture_sigma.tiff", "picture_sigma"),
+        ("depth_mm.tiff", "depth"),
+        ("depth_sigma_mm.tiff", "depth_sigma"),
+        ("depth_confidence.tiff", "depth_confidence"),
+        ("visibility.tiff", "visibility"),
+    ],
+)
+def test_the_maps_are_written_as_they_are(file: str, field: str, written: Path) -> None:
+    found, expected = tifffile.imread(written / file), getattr(surface_maps(), field)
+    assert (str(found.dtype), found.shape) == ("float32", SHAPE)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)  # NaN where it is NaN
+
+
+def test_the_record_counts_what_is_known(written: Path) -> None:
+    found = surfaces_below(written)[written].surface
+    unknown = 9 * 19
+    ball = sum((r - 40) ** 2 + (c - 50) ** 2 < 400 for r in range(90) for c in range(120))
+    assert found.known_share == pytest.approx(1 - unknown / (90 * 120))
+    assert found.sure_share == pytest.approx(ball / (90 * 120))
+    assert found.median == pytest.approx(np.nanmedian(surface_maps().depth))
+    assert found.shape == SHAPE
+
+
+def test_colours_are_kept_and_disparities_named_as_such(tmp_path: Path) -> None:
+    record = write_example(tmp_path, unit="px", colours=3)
+    assert (record.depth, record.depth_sigma, record.points) == ("disparity_px.tiff", "disparity_sigma_px.tiff", None)
+    assert not (tmp_path / "surface.ply").exists()  # no length is known
+    found = tifffile.imread(tmp_path / "picture.tiff")
+    np.testing.assert_allclose(found, surface_maps(colours=3).picture, rtol=1e-6)
+    shown = cv2.imdecode(np.fromfile(tmp_path / "picture.png", np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert shown is not None
+    assert shown.shape == (*SHAPE, 3)
+    ratio = shown[40, 50].astype(float) / found[40, 50]
+    assert ratio.max() < 1.05 * ratio.min()  # red stays red
+
+
+def test_the_points_are_the_known_samples(written: Path) -> None:
+    header, _, body = (written / "surface.ply").read_bytes().partition(b"end_header\n")
+    known = int(np.isfinite(surface_maps().depth).sum())
+    assert f"element vertex {known}\n".encode() in header
+    points = np.frombuffer(body, [("place", "<f4", 3), ("rest", "V15")])["place"]
+    maps = surface_maps()
+    rows, columns = np.nonzero(np.isfinite(maps.depth))
+    z = maps.depth[rows, columns]
+    expected = np.column_stack([z * (columns - 59.5) / 150, z * (rows - 44.5) / 150, z])
+    np.testing.assert_allclose(points, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_the_film_repeats_for_ever_and_shows_the_picture(written: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    with image.open(written / "parallax.webp") as film:
+        assert (film.format, film.n_frames, film.info["loop"]) == ("WEBP", 24, 0)
+        film.seek(1)
+        film.load()
+        assert film.info["duration"] == 80
+        assert film.width <= 480
+        means = []
+        for number in range(film.n_frames):
+            film.seek(number)
+            means.append(np.asarray(film.convert("L"), float).mean())
+    assert np.std(means) < 0.05 * np.mean(means)
+
+
+def test_without_an_encoder_the_film_is_left_out_and_that_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delattr(cv2, "imencodeanimation")
+    write_example(tmp_path)
+    assert surfaces_below(tmp_path)[tmp_path].surface.film is None
+    assert {path.name for path in tmp_path.iterdir()} == FILES - {"parallax.webp"} | {SURFACE_FILE}
+    assert "OpenCV 4.12 or later" in capsys.readouterr().err
+
+
+def test_nodes_at_one_place_make_no_film(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.pipelines.surfaces.surface_maps", lambda **_: _at_one_place())
+    assert write_example(tmp_path).film is None
+
+
+def _at_one_place() -> SurfaceMaps:
+    return SurfaceMaps(**(vars(surface_maps()) | {"aperture_mm": (0.0, 0.0)}))
+
+
+def test_maps_of_several_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"visibility has shape \(90, 119\), the grid has \(90, 120\)"):
+        SurfaceMaps(**(vars(surface_maps()) | {"visibility": np.ones((90, 119))}))
+
+
+def test_a_surface_of_which_nothing_is_known_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = {"depth": np.full(SHAPE, np.nan), "depth_sigma": np.full(SHAPE, np.nan)}
+    maps = SurfaceMaps(**(vars(surface_maps()) | nothing))
+    monkeypatch.setattr("tests.pipelines.surfaces.surface_maps", lambda **_: maps)
+    record = write_example(tmp_path)
+    assert (record.known_share, record.median) == (0, None)
+    assert verify(tmp_path).results is not None
+
+
+def test_a_failure_on_the_way_leaves_nothing_that_vouches(surface: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> int:
+        raise CannotWrite("no")
+
+    monkeypatch.setattr(surface_files, "write_points", fail)
+    with pytest.raises(CannotWrite):
+        write_example(surface)
+    assert not (surface / SURFACE_FILE).exists()
+
+
+class TestVerify:
+    """`faintfield verify` of a folder with a surface, and of its record alone."""
+
+    def test_all_agrees(self, written: Path) -> None:
+        for path in (written, written / SURFACE_FILE):
+            found = verify(path).results
+            assert found is not None
+            assert (found.records, found.files, found.problems) == (1, len(FILES), ())
+
+    @pytest.mark.parametrize("name", sorted(FILES))
+    def test_every_file_is_compared(self, name: str, surface: Path) -> None:
+        content = bytearray((surface / name).read_bytes())
+        content[-1] ^= 1
+        (surface / name).write_bytes(content)
+        with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
+            verify(surface / SURFACE_FILE)
+        (surface / name).unlink()
+        with pytest.raises(ResultDamaged, match=f"{name}: is missing"):
+            verify(surface)
+
+    def test_a_record_that_vouches_for_too_few_files_is_found(self, surface: Path) -> None:
+        path = surface / SURFACE_FILE
+        content = json.loads(path.read_bytes())
+        del content["sha256"]["parallax.webp"], content[DIGEST_KEY]
+        path.write_bytes(with_digest(json.dumps(content).encode()))
+        with pytest.raises(ResultDamaged, match=r"has no SHA-256 of parallax\.webp"):
+            verify(surface)
+
+    def test_an_altered_record_is_found(self, surface: Path) -> None:
+        text = (surface / SURFACE_FILE).read_text()
+        (surface / SURFACE_FILE).write_text(text.replace('"depths": 64', '"depths": 65'))
+        with pytest.raises(ResultDamaged, match="was altered after it was written"):
+            verify(surface)
+
+
+class TestReading:
+    """Records are read with the limits of all results."""
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"picture": "../picture.tiff"},
+            {"film": "/dev/zero"},
+            {"unit": "inch"},
+            {"channels": []},
+            {"known_share": 1.5},
+            {"shape": [-1, 5]},
+        ],
+        ids=str,
+    )
+    def test_what_no_surface_can_be_is_refused(self, changes: dict[str, Any], surface: Path) -> None:
+        _alter(surface, **changes)
+        with pytest.raises(BadValue, match="is not a result that can be shown"):
+            surfaces_below(surface)
+
+    def test_a_link_out_of_the_folder_is_refused(self, surface: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+        elsewhere = tmp_path_factory.mktemp("elsewhere") / "film.webp"
+        elsewhere.write_bytes(b"")
+        (surface / "parallax.webp").unlink()
+        (surface / "parallax.webp").symlink_to(elsewhere)
+        with pytest.raises(BadValue, match=r"parallax\.webp: leads out of the folder"):
+            surfaces_below(surface)
+
+    def test_a_folder_that_is_none_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(MissingFile, match="no such folder"):
+            surfaces_below(tmp_path / "absent")
+        assert surfaces_below(tmp_path) == {}
+
+    def test_a_current_surface_is_kept_and_any_other_made_again(self, surface: Path) -> None:
+        path, inputs = surface / SURFACE_FILE, {"elemental.toml": "0" * 64}
+        origin = provenance("reconstruct", OPTIONS, inputs)
+        kept = read_current(path, SurfaceFileRecord, origin)
+        assert kept is not None
+        assert kept.surface == surfaces_below(surface)[surface].surface
+        other = msgspec.structs.replace(OPTIONS, depth_range_mm=(400.0, 900.0))
+        assert read_current(path, SurfaceFileRecord, provenance("reconstruct", other, inputs)) is None
+        (surface / "surface.ply").write_bytes(b"")
+        assert read_current(path, SurfaceFileRecord, origin) is None
+
+
+def test_the_limits_of_a_map_leave_outliers_out() -> None:
+    values = np.linspace(100, 200, 10_001)
+    values[[0, 5, 9]] = 1e9, -1e9, np.nan
+    assert robust_limits(values) == pytest.approx((101, 199), abs=0.1)
+    assert robust_limits(np.full(5, np.nan)) == (0, 1)
+    low, high = robust_limits(np.full(5, 3.0))
+    assert low < 3 < high
+    low, high = robust_limits(np.zeros(5))
+    assert low < 0 < high
