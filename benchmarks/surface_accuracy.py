@@ -112,15 +112,15 @@ def reliability(depth_mm: Map, confidence: Map, true_depth_mm: Map) -> list[Reli
 
 
 def depth_edges(depth_mm: Map) -> NDArray[np.bool_]:
-    """Return the samples (row, column) that differ from a neighbour, beside or below, by more than 5 % of the nearer.
+    """Return the samples (row, column) that are nearer than a neighbour beside, above or below by more than 5 %.
 
-    Both samples of the pair are marked. A depth that is not known differs from nothing.
+    Only the nearer sample of a pair counts, so that an edge moved by a pixel is a pixel away. A depth that is not known
+    differs from nothing.
     """
     edges = np.zeros(depth_mm.shape, bool)
     for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        step = np.abs(depth_mm[one] - depth_mm[other]) > _EDGE_STEP * np.minimum(depth_mm[one], depth_mm[other])
-        edges[one] |= step
-        edges[other] |= step
+        edges[one] |= depth_mm[other] > (1 + _EDGE_STEP) * depth_mm[one]
+        edges[other] |= depth_mm[one] > (1 + _EDGE_STEP) * depth_mm[other]
     return edges
 
 

@@ -86,23 +86,24 @@ def test_a_straight_line_is_fitted_only_if_asked() -> None:
 
 def test_edges_are_steps_of_more_than_5_percent_between_neighbours() -> None:
     depth = np.full((6, 8), 500.0)
-    depth[:, 3:] = 530.0
+    depth[:, 3:] = 526.0
     depth[4:, :] *= 1.04
     depth[0, 7] = np.nan
     expected = np.zeros((6, 8), bool)
-    expected[:, 2:4] = True
+    expected[:, 2] = True
     np.testing.assert_array_equal(depth_edges(depth), expected)
     np.testing.assert_array_equal(depth_edges(depth.T), expected.T)
+    np.testing.assert_array_equal(depth_edges(depth[:, ::-1]), expected[:, ::-1])
 
 
 def test_edges_are_as_far_apart_as_they_were_moved_but_no_farther_than_20_px() -> None:
     near = np.full((30, 60), 500.0)
     near[:, 20:] = 600.0
-    for moved, expected in ((0, 0.0), (5, 4.5), (39, 20.0)):
+    for moved, expected in ((0, 0.0), (5, 5.0), (39, 20.0)):
         far = np.full((30, 60), 500.0)
         far[:, 20 + moved :] = 600.0
         found = median_edge_distance_px(depth_edges(near), depth_edges(far))
-        assert found == expected  # of two columns each, the median of moved and moved - 1
+        assert found == expected
     flat = np.zeros((30, 60), bool)
     assert median_edge_distance_px(depth_edges(near), flat) == 20
     assert np.isnan(median_edge_distance_px(flat, depth_edges(near)))
