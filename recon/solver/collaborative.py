@@ -74,10 +74,9 @@ def refined(operator: SceneOperator, images: ElementalImages, plane: Image) -> I
     plane : float array (row, column)
         f, in electrons.
     """
-    coverage = operator.coverage()
-    u = operator.adjoint_of_forward(plane)
-    np.divide(u, coverage, out=u, where=coverage > 0)  # where none sees, u is zero anyway
     noise = noise_of_back_projection(operator, images, plane)
+    u, coverage = operator.adjoint_of_forward(plane), operator.coverage()
+    np.divide(u, coverage, out=u, where=coverage > 0)  # where none sees, u is zero anyway
     w = collaborative_wiener(back_projection(operator, images), u, noise)
     return np.maximum(plane + (w - u).astype(plane.dtype), 0)
 
@@ -87,9 +86,9 @@ def noise_of_back_projection(
 ) -> Noise:
     """Return the covariance of the back-projection's noise, for data of variance `H f + b + σ²`.
 
-    A pixel enters the sum Hᵀ g with a variance h² v, and h is known only to the operator. But h² is about in a constant
-    ratio to h: `Hᵀ v` times a smooth factor is the variance of the sum. The factor and the kernel are measured
-    on back-projected draws of the noise, one view at a time.
+    A pixel of variance v adds h² v to the variance of a sum Hᵀ g, and the operator can only add h v. The ratio of the
+    two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise,
+    one view at a time.
 
     Parameters
     ----------
@@ -173,10 +172,10 @@ def collaborative_wiener(
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
     patches = patches or Patches()
-    picture, pilot = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot))
-    _check(picture, pilot, noise, patches)
+    picture, pilot, variance = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot, noise.variance))
+    _check(picture, pilot, variance, patches)
     # A distance to NaN is below none
-    seen = np.where(np.isfinite(noise.variance), pilot, np.float32(np.nan))
+    seen = np.where(np.isfinite(variance), pilot, np.float32(np.nan))
     above, below = np.zeros_like(pilot), np.zeros_like(pilot)
     transform = _transform(noise.kernel, patches.size)
     rows, columns = (_corners(length, patches) for length in pilot.shape)
@@ -184,7 +183,7 @@ def collaborative_wiener(
     def work(strips: list[NDArray[np.intp]]) -> None:
         for strip in strips:
             search = (patches.radius, patches.members)
-            filter_rows(picture, seen, noise.variance, strip, columns, search, transform, above, below)
+            filter_rows(picture, seen, variance, strip, columns, search, transform, above, below)
 
     # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
     strip_of_row = rows // (2 * patches.radius + patches.size)
@@ -197,11 +196,11 @@ def collaborative_wiener(
     return np.divide(above, below, out=above, where=below > 0)
 
 
-def _check(picture: Image, pilot: Image, noise: Noise, patches: Patches) -> None:
+def _check(picture: Image, pilot: Image, variance: Image, patches: Patches) -> None:
     """Refuse shapes that differ or are too small for a patch, and sizes that are not multiples of four (ValueError)."""
-    if not picture.shape == pilot.shape == noise.variance.shape:
+    if not picture.shape == pilot.shape == variance.shape:
         raise ValueError(
-            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {noise.variance.shape}; give "
+            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {variance.shape}; give "
             "all the same"
         )
     if patches.size < 4 or patches.size % 4 or patches.size > min(picture.shape):
