@@ -55,7 +55,8 @@ def scene_geometry(
     maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
     homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
     starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
-    slopes, relief = surface or (np.zeros(0), Relief(np.zeros((0, 0, 0), np.int16), 0.0, 0.0))
+    slopes, relief = surface or (np.zeros((0, 3, 3)), Relief(np.zeros((0, 0, 0), np.int16), 0.0, 0.0))
+    homographies = np.concatenate([homographies.reshape(-1, 3, 3), slopes])
     return SceneGeometry(
         np.ascontiguousarray(homographies, dtype).reshape(-1),
         np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp),
@@ -64,7 +65,6 @@ def scene_geometry(
         maps.reshape(-1),
         valid.reshape(-1).view(np.uint8),
         transmission.reshape(-1),
-        np.ascontiguousarray(slopes, dtype).reshape(-1),
         relief.codes.reshape(-1),
         dtype.type(relief.step),
         () if surface is None else (True,),

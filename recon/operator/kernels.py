@@ -35,7 +35,8 @@ class SceneGeometry(NamedTuple):
     Attributes
     ----------
     homographies : array (plane × view × 9,)
-        From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous.
+        From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous. For a surface, their change with 1/depth
+        follows as if it were a second plane's.
     layout : int array (plane, 3)
         Index of each plane's first sample among all samples, its rows and its columns.
     lattice_of_view : int array (view,)
@@ -49,8 +50,6 @@ class SceneGeometry(NamedTuple):
         Zero for pixels that do not count in this view; of size zero when all do.
     transmission : array (plane × view × row × column,)
         Fraction of a plane's light that reaches a pixel; of size zero when all light does.
-    slopes : array (view × 9,)
-        Change of the homographies per 1/depth, for the one surface of a scene; of size zero for planes.
     relief : int16 array (view × row × column,)
         How much nearer than the depth of the homographies each pixel meets the surface, in units of `relief_step`;
         `UNSEEN` where it sees no part of it. Of size zero for planes.
@@ -70,7 +69,6 @@ class SceneGeometry(NamedTuple):
     maps: NDArray[Any]
     valid: NDArray[np.uint8]
     transmission: NDArray[Any]
-    slopes: NDArray[Any]
     relief: NDArray[np.int16]
     relief_step: Any
     bent: tuple[bool, ...]
@@ -130,7 +128,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
     valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
     masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
-    bent, slopes, relief_at = geometry.bent, pointer(geometry.slopes), pointer(geometry.relief)
+    bent, relief_at = geometry.bent, pointer(geometry.relief)
     per_plane = count_of_views * index(rows * columns)
     model, level = pixels.model, pixels.level
     value = 0.0
@@ -148,7 +146,7 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     at = index((lattice * rows + row) * padded + first)
                     if not locate_on_all(
                         homographies, index(9 * view), count_of_views, layout, count_of_planes, samples,
-                        maps, layer, at, slopes, bent, scratch, blocks,
+                        maps, layer, at, bent, scratch, blocks,
                     ):  # fmt: skip
                         continue
                     met_from, met_to = min(met_from, first), first + BLOCK_PX

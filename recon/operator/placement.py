@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.pixel_models import WORK_ROWS
-from faintfield.recon.numba_tools import compiled, index, inlined
+from faintfield.recon.numba_tools import advanced, compiled, index, inlined
 
 # Pixels of a block.
 BLOCK_PX = 64
@@ -26,12 +26,13 @@ MARGIN = 16
 PRODUCT_PX = BLOCK_PX + 2 * MARGIN
 PRODUCTS = 2 * BLOCK_PX + MARGIN
 
-# Then how much nearer, in 1/depth, each pixel meets a surface than the depth of its homographies.
 # Then three rows for each plane: column (less the pixel's number), row, and weight of each pixel.
-NEARER = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * PRODUCT_PX
-_PLACES = NEARER + BLOCK_PX
+_PLACES = 2 * BLOCK_PX + ROW_TAPS * COLUMN_TAPS * PRODUCT_PX
 COLUMN, ROW, WEIGHT = (row * BLOCK_PX for row in range(3))
 _PLACE_SIZE = 3 * BLOCK_PX
+
+# Then, for a surface, how much nearer in 1/depth each pixel meets it than the depth of its homographies.
+NEARER = _PLACES + _PLACE_SIZE
 
 # A pixel this far outside the samples (in samples) still sees their edge: rounding must not decide whether the border
 # of a plane that overlays a view pixel for pixel is seen. Float32 places a pixel of a large detector within 3e-4.
@@ -64,7 +65,7 @@ class BlockWorkspace(NamedTuple):
 
 def make_workspace(planes: int, dtype: np.dtype[Any]) -> BlockWorkspace:
     """Return a workspace whose rows begin at a cache line: a vector that straddles two lines costs twice."""
-    size = _PLACES + planes * _PLACE_SIZE
+    size = _PLACES + planes * _PLACE_SIZE + BLOCK_PX
     raw = np.zeros(size + _LINE_BYTES // dtype.itemsize, dtype)
     skipped = -raw.ctypes.data % _LINE_BYTES // dtype.itemsize
     models = np.zeros((WORK_ROWS, BLOCK_PX), dtype)
@@ -84,9 +85,7 @@ def weights_of(plane):
 
 
 @compiled
-def locate_on_all(
-    homographies, matrix, views, layout, planes, samples, maps, layer, pixel, slopes, bent, scratch, blocks
-):  # fmt: skip
+def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, bent, scratch, blocks):
     """Find where a block of pixels lies on every plane; return whether it sees any.
 
     `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that sample's row and column.
@@ -96,7 +95,7 @@ def locate_on_all(
         start = layout[index(3) * plane]
         height, width = layout[index(3) * plane + index(1)], layout[index(3) * plane + index(2)]
         row_from, row_to, column_from, column_to = _locate(
-            homographies, matrix + index(9) * plane * views, maps, layer, pixel, slopes, matrix, bent, height, width,
+            homographies, matrix + index(9) * plane * views, index(9) * views, maps, layer, pixel, bent, height, width,
             scratch, place_of(plane),
         )  # fmt: skip
         start += row_from * width + column_from
@@ -109,9 +108,7 @@ def locate_on_all(
 
 
 @compiled
-def _locate(
-    homographies, matrix, maps, layer, pixel, slopes, slope, bent, height, width, scratch, place
-):  # fmt: skip
+def _locate(homographies, matrix, to_slopes, maps, layer, pixel, bent, height, width, scratch, place):
     """Find where a block's rays meet a plane; return the range of the rows, and that of column minus pixel.
 
     Rows `_COLUMN` (minus the pixel's number), `_ROW` and `_WEIGHT` of `place` are written. The weight is the pixel's
@@ -129,8 +126,9 @@ def _locate(
     g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
     p, q, r, s, t, u = zero, zero, zero, zero, zero, zero
     if len(bent) > 0:
-        p, q, r = slopes[slope], slopes[slope + index(1)], slopes[slope + index(2)]
-        s, t, u = slopes[slope + index(3)], slopes[slope + index(4)], slopes[slope + index(5)]
+        slopes = advanced(homographies, matrix + to_slopes)
+        p, q, r = slopes[index(0)], slopes[index(1)], slopes[index(2)]
+        s, t, u = slopes[index(3)], slopes[index(4)], slopes[index(5)]
     for k in range(index(BLOCK_PX)):
         at = pixel + k
         x, y, response = maps[at], maps[at + layer], maps[at + layer + layer]
