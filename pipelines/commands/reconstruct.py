@@ -19,6 +19,8 @@ from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes, selected_methods
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
+from faintfield.pipelines.reconstruction.surface import reconstruct_surface
+from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.recon.likelihood.images import LikelihoodName
 from faintfield.recon.solver.penalties import PenaltyName
@@ -36,6 +38,9 @@ def reconstruct(
     sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
     plane_pose: list[Path] | None = None,
     depth_map: bool = False,
+    surface: bool = False,
+    depth_range_mm: str | None = None,
+    disparity_range_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
     method: list[Method] | None = None,
     joint: bool = False,
     occlusion: bool = False,
@@ -50,7 +55,7 @@ def reconstruct(
     workers: Count | None = None,
     scheduler: str | None = None,
 ) -> Outcome:
-    """Reconstruct planes of the scene at chosen depths.
+    """Reconstruct planes of the scene at chosen depths, or one picture that is sharp everywhere, with its depth.
 
     Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
     entry in reconstruction.json; report.html shows them all. With several methods, each has its own folder in OUT.
@@ -78,6 +83,13 @@ def reconstruct(
     depth_map
         Also compute, from the sweep, the depth of each pixel, the probability that it is right, and an all-in-focus
         picture.
+    surface
+        Instead of planes, reconstruct one picture of the scene from the reference view, sharp everywhere, with the depth
+        of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and others, see docs/results.md.
+    depth_range_mm
+        NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
+    disparity_range_px
+        NEAR:FAR: the same by disparity, such as -3.6:1; depths are then written as disparities, disparity_px.tiff.
     method
         pmlem (the default; iterates to a certified optimum), joint or occlusion (pmlem for all planes together),
         pmlem-osl or mlem (the iterations of the paper), or backprojection; repeat it for further methods.
@@ -110,13 +122,25 @@ def reconstruct(
     scheduler
         Address of a dask scheduler whose workers make the planes; they must see OUT under the same path.
     """
-    runner = make_runner(workers, scheduler)
     weight = None if penalty_weight == "auto" else penalty_weight
+    settings = Settings(weight, passes, likelihood, penalty, uncertainty)
+    if surface:
+        _refuse_beside_surface(
+            depth_mm=depth_mm, sweep_mm=sweep_mm, disparity_px=disparity_px, sweep_px=sweep_px, plane_pose=plane_pose,
+            depth_map=depth_map, method=method, joint=joint, occlusion=occlusion, uncertainty=uncertainty,
+            pitch_mm=pitch_mm, workers=workers, scheduler=scheduler,
+        )  # fmt: skip
+        asked = select_surface(depth_range_mm, disparity_range_px, settings)
+        loaded, out = _open(elemental_set, out, scene, geometry, SURFACE_FOLDER)
+        return surface_and_report(loaded, out, asked.resolve(loaded))
+    if depth_range_mm or disparity_range_px:
+        raise WrongUsage("--depth-range-mm and --disparity-range-px are the range of a surface; add --surface")
+    runner = make_runner(workers, scheduler)
     selection = select_planes(
         *(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
         depth_map=depth_map,
         methods=selected_methods(method or [], joint=joint, occlusion=occlusion),
-        settings=Settings(weight, passes, likelihood, penalty, uncertainty),
+        settings=settings,
         pitch_mm=pitch_mm,
     )
     loaded, out = _open(elemental_set, out, scene, geometry)
@@ -140,11 +164,43 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     return msgspec.structs.replace(outcome, report=str(report))
 
 
-def _open(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> tuple[ElementalSet, Path]:
-    """Return a set, or that of a session, and the folder of its results."""
+def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest) -> Outcome:
+    """Reconstruct the surface of a set into `out`, and write the report of it.
+
+    Raises
+    ------
+    OutputBusy
+        Another command is writing to `out`.
+    """
+    started = time.monotonic()
+    with exclusive(out):
+        record = reconstruct_surface(loaded, out, request)
+        report = write_report(out)
+    sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
+    inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
+    return Outcome(
+        out=str(out), report=str(report), planes=[], focus=None, best_focus=None, depth_map=None, metrics=None,
+        surface=record,
+    )  # fmt: skip
+
+
+def _refuse_beside_surface(**options: object) -> None:
+    """Refuse options of planes beside --surface (WrongUsage)."""
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
+    if given:
+        raise WrongUsage(
+            f"--surface makes one picture at all depths, and {' and '.join(given)} would have no effect; leave it out, or "
+            "reconstruct planes in a call of their own, with another --out"
+        )
+
+
+def _open(
+    folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None, results: str = ""
+) -> tuple[ElementalSet, Path]:
+    """Return a set, or that of a session, and the folder of its results: by default, `results` in that of the scene."""
     if has_session(folder):
         loaded = load_session(folder, scene, geometry)
-        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene) / results
     if out is None:
         raise WrongUsage("no folder for the results is named; give --out")
     loaded = load_set(folder)

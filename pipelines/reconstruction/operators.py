@@ -126,10 +126,10 @@ class OperatorFactory:
             [loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]].astype(np.float32) for at in lattices]
         )
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
-        response = np.stack([_response(loaded, lattice) for lattice in lattices])
+        response = np.stack([response_of(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._response = np.where(whole, binned(response, bins), 0)
-        self._principal_shift = _principal_shift(loaded)
+        self._principal_shift = principal_shift(loaded)
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
@@ -174,14 +174,14 @@ class OperatorFactory:
         return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
 
 
-def _response(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
+def response_of(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
     """Return the flat field of a lattice (row, column), zero at unusable pixels."""
     flat = np.ones(lattice.shape, np.float32) if loaded.flat is None else lattice.of(loaded.flat).copy()
     flat[lattice.of(loaded.unusable)] = 0
     return flat
 
 
-def _principal_shift(loaded: ElementalSet) -> NDArray[np.float64] | None:
+def principal_shift(loaded: ElementalSet) -> NDArray[np.float64] | None:
     """Return the shift (view, 2) of the rays of views with a principal point of their own, None without such views."""
     camera = loaded.settings.camera
     shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()

@@ -27,6 +27,7 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.stacks import write_stack
+from faintfield.pipelines.formats.results.surface import SurfaceRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
@@ -52,6 +53,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     best_focus: BestFocusRecord | None
     depth_map: DepthMapRecord | None
     metrics: Metrics | None
+    surface: SurfaceRecord | UnsetType = UNSET
 
 
 def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:

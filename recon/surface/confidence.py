@@ -1,10 +1,10 @@
 """How sure a depth is: the probability that it is right within 2 %, from what is known to go wrong."""
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.edges import near_side, values_at
 
 # Relative error of a depth that still counts as right.
@@ -37,7 +37,7 @@ def confidence(
 ) -> NDArray[np.float32]:
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
-    A logistic model of `features`. Its coefficients were fitted on rendered scenes whose depth is known, at two levels of light.
+    A logistic model of `features`, whose coefficients were fitted on rendered scenes of known depth.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def features(
     share = np.where(away <= tolerance[:, :, np.newaxis], chances, 0).sum(axis=2) / chances.sum(axis=2)
     near = near_side(index)
     edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
-    smooth = cv2.GaussianBlur(np.asarray(index, np.float32), (0, 0), _SLOPE_SCALE)
+    smooth = gaussian(np.asarray(index, np.float32), _SLOPE_SCALE)
     slope = np.hypot(*np.gradient(smooth))
     moved = np.abs(costs.argmin(axis=2) - index) / tolerance
     return np.stack(

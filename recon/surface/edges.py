@@ -7,13 +7,13 @@ how much the views prefer the nearer depth, and an edge costs g, which is little
 Esedoglu and Chan 2006, with the absolute differences of rows and columns).
 """
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
+from faintfield.recon.surface.blur import gaussian
 
 # A difference between neighbours, in steps of the sweep, that counts as the edge of something nearer.
 EDGE_STEPS = 3.0
@@ -66,7 +66,7 @@ def moved_edges(index: NDArray[np.float32], ratios: Image, light: Image) -> NDAr
     near, far = np.where(is_near, index, near), np.where(is_near, far, index)
     free = (np.minimum(to_near, to_far) <= _BAND) & (near - far > EDGE_STEPS / 2)
     scale = np.float32(4 * np.pi * _WINDOW**2 * _INDEPENDENT)
-    preference = cv2.GaussianBlur(values_at(ratios, near) - values_at(ratios, far), (0, 0), _WINDOW) * scale
+    preference = gaussian(values_at(ratios, near) - values_at(ratios, far), _WINDOW) * scale
     share = is_near.astype(np.float32)
     _divide(
         np.clip(preference, -_MAX_PREFERENCE, _MAX_PREFERENCE),

@@ -2,19 +2,20 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.numba_tools import compiled
 from faintfield.recon.solver.cross_validation import MIN_VIEWS, validation_views
+from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
+from faintfield.recon.surface.held_out import Prediction, deviance, predicted, seen_of
 from faintfield.recon.surface.paths import lowest, sum_over_paths
-from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
+from faintfield.recon.surface.pinhole_views import PinholeViews
 
 # Rounds of depth and light at most; the last is one more, with all views.
 _MAX_ROUNDS = 3
@@ -50,24 +51,23 @@ class SurfaceEstimate:
     confidence : float array (row, column)
         Probability that the depth is right within 2 %.
     rounds : int
-        Rounds of depth and light that the views left out asked for, and one with all views.
-    left_out : int array (view,)
-        The views that judged the rounds.
-    deviances : list of float
-        Deviance per pixel of these views after each round.
+        Rounds of depth and light.
+    prediction : Prediction, optional
+        How well views that were left out are predicted; None if there are too few views to leave some out.
     """
 
     inverse_depth: NDArray[np.float64]
     confidence: NDArray[np.float32]
     rounds: int
-    left_out: NDArray[np.intp]
-    deviances: list[float]
+    prediction: Prediction | None
 
 
-def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64], odd: NDArray[np.bool_]) -> SurfaceEstimate:
+def estimate_surface(
+    views: PinholeViews, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]
+) -> SurfaceEstimate:
     """Return the surface that explains the views best.
 
-    The rounds are done without some of the views, and end when these are no longer predicted better.
+    All rounds but the last are done without some of the views, and end when these are no longer predicted better.
 
     Parameters
     ----------
@@ -75,54 +75,56 @@ def estimate_surface(views: PinholeViews, inverse_depths: NDArray[np.float64], o
         The views.
     inverse_depths : float array (depth,)
         The 1/depth to choose from, ascending in equal steps.
-    odd : bool array (view,)
-        One of two halves of the views that look from all over the aperture: a checkerboard of the nodes.
+    nodes : int array (view, 2)
+        Row and column of each view in the grid of nodes.
     """
-    everything = np.arange(len(odd))
-    left_out = validation_views(len(odd)) if len(odd) >= _MIN_JUDGED else everything[:0]
-    evidence = DepthEvidence(views, inverse_depths, _halves(np.setdiff1d(everything, left_out), odd))
-    first = sum_over_paths(_votes(evidence.at_first(), _GATHERED_AT_FIRST), *_STEP_COSTS_AT_FIRST)
-    best, index, deviances = lowest(first), lowest(first), list[float]()
-    for _ in range(_MAX_ROUNDS):
+    left_out = validation_views(len(nodes)) if len(nodes) >= _MIN_JUDGED else np.zeros(0, np.intp)
+    kept = np.setdiff1d(np.arange(len(nodes)), left_out)
+    evidence = DepthEvidence(views, inverse_depths, halves(nodes, kept))
+    index = best = first_depths(evidence)
+    least, rounds = np.inf, 0
+    while True:
         known = evidence.explained(index)
         if left_out.size:
-            deviances.append(prediction_deviance(evidence, known, left_out))
-            if deviances[-1] > min(deviances):
+            expected = known.operator.forward(known.light(), left_out)
+            error = deviance(evidence, expected, left_out, seen_of(evidence, known, left_out))
+            if error > least:
                 break
+            least = error
         best = index
-        index = _next(evidence, known)[0]
-    final = DepthEvidence(views, inverse_depths, _halves(everything, odd))
-    index, costs = _next(final, final.explained(best if left_out.size else index))
+        if rounds == _MAX_ROUNDS:
+            break
+        index = next_depths(evidence, known)[0]
+        rounds += 1
+    prediction = None
+    if left_out.size:
+        beside = [kept[np.abs(nodes[kept] - nodes[view]).sum(axis=1) == 1] for view in left_out]
+        prediction = predicted(evidence, best, left_out, beside)
+    final = DepthEvidence(views, inverse_depths, halves(nodes))
+    index, costs = next_depths(final, final.explained(best))
     sure = confidence(index, costs, inverse_depths)
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-    return SurfaceEstimate(depths, sure, len(deviances) + 1, left_out, deviances)
+    return SurfaceEstimate(depths, sure, rounds + 1, prediction)
 
 
-def prediction_deviance(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> float:
-    """Return the mean squared error of the pixels of views under a surface and its light, over their variance."""
-    expected = known.operator.forward(known.light(), views)
-    pictures = evidence.views.light_e[views]
-    seen = (known.operator.inverse_depth_of_pixels()[views] > 0) & (pictures > UNKNOWN)
-    variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
-    return float(np.mean((np.square(pictures - expected) / np.maximum(variance, 1e-6))[seen], dtype=np.float64))
+def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:
+    """Return depths to start from (row, column), as fractional index."""
+    return lowest(sum_over_paths(_votes(evidence.at_first(), _GATHERED_AT_FIRST), *_STEP_COSTS_AT_FIRST))
 
 
-def _halves(views: NDArray[np.intp], odd: NDArray[np.bool_]) -> Halves:
-    """Return the two halves of some views."""
-    return Halves(views[~odd[views]], views[odd[views]])
+def halves(nodes: NDArray[np.intp], views: NDArray[np.intp] | None = None) -> Halves:
+    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes."""
+    views = np.arange(len(nodes)) if views is None else views
+    odd = nodes[views].sum(axis=1) % 2 == 1
+    return Halves(views[~odd], views[odd])
 
 
-def _next(evidence: DepthEvidence, known: Explained) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def next_depths(evidence: DepthEvidence, known: Explained) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the depths given a surface's light, as fractional index, and the costs (row, column, depth) by paths."""
     ratios = evidence.against(known)
     costs = sum_over_paths(_votes(ratios.both, _GATHERED), *_STEP_COSTS)
-    index = _refined(_gathered(ratios.both, _REFINED), lowest(costs))
+    index = _refined(gaussian(ratios.both, _REFINED), lowest(costs))
     return moved_edges(index, ratios.own, known.light()), costs
-
-
-def _gathered(volume: Image, scale: float) -> NDArray[np.float32]:
-    """Return a volume (row, column, depth) blurred over rows and columns."""
-    return np.asarray(cv2.GaussianBlur(volume, (0, 0), scale), np.float32)
 
 
 def _votes(evidence: Image, scale: float) -> NDArray[np.float32]:
@@ -131,7 +133,7 @@ def _votes(evidence: Image, scale: float) -> NDArray[np.float32]:
     A vote is `−ln( ε/n + (1 − ε) P )`, with P the probability of each of n depths by the window's evidence: no window,
     however bright its detail, outvotes its neighbours.
     """
-    votes = _gathered(evidence, _WINDOW)
+    votes = gaussian(evidence, _WINDOW)
     votes *= np.float32(4 * np.pi * _WINDOW**2 * _INDEPENDENT)
     votes -= votes.max(axis=2, keepdims=True)
     np.exp(votes, out=votes)
@@ -141,7 +143,7 @@ def _votes(evidence: Image, scale: float) -> NDArray[np.float32]:
     np.log(votes, out=votes)
     votes -= votes.mean(axis=2, keepdims=True)
     np.negative(votes, out=votes)
-    return _gathered(votes, scale)
+    return gaussian(votes, scale)
 
 
 def _refined(evidence: Image, start: NDArray[np.float32]) -> NDArray[np.float32]:

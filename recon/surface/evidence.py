@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews, gather
 from faintfield.recon.threads import run_in_threads
 
@@ -146,7 +146,7 @@ class DepthEvidence:
             expected = known.operator.forward(light, half)
             for view, seen in zip(half, expected, strict=True):
                 picture = self.views.light_e[view]
-                around = cv2.GaussianBlur(np.where(picture > UNKNOWN, picture, 0), (0, 0), _UNSEEN_LIGHT)
+                around = gaussian(np.where(picture > UNKNOWN, picture, 0), _UNSEEN_LIGHT)
                 light_e = np.where(relief[view] > 0, seen, around)
                 explained.append(picture * light_e - np.float32(0.5) * light_e**2)
         return np.stack(explained)
@@ -202,8 +202,8 @@ def _of_views(views: PinholeViews, numbers: NDArray[np.intp]) -> PinholeViews:
 
 def _ratio(sum_e: Image, count: Image, scale: float) -> Image:
     """Return blurred sums over blurred numbers of views."""
-    blurred = cv2.GaussianBlur(count, (0, 0), scale)
-    return np.asarray(cv2.GaussianBlur(sum_e, (0, 0), scale) / np.maximum(blurred, np.float32(0.3)))
+    blurred = gaussian(count, scale)
+    return np.asarray(gaussian(sum_e, scale) / np.maximum(blurred, np.float32(0.3)), np.float32)
 
 
 def _detail(light: Image, count: Image, scale: float) -> Image:

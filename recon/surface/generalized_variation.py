@@ -1,8 +1,8 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """Piecewise plane depths: total generalised variation of second order, compiled.
 
-Minimised is `Σ ½ c (u − v)² + α₁ |∇u − w| + α₀ |ℰw|` over u and the slopes w, with ℰ the symmetrised derivative (Bredies,
-Kunisch and Pock 2010), by the primal-dual method (Chambolle and Pock 2011).
+Minimised is `Σ ½ c (u − v)² + α₁ |∇u − w| + α₀ |ℰw|` over u and the slopes w, with ℰ the symmetrised derivative
+(Bredies, Kunisch and Pock 2010), by the primal-dual method (Chambolle and Pock 2011).
 """
 
 from dataclasses import dataclass

@@ -7,13 +7,16 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.likelihood.images import Image
+from faintfield.recon.likelihood.images import Image, binned
 from faintfield.recon.numba_tools import compiled, index, pointer
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 
 # Light of a pixel without a valid number.
 UNKNOWN = np.float32(-1e30)
+
+# A sum with any such light lies below this.
+_SURELY_UNKNOWN = np.float32(-1e20)
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,22 @@ class PinholeViews:
         """Parallax of each view, in samples per unit of 1/depth."""
         reach = np.linalg.norm(self.ray_from_surface[:, :2, 3], axis=1) / self.grid.pitch_mm
         return np.asarray(reach, np.float32)
+
+    def binned(self, bins: int) -> "PinholeViews":
+        """Return the views with `bins` by `bins` pixels added up; a bin counts if all its pixels do."""
+        if bins == 1:
+            return self
+        light = np.stack([binned(picture, bins) for picture in self.light_e]) * np.float32(bins**2)
+        light[light < _SURELY_UNKNOWN] = UNKNOWN
+        (fx, fy), (cx, cy) = self.focal_px, self.centre_px
+        return PinholeViews(
+            light,
+            self.variance_e2 * bins**2,
+            self.ray_from_surface,
+            (fx / bins, fy / bins),
+            ((cx + 0.5) / bins - 0.5, (cy + 0.5) / bins - 0.5),
+            self.grid.binned(bins),
+        )
 
     def surface_operator(self, inverse_depth: NDArray[np.floating]) -> SurfaceOperator:
         """Return H of a surface with the given 1/depth (row, column)."""
@@ -142,12 +161,22 @@ def _gather(pictures, relief, tolerance, half, matrices, q, lattice, sums):
                 r, k = np.int32(row), np.int32(column)
                 upper = index(r) * row_step + index(k) * column_step
                 lower = upper + row_step
-                if min(min(picture[upper], picture[upper + column_step]), min(picture[lower], picture[lower + column_step])) == UNKNOWN:
+                if (
+                    min(
+                        min(picture[upper], picture[upper + column_step]),
+                        min(picture[lower], picture[lower + column_step]),
+                    )
+                    == UNKNOWN
+                ):
                     continue
                 down, right = row - np.float32(r), column - np.float32(k)
                 at = index(i) * width + index(j)
                 total[at] += one
                 for n in range(numbers):
-                    high = picture[upper + index(n)] + right * (picture[upper + column_step + index(n)] - picture[upper + index(n)])
-                    low = picture[lower + index(n)] + right * (picture[lower + column_step + index(n)] - picture[lower + index(n)])
+                    high = picture[upper + index(n)] + right * (
+                        picture[upper + column_step + index(n)] - picture[upper + index(n)]
+                    )
+                    low = picture[lower + index(n)] + right * (
+                        picture[lower + column_step + index(n)] - picture[lower + index(n)]
+                    )
                     total[at + index(n + 1) * size] += high + down * (low - high)

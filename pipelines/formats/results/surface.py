@@ -34,9 +34,11 @@ class SurfaceOptions(Struct, frozen=True, kw_only=True):
     """
 
     depth_range_mm: tuple[float, float] | None
+    unit: Literal["mm", "px"] = "mm"
     penalty_weight: float | Literal["auto"]
     penalty: str
     likelihood: str
+    passes: int | None = None
     poses: Poses
 
 

@@ -1,0 +1,111 @@
+"""All colours of a set together, as pinhole cameras of larger pixels see it: what depths are found from."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.homography import ray_from_surface
+from faintfield.pipelines.console import progress
+from faintfield.pipelines.formats.frames import Lattice
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
+from faintfield.recon.likelihood.images import binned
+from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
+
+# Most pixels of a view, and the fewest pixels along a side that are still added up in twos.
+_MAX_PIXELS, _MIN_SIDE_PX = 120_000, 120
+
+
+def default_bins(loaded: ElementalSet) -> int:
+    """Return the width in detector pixels of the bins: two, or more if views are large; whole periods of a mosaic."""
+    width, height = loaded.settings.camera.size_px
+    period = max(max(lattice.step) for layout in channel_layouts(loaded) for lattice in layout.lattices)
+    needed = int(np.ceil(np.sqrt(width * height / _MAX_PIXELS)))
+    smallest = 2 if min(width, height) >= _MIN_SIDE_PX else 1
+    return -(-max(needed, smallest) // period) * period
+
+
+def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
+    """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
+
+    Views are read one at a time.
+
+    Raises
+    ------
+    WrongSize, WrongBitDepth, UnreadableImage
+        A frame does not match the set; the message names it.
+    """
+    layouts = channel_layouts(loaded)
+    parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
+    responses = [binned(response_of(loaded, lattice), bins // max(lattice.step)) for _, lattice in parts]
+    backgrounds, variances = zip(*(_known(loaded, lattice) for _, lattice in parts), strict=True)
+    grid = plane_grid(loaded, 1.0).binned(bins)
+    views = len(loaded.settings.view)
+    width, height = loaded.settings.camera.size_px
+    shape = (height // bins, width // bins)
+    light = np.empty((views, *shape), np.float32)
+    undistorted = _undistorted_places(loaded, bins, shape)
+    for view in progress(range(views), "reading views"):
+        total = np.zeros(shape, np.float32)
+        for response, background, (lattice, sum_e, over) in zip(
+            responses, backgrounds, _electrons(loaded, view), strict=True
+        ):
+            step = bins // max(lattice.step)
+            usable = (response > 0) & (binned(over, step) == 0)
+            light_e = binned(sum_e - np.asarray(background, np.float32), step) * np.float32(step**2)
+            total += np.where(usable, light_e / np.where(response > 0, response, 1), UNKNOWN)
+        light[view] = _resampled(total, undistorted)
+    camera = loaded.settings.camera
+    return PinholeViews(
+        light,
+        float(np.sum(variances)) * (bins // max(parts[0][1].step)) ** 2,
+        ray_from_surface(loaded.poses_rt_cam_ref, principal_shift(loaded)),
+        (camera.fx_px / bins, camera.fy_px / bins),
+        ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
+        grid,
+    )
+
+
+def _electrons(loaded: ElementalSet, view: int) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
+    """Yield the electrons of a view on each lattice of each colour, and where they are saturated."""
+    for layout in channel_layouts(loaded):
+        found = view_electrons(loaded, layout, loaded.frame_paths(view))
+        for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
+            yield lattice, sum_e, over
+
+
+def _known(loaded: ElementalSet, lattice: Lattice) -> tuple[float | NDArray[np.floating], float]:
+    """Return the background of a lattice (row, column), and the mean variance that is not of the light."""
+    noise = lattice_noise(loaded, lattice, None)
+    background_e = loaded.background_e(noise)
+    return background_e, float(np.mean(background_e)) + float(np.mean(loaded.read_variance_e2(noise)))
+
+
+def _undistorted_places(
+    loaded: ElementalSet, bins: int, shape: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Return column and row (row, column) of the bin that a pinhole camera's bin shows; None without distortion."""
+    camera = loaded.settings.camera
+    if not any(camera.distortion):
+        return None
+    rows, columns = np.indices(shape, np.float64)
+    pixel_x, pixel_y = (columns + 0.5) * bins - 0.5, (rows + 0.5) * bins - 0.5
+    directions = [(pixel_x - camera.cx_px) / camera.fx_px, (pixel_y - camera.cy_px) / camera.fy_px, np.ones(shape)]
+    seen = loaded.lens.project(np.stack(directions, -1).reshape(-1, 3)).reshape(*shape, 2)
+    places = ((seen + 0.5) / bins - 0.5).astype(np.float32)
+    return np.ascontiguousarray(places[:, :, 0]), np.ascontiguousarray(places[:, :, 1])
+
+
+def _resampled(
+    light: NDArray[np.float32], places: tuple[NDArray[np.float32], NDArray[np.float32]] | None
+) -> NDArray[np.float32]:
+    """Return light at places between bins; unknown where a bin that it needs is."""
+    unknown = light < UNKNOWN / 2
+    if places is None:
+        return np.where(unknown, UNKNOWN, light)
+    values = cv2.remap(np.where(unknown, 0, light), *places, cv2.INTER_LINEAR)
+    known = cv2.remap((~unknown).astype(np.float32), *places, cv2.INTER_LINEAR)
+    return np.where(known > 0.999, values, UNKNOWN).astype(np.float32)

@@ -1,0 +1,104 @@
+"""What `reconstruct --surface` is asked for."""
+
+import re
+from dataclasses import dataclass, field
+from typing import Literal
+
+from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.results.surface import SurfaceOptions
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.planes import Settings
+
+# Folder of the surface among the results of a session.
+SURFACE_FOLDER = "surface"
+
+_NUMBER = r"(-?\d+(?:\.\d*)?)"
+
+
+@dataclass(frozen=True)
+class SurfaceRequest:
+    """A surface to reconstruct.
+
+    Attributes
+    ----------
+    depth_range_mm : (float, float), optional
+        Nearest and farthest depth; found in the views if None.
+    unit : str
+        Unit of the depths in its files: mm, or px of disparity from node to node.
+    settings : Settings
+        How its light is solved.
+    """
+
+    depth_range_mm: tuple[float, float] | None = None
+    unit: Literal["mm", "px"] = "mm"
+    settings: Settings = field(default_factory=Settings)
+
+    def options(self, poses: Poses) -> SurfaceOptions:
+        """Return the options that the results record."""
+        weight = self.settings.penalty_weight
+        return SurfaceOptions(
+            depth_range_mm=self.depth_range_mm,
+            unit=self.unit,
+            penalty_weight="auto" if weight is None else weight,
+            penalty=self.settings.penalty,
+            likelihood=self.settings.likelihood,
+            passes=self.settings.passes,
+            poses=poses,
+        )
+
+
+@dataclass(frozen=True)
+class SurfaceSelection:
+    """The range of a surface as the options give it, before the set is known.
+
+    Attributes
+    ----------
+    range_mm, range_px : (float, float), optional
+        Depths, nearest first; disparities.
+    settings : Settings
+        How its light is solved.
+    """
+
+    range_mm: tuple[float, float] | None
+    range_px: tuple[float, float] | None
+    settings: Settings
+
+    def resolve(self, loaded: ElementalSet) -> SurfaceRequest:
+        """Return the request for a set, whose disparities become depths.
+
+        Raises
+        ------
+        BadValue
+            A disparity has no depth.
+        """
+        if self.range_px is None:
+            return SurfaceRequest(self.range_mm, "mm", self.settings)
+        near_mm, far_mm = sorted(loaded.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
+        return SurfaceRequest((near_mm, far_mm), "px", self.settings)
+
+
+def select_surface(depth_range_mm: str | None, disparity_range_px: str | None, settings: Settings) -> SurfaceSelection:
+    """Return the surface that options select.
+
+    Raises
+    ------
+    WrongUsage
+        A range is no range, or two are given.
+    """
+    if depth_range_mm and disparity_range_px:
+        raise WrongUsage("--depth-range-mm and --disparity-range-px say the same of a surface; give one of them")
+    range_mm = _ends("--depth-range-mm", depth_range_mm, "400:1500") if depth_range_mm else None
+    range_px = _ends("--disparity-range-px", disparity_range_px, "-3.6:1") if disparity_range_px else None
+    if range_mm is not None and range_mm[0] <= 0:
+        raise WrongUsage(f"--depth-range-mm {depth_range_mm}: depths are positive; give NEAR:FAR, such as 400:1500")
+    return SurfaceSelection(range_mm, range_px, settings)
+
+
+def _ends(option: str, given: str, example: str) -> tuple[float, float]:
+    """Return the two ends of a range in ascending order."""
+    parts = re.fullmatch(f"{_NUMBER}:{_NUMBER}", given)
+    if parts is None or float(parts[1]) == float(parts[2]):
+        raise WrongUsage(f"{option} {given}: is no range; give two different numbers as NEAR:FAR, such as {example}")
+    first, last = sorted((float(parts[1]), float(parts[2])))
+    return first, last

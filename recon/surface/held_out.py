@@ -1,0 +1,95 @@
+"""Views that were left out, as a surface and its rivals predict them: a figure of merit that needs no truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.surface.blur import gaussian
+from faintfield.recon.surface.evidence import DepthEvidence, Explained
+from faintfield.recon.surface.pinhole_views import UNKNOWN
+
+# Number of planes that stand for a surface, each a share of its samples.
+_PLANES = 4
+
+# Blurs of the mean of neighbours, in pixels: the best counts.
+_BLURS = (1.0, 2.0, 4.0)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """How well views that were left out are predicted.
+
+    Attributes
+    ----------
+    views : int array (view,)
+        The views.
+    pixels : int
+        Number of their pixels that were compared: those that see the surface.
+    surface, planes : float
+        Mean squared error over variance, by the surface, and by the same depths on a few planes.
+    neighbours : float, optional
+        The same by the mean of the views next to each, blurred as suits it best; None without such views.
+    """
+
+    views: NDArray[np.intp]
+    pixels: int
+    surface: float
+    planes: float
+    neighbours: float | None
+
+
+def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return the pixels of views (view, row, column) that have a number and see the surface."""
+    seen = known.operator.inverse_depth_of_pixels()[views] > 0
+    return np.asarray(seen & (evidence.views.light_e[views] > UNKNOWN))
+
+
+def deviance(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp], seen: NDArray[np.bool_]) -> float:
+    """Return the mean squared error of pixels of views over their variance, given what is expected of them."""
+    variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
+    squares = np.square(evidence.views.light_e[views] - expected) / np.maximum(variance, np.float32(1e-6))
+    return float(np.mean(squares[seen], dtype=np.float64))
+
+
+def predicted(
+    evidence: DepthEvidence, index: NDArray[np.floating], views: NDArray[np.intp], beside: Sequence[NDArray[np.intp]]
+) -> Prediction:
+    """Return how well a surface predicts views that the evidence leaves out, and how well its rivals do.
+
+    Parameters
+    ----------
+    evidence : DepthEvidence
+        Of the other views.
+    index : float array (row, column)
+        The surface, as fractional index of the depths.
+    views : int array (view,)
+        The views that were left out.
+    beside : sequence of int array
+        For each of them, the views next to it that were not left out.
+    """
+    limits = np.quantile(index, np.arange(1, _PLANES) / _PLANES)
+    middles = np.quantile(index, (np.arange(_PLANES) + 0.5) / _PLANES)
+    planes = evidence.explained(np.asarray(middles[np.searchsorted(limits, index)], np.float32))
+    surface = evidence.explained(index)
+    seen = seen_of(evidence, surface, views) & seen_of(evidence, planes, views)
+    by_surface, by_planes = (
+        deviance(evidence, known.operator.forward(known.light(), views), views, seen) for known in (surface, planes)
+    )
+    return Prediction(views, int(seen.sum()), by_surface, by_planes, _by_neighbours(evidence, views, beside, seen))
+
+
+def _by_neighbours(
+    evidence: DepthEvidence,
+    views: NDArray[np.intp],
+    beside: Sequence[NDArray[np.intp]],
+    seen: NDArray[np.bool_],
+) -> float | None:
+    """Return the deviance of views predicted by the mean of those beside them, under the best blur."""
+    if not beside or min(map(len, beside)) == 0:
+        return None
+    light = evidence.views.light_e
+    means = [np.maximum(light[near], 0).mean(axis=0, dtype=np.float32) for near in beside]
+    return min(deviance(evidence, np.stack([gaussian(mean, blur) for mean in means]), views, seen) for blur in _BLURS)
