@@ -56,8 +56,7 @@ class SceneGeometry(NamedTuple):
     relief_step : float
         Unit of the relief, in 1/depth.
     bent : (True,) or ()
-        Whether there is a surface. The type says so: the compiler makes one sweep for surfaces and one for planes,
-        which would otherwise take a tenth longer.
+        Whether there is a surface. Its type says so: the compiler makes one sweep for surfaces and one for planes.
     reach : int array (view, row, 2)
         First and past-the-last padded column at which a row's pixels see any plane. Written by `REACH`.
     """
