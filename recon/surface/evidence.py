@@ -60,9 +60,20 @@ class Ratios(NamedTuple):
 
 @dataclass(frozen=True)
 class Explained:
-    """A surface, and the light on it as each half of the views shows it."""
+    """A surface, and the light on it.
+
+    Attributes
+    ----------
+    operator : SurfaceOperator
+        H of the surface.
+    relief : float32 array (view, row, column)
+        1/depth of what each pixel sees, 0 where it sees no sample.
+    lights : list of float array (row, column)
+        The light, as each half of the views shows it.
+    """
 
     operator: SurfaceOperator
+    relief: NDArray[np.float32]
     lights: list[Image]
 
     def light(self) -> NDArray[np.float32]:
@@ -113,8 +124,13 @@ class DepthEvidence:
         q = np.interp(index, np.arange(len(self.inverse_depths)), self.inverse_depths)
         operator = self.views.surface_operator(q)
         light = self.views.light_e
+        samples = np.ones(self.variance.shape, np.float32)
+        relief = operator.inverse_depth_of_pixels()
+        for view, seen in enumerate(relief):  # one at a time: all together are as large as the images
+            seen[operator.forward(samples, [view])[0] == 0] = 0
         return Explained(
             operator,
+            relief,
             [
                 self._denoised(operator.adjoint(light, half), operator.sensitivity(half), _OF_SURFACE, workers=None)
                 for half in self.halves
@@ -123,9 +139,8 @@ class DepthEvidence:
 
     def against(self, known: Explained) -> Ratios:
         """Return the evidence for each depth against a surface and its light."""
-        relief = known.operator.inverse_depth_of_pixels()
-        stack = self._stack(self._explanation(known, relief))
-        relief, tolerance = relief[self._numbers], _REACH / np.maximum(self._subset.reach, np.float32(1e-9))
+        stack = self._stack(self._explanation(known))
+        relief, tolerance = known.relief[self._numbers], _REACH / np.maximum(self._subset.reach, np.float32(1e-9))
         details = [_detail(light, np.ones_like(light), _DETAIL) for light in known.lights]
 
         def ratio(inverse_depth: float) -> list[Image]:
@@ -139,7 +154,7 @@ class DepthEvidence:
 
         return Ratios(*self._of_all_depths(ratio, 2))
 
-    def _explanation(self, known: Explained, relief: NDArray[np.float32]) -> Image:
+    def _explanation(self, known: Explained) -> Image:
         """Return the part of each pixel's log-likelihood (view, row, column) that its light by the surface explains."""
         explained = []
         for half, light in zip(self.halves, reversed(known.lights), strict=True):
@@ -147,7 +162,7 @@ class DepthEvidence:
             for view, seen in zip(half, expected, strict=True):
                 picture = self.views.light_e[view]
                 around = gaussian(np.where(picture > UNKNOWN, picture, 0), _UNSEEN_LIGHT)
-                light_e = np.where(relief[view] > 0, seen, around)
+                light_e = np.where(known.relief[view] > 0, seen, around)
                 explained.append(picture * light_e - np.float32(0.5) * light_e**2)
         return np.stack(explained)
 
