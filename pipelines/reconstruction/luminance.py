@@ -16,7 +16,7 @@ from faintfield.recon.likelihood.images import binned
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 
 # Most pixels of a view, and the fewest pixels along a side that are still added up in twos.
-_MAX_PIXELS, _MIN_SIDE_PX = 120_000, 120
+_MAX_PIXELS, _MIN_SIDE_PX = 80_000, 120
 
 
 def default_bins(loaded: ElementalSet) -> int:

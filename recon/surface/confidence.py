@@ -4,29 +4,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.edges import near_side, values_at
 
 # Relative error of a depth that still counts as right.
 RIGHT_WITHIN = 0.02
 
 # Probability above which a depth is called sure, and below which none is stated.
-SURE, UNKNOWN_BELOW = 0.9, 0.15
+SURE, UNKNOWN_BELOW = 0.9, 0.05
 
 # Samples from an edge beyond which it does not matter, and within which depths often are those of the other side.
 _FAR_FROM_EDGE, _BESIDE_EDGE = 12.0, 4.0
 
+# Samples from the border of the picture, and steps from the ends of the range, beyond which these do not matter.
+_FAR_FROM_BORDER, _FAR_FROM_END = 10.0, 2.0
+
 # Sharpness of the costs as a probability.
 _SHARPNESS = 0.1
-
-# Scale of the blur in samples before the slope of the depths is measured.
-_SLOPE_SCALE = 2.0
 
 # Alternatives to a depth lie at least this many steps away from it.
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-2.58, 1.25, 1.07, -0.24, 1.82, 0.42, 0.24, -0.16, -1.33)
+COEFFICIENTS = (-12.885, 0.404, 0.642, 3.037, 0.682, -1.330, 1.248, 9.319)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
@@ -58,8 +57,8 @@ def features(
     """Return what the probability depends on (feature, row, column); the first is one everywhere.
 
     In order: one; the log odds of the depths within the tolerance, by the costs; by how much alternatives cost more
-    (logarithm), or less; the distance to the next edge; whether one is near; the slope of the depths; the difference
-    between the depths before and after they were made piecewise plane; the tolerance in steps (both logarithms).
+    (logarithm); the distance to the next edge of something nearer; whether one is close; the tolerance in steps
+    (logarithm); the distances to the border of the picture, and to the ends of the range.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
@@ -75,19 +74,18 @@ def features(
     share = np.where(away <= tolerance[:, :, np.newaxis], chances, 0).sum(axis=2) / chances.sum(axis=2)
     near = near_side(index)
     edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
-    smooth = gaussian(np.asarray(index, np.float32), _SLOPE_SCALE)
-    slope = np.hypot(*np.gradient(smooth))
-    moved = np.abs(costs.argmin(axis=2) - index) / tolerance
+    rows, columns = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in index.shape)
+    border = np.minimum(np.minimum(rows[:, np.newaxis], columns), _FAR_FROM_BORDER)
+    end = np.minimum(np.minimum(index, costs.shape[2] - 1 - index), _FAR_FROM_END)
     return np.stack(
         [
             np.ones_like(q),
             np.log((share + 0.01) / (1.01 - share)),
             np.log1p(np.maximum(margin, 0)),
-            0.1 * np.minimum(margin, 0),
             edge / _FAR_FROM_EDGE,
             edge < _BESIDE_EDGE,
-            np.log(0.05 + slope),
-            np.log(0.05 + moved),
             np.log(tolerance),
+            border / _FAR_FROM_BORDER,
+            end / _FAR_FROM_END,
         ]
     )
