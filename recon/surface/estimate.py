@@ -1,6 +1,7 @@
 """Depth and light of a surface by turns: the depth given the light, then the light given the depth."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
-from faintfield.recon.surface.held_out import Prediction, deviance, predicted, seen_of
+from faintfield.recon.surface.held_out import Prediction, predicted, seen_of, squared_errors
 from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
@@ -51,7 +52,7 @@ class SurfaceEstimate:
     confidence : float array (row, column)
         Probability that the depth is right within 2 %.
     rounds : int
-        Rounds of depth and light.
+        Rounds of depth and light that the result needed.
     prediction : Prediction, optional
         How well views that were left out are predicted; None if there are too few views to leave some out.
     """
@@ -67,7 +68,7 @@ def estimate_surface(
 ) -> SurfaceEstimate:
     """Return the surface that explains the views best.
 
-    All rounds but the last are done without some of the views, and end when these are no longer predicted better.
+    All rounds but the last are done without some of the views; the last starts from the one that predicts these best.
 
     Parameters
     ----------
@@ -81,30 +82,42 @@ def estimate_surface(
     left_out = validation_views(len(nodes)) if len(nodes) >= _MIN_JUDGED else np.zeros(0, np.intp)
     kept = np.setdiff1d(np.arange(len(nodes)), left_out)
     evidence = DepthEvidence(views, inverse_depths, halves(nodes, kept))
-    index = best = first_depths(evidence)
-    least, rounds = np.inf, 0
-    while True:
-        known = evidence.explained(index)
-        if left_out.size:
-            expected = known.operator.forward(known.light(), left_out)
-            error = deviance(evidence, expected, left_out, seen_of(evidence, known, left_out))
-            if error > least:
-                break
-            least = error
-        best = index
-        if rounds == _MAX_ROUNDS:
-            break
-        index = next_depths(evidence, known)[0]
-        rounds += 1
+    candidates = [first_depths(evidence)]
+    known = evidence.explained(candidates[0])
+    best, judged = 0, _Judged.of(evidence, known, left_out)
+    for number in range(1, _MAX_ROUNDS + 1):
+        candidates.append(next_depths(evidence, known)[0])
+        known = evidence.explained(candidates[-1])
+        new = _Judged.of(evidence, known, left_out)
+        if new.is_better_than(judged):
+            best, judged = number, new
     prediction = None
     if left_out.size:
         beside = [kept[np.abs(nodes[kept] - nodes[view]).sum(axis=1) == 1] for view in left_out]
-        prediction = predicted(evidence, best, left_out, beside)
+        prediction = predicted(evidence, candidates[best], left_out, beside)
     final = DepthEvidence(views, inverse_depths, halves(nodes))
-    index, costs = next_depths(final, final.explained(best))
+    index, costs = next_depths(final, final.explained(candidates[best]))
     sure = confidence(index, costs, inverse_depths)
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-    return SurfaceEstimate(depths, sure, rounds + 1, prediction)
+    return SurfaceEstimate(depths, sure, best + 1, prediction)
+
+
+class _Judged(NamedTuple):
+    """Squared errors over variance (view, row, column) of views that were left out, and where they see the surface."""
+
+    squares: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> "_Judged":
+        """Return how a surface predicts views."""
+        expected = known.operator.forward(known.light(), views)
+        return cls(squared_errors(evidence, expected, views), seen_of(evidence, known, views))
+
+    def is_better_than(self, other: "_Judged") -> bool:
+        """Return whether the errors are smaller where both surfaces are seen; without any view, they are."""
+        both = self.seen & other.seen
+        return float(np.sum(self.squares[both] - other.squares[both], dtype=np.float64)) <= 0
 
 
 def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:

@@ -46,11 +46,11 @@ def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) 
     return np.asarray((known.relief[views] > 0) & (evidence.views.light_e[views] > UNKNOWN))
 
 
-def deviance(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp], seen: NDArray[np.bool_]) -> float:
-    """Return the mean squared error of pixels of views over their variance, given what is expected of them."""
+def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp]) -> NDArray[np.float32]:
+    """Return the squared errors of pixels (view, row, column) over their variance, given what is expected of them."""
     variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
     squares = np.square(evidence.views.light_e[views] - expected) / np.maximum(variance, np.float32(1e-6))
-    return float(np.mean(squares[seen], dtype=np.float64))
+    return np.asarray(squares, np.float32)
 
 
 def predicted(
@@ -75,7 +75,8 @@ def predicted(
     surface = evidence.explained(index)
     seen = seen_of(evidence, surface, views) & seen_of(evidence, planes, views)
     by_surface, by_planes = (
-        deviance(evidence, known.operator.forward(known.light(), views), views, seen) for known in (surface, planes)
+        _mean(squared_errors(evidence, known.operator.forward(known.light(), views), views), seen)
+        for known in (surface, planes)
     )
     return Prediction(views, int(seen.sum()), by_surface, by_planes, _by_neighbours(evidence, views, beside, seen))
 
@@ -91,4 +92,12 @@ def _by_neighbours(
         return None
     light = evidence.views.light_e
     means = [np.maximum(light[near], 0).mean(axis=0, dtype=np.float32) for near in beside]
-    return min(deviance(evidence, np.stack([gaussian(mean, blur) for mean in means]), views, seen) for blur in _BLURS)
+    return min(
+        _mean(squared_errors(evidence, np.stack([gaussian(mean, blur) for mean in means]), views), seen)
+        for blur in _BLURS
+    )
+
+
+def _mean(squares: NDArray[np.float32], seen: NDArray[np.bool_]) -> float:
+    """Return the mean of the errors of pixels that count."""
+    return float(np.mean(squares[seen], dtype=np.float64))
