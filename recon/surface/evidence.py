@@ -69,6 +69,10 @@ class Explained:
         """Return the light (row, column) by both halves."""
         return np.asarray(np.mean(self.lights, axis=0), np.float32)
 
+    def seen_by(self, views: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Return the pixels (view, row, column) that see the surface between four of its samples: H has a row there."""
+        return np.asarray(self.operator.forward(np.ones_like(self.lights[0]), views) > 0)
+
 
 class DepthEvidence:
     """The evidence for each depth of a sweep.

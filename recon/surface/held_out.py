@@ -43,8 +43,7 @@ class Prediction:
 
 def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return the pixels of views (view, row, column) that have a number and see the surface."""
-    seen = known.operator.inverse_depth_of_pixels()[views] > 0
-    return np.asarray(seen & (evidence.views.light_e[views] > UNKNOWN))
+    return np.asarray(known.seen_by(views) & (evidence.views.light_e[views] > UNKNOWN))
 
 
 def deviance(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp], seen: NDArray[np.bool_]) -> float:
