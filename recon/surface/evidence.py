@@ -128,7 +128,7 @@ class DepthEvidence:
     def against(self, known: Explained) -> Ratios:
         """Return the evidence for each depth against a surface and its light."""
         relief = known.operator.inverse_depth_of_pixels()
-        stack = self._stack(self._explanation(known, relief))
+        stack = self._stack(self._explanation(known))
         relief, tolerance = relief[self._numbers], _REACH / np.maximum(self._subset.reach, np.float32(1e-9))
         details = [_detail(light, np.ones_like(light), _DETAIL) for light in known.lights]
 
@@ -143,15 +143,15 @@ class DepthEvidence:
 
         return Ratios(*self._of_all_depths(ratio, 2))
 
-    def _explanation(self, known: Explained, relief: NDArray[np.float32]) -> Image:
+    def _explanation(self, known: Explained) -> Image:
         """Return the part of each pixel's log-likelihood (view, row, column) that its light by the surface explains."""
         explained = []
         for half, light in zip(self.halves, reversed(known.lights), strict=True):
             expected = known.operator.forward(light, half)
-            for view, seen in zip(half, expected, strict=True):
+            for view, seen, light_of_surface in zip(half, known.seen_by(half), expected, strict=True):
                 picture = self.views.light_e[view]
                 around = gaussian(np.where(picture > UNKNOWN, picture, 0), _UNSEEN_LIGHT)
-                light_e = np.where(relief[view] > 0, seen, around)
+                light_e = np.where(seen, light_of_surface, around)
                 explained.append(picture * light_e - np.float32(0.5) * light_e**2)
         return np.stack(explained)
 
