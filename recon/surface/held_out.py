@@ -48,9 +48,9 @@ def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) 
 
 def deviance(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp], seen: NDArray[np.bool_]) -> float:
     """Return the mean squared error of pixels of views over their variance, given what is expected of them."""
-    variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
-    squares = np.square(evidence.views.light_e[views] - expected) / np.maximum(variance, np.float32(1e-6))
-    return float(np.mean(squares[seen], dtype=np.float64))
+    light, mean = evidence.views.light_e[views][seen], expected[seen]
+    variance = np.maximum(np.maximum(mean, 0) + np.float32(evidence.views.variance_e2), np.float32(1e-6))
+    return float(np.mean(np.square(light - mean) / variance, dtype=np.float64))
 
 
 def predicted(
