@@ -31,12 +31,12 @@ def _frames(*shape: int) -> list[NDArray[np.uint16]]:
     return list(np.random.default_rng(1).integers(100, 900, (2, *shape)).astype(np.uint16))
 
 
-def _summed(frame: NDArray[np.floating], bins: int) -> NDArray[np.float64]:
+def _summed(frame: NDArray[np.uint16], bins: int) -> NDArray[np.float64]:
     """Electrons of light in whole bins, pixel by pixel."""
     rows, columns = frame.shape[0] // bins, frame.shape[1] // bins
     sums = np.zeros((rows, columns))
     for row, column in np.ndindex(rows * bins, columns * bins):
-        sums[row // bins, column // bins] += np.sum((frame[row, column] - 100.0) / 2.0 - BACKGROUND_E)
+        sums[row // bins, column // bins] += float(np.sum((frame[row, column] - 100.0) / 2.0 - BACKGROUND_E))
     return sums
 
 

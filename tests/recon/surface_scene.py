@@ -43,7 +43,7 @@ def matrices() -> NDArray[np.float64]:
 
 def inverse_depth() -> NDArray[np.float64]:
     """1/depth of each sample of the reference view."""
-    row, column = np.indices(SHAPE)
+    row, column = np.indices(SHAPE, float)
     return np.where(_in_square(column, row), NEAR, FAR)
 
 

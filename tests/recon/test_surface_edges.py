@@ -79,7 +79,8 @@ def test_a_row_is_divided_as_the_best_of_all_its_divisions(seed: int) -> None:
     ratios[:, :, NEAR] = generator.normal(0, 0.5, SHAPE[1])
     ratios[:, :, FAR] = generator.normal(0, 0.5, SHAPE[1])
     independent = 4 * np.pi * 1.5**2 * 0.3
-    preferred = independent * gaussian_filter(ratios[0, :, NEAR] - ratios[0, :, FAR], 1.5, mode="mirror", axes=0)
+    gain = (ratios[0, :, NEAR] - ratios[0, :, FAR]).astype(float)
+    preferred = independent * gaussian_filter(gain, 1.5, mode="mirror")
     cost = 0.05 + np.exp(-((np.diff(light[0]) / (0.2 * light.std())) ** 2))
     first, last = 11, 29  # the band: eight samples beyond those at the edge
     sides = _divisions()
