@@ -102,7 +102,7 @@ def test_a_noisy_slanted_plane_gets_no_stairs() -> None:
 
 
 def _differences(fields: NDArray[np.float64]) -> NDArray[np.float64]:
-    """∇u − w and the symmetrised derivative of w (right, down; right, down, √2 times mixed) of u, w (3, row, column)."""
+    """∇u − w (right, down) and the symmetrised derivative of w (right, down, √2 times mixed), of u and w."""
     u, right, down = fields
     found = np.zeros((5, *u.shape))
     found[0, :, :-1], found[1, :-1] = np.diff(u, axis=1) - right[:, :-1], np.diff(u, axis=0) - down[:-1]
