@@ -95,12 +95,13 @@ def test_only_what_is_nearer_by_more_than_the_tolerance_hides(relief_above: floa
 def test_bins_add_light_up_and_look_where_their_pixels_look() -> None:
     generator = np.random.default_rng(3)
     light = generator.uniform(1, 9, (6, *SHAPE)).astype(np.float32)
-    light[2, 3, 5] = UNKNOWN
+    light[2, 3, 4:6] = UNKNOWN
+    light[4, 0, 0] = UNKNOWN
     views = _views(light)
     binned = views.binned(2)
     assert binned.light_e.shape == (6, 4, 5)
     assert binned.light_e[1, 2, 3] == pytest.approx(light[1, 4:6, 6:8].sum(), rel=1e-6)
-    assert np.argwhere(binned.light_e == UNKNOWN).tolist() == [[2, 1, 2]]
+    assert np.argwhere(binned.light_e == UNKNOWN).tolist() == [[2, 1, 2], [4, 0, 0]]
     assert binned.light_e[binned.light_e != UNKNOWN].min() > 0
     assert binned.variance_e2 == 4 * 1.5
     assert binned.grid == GRID.binned(2)
