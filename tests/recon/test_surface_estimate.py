@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import cache
+from unittest.mock import patch
 
 import numba
 import numpy as np
@@ -9,9 +10,10 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import NothingInFocus
+from faintfield.recon.surface import estimate
 from faintfield.recon.surface.confidence import RIGHT_WITHIN
-from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface, halves
-from faintfield.recon.surface.evidence import DepthEvidence
+from faintfield.recon.surface.estimate import _OUTLIERS, SurfaceEstimate, _votes, estimate_surface, halves, next_depths
+from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.held_out import deviance, predicted, seen_of
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 from faintfield.recon.surface.sweep import equal_steps, found_range
@@ -27,15 +29,26 @@ DEPTHS = np.linspace(FARTHEST, NEAREST, 40)  # fewer than `equal_steps` would ta
 
 
 @cache
+def _recorded() -> tuple[SurfaceEstimate, list[NDArray[np.intp]]]:
+    """The estimate that several tests look at, and the views that each of its searches used."""
+    used = []
+
+    class Recorded(DepthEvidence):
+        def __init__(self, views: PinholeViews, inverse_depths: NDArray[np.float64], halves: Halves) -> None:
+            super().__init__(views, inverse_depths, halves)
+            used.append(np.concatenate(halves))
+
+    with patch.object(estimate, "DepthEvidence", Recorded):
+        return estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS, NODES), used
+
+
 def _estimate() -> SurfaceEstimate:
-    """The estimate that several tests look at."""
-    views = surface_scene.drawn_views(LEVEL_E)
-    return estimate_surface(views, DEPTHS, NODES)
+    return _recorded()[0]
 
 
-def _error(estimate: SurfaceEstimate) -> NDArray[np.float64]:
+def _error(found: SurfaceEstimate) -> NDArray[np.float64]:
     """Relative error of the depths."""
-    return np.abs(estimate.inverse_depth / surface_scene.inverse_depth() - 1)
+    return np.abs(found.inverse_depth / surface_scene.inverse_depth() - 1)
 
 
 def test_the_depths_of_wall_and_square_are_found() -> None:
@@ -47,6 +60,36 @@ def test_the_depths_of_wall_and_square_are_found() -> None:
     # Beside the square, where some views see it instead, the wall is drawn to it by half a step
     assert np.median(error) < 0.006
     assert np.median(error[inner & (surface_scene.inverse_depth() == NEAR)]) < 0.002
+
+
+def test_views_that_judge_the_rounds_take_part_in_the_last_one_only() -> None:
+    found, (first, last) = _recorded()
+    assert found.prediction is not None
+    assert sorted([*first, *found.prediction.views]) == list(range(25))
+    assert sorted(last) == list(range(25))
+    assert found.prediction.surface < 0.9 * (found.prediction.neighbours or 0)
+    assert 2 <= found.rounds <= 4
+
+
+def test_rounds_end_when_the_views_left_out_are_predicted_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = iter([3.0, 2.0, 2.5])
+    monkeypatch.setattr(estimate, "deviance", lambda *_: next(errors))
+    assert estimate_surface(surface_scene.drawn_views(LEVEL_E), DEPTHS, NODES).rounds == 3
+
+
+def test_no_window_is_more_certain_than_outliers_allow() -> None:
+    evidence = np.zeros((9, 9, 20), np.float32)
+    evidence[:, :, 7] = 1000
+    votes = _votes(evidence, 2.0)
+    gap = np.log((1 - _OUTLIERS + _OUTLIERS / 20) / (_OUTLIERS / 20))
+    np.testing.assert_allclose(votes[:, :, 3] - votes[:, :, 7], gap, rtol=1e-4)
+
+
+def test_outlines_are_moved_before_depths_are_returned(monkeypatch: pytest.MonkeyPatch) -> None:
+    evidence = DepthEvidence(surface_scene.drawn_views(LEVEL_E), DEPTHS, halves(NODES))
+    moved = np.full(SHAPE, 7, np.float32)
+    monkeypatch.setattr(estimate, "moved_edges", lambda *_: moved)
+    assert next_depths(evidence, evidence.explained(np.full(SHAPE, 3.0)))[0] is moved
 
 
 def test_what_is_called_sure_is_right() -> None:
@@ -216,6 +259,13 @@ def test_only_pixels_between_samples_are_compared() -> None:
         inside &= light[view] > UNKNOWN
         assert (mask != inside).mean() < 0.02  # rounding, at the very border
         assert not mask[~inside].any()
+
+
+def test_the_noise_of_one_half_says_nothing_of_the_others() -> None:
+    """On average over depths and samples, noise speaks against any light: half of that light's own square."""
+    noise = np.random.default_rng(1)
+    light = 5 + noise.normal(0, 7**0.5, (25, *SHAPE))
+    assert _evidence(surface_scene.views_of(light)).at_first().mean() < 0
 
 
 type Wrong = Callable[[NDArray[np.float64]], NDArray[np.float64]]
