@@ -40,7 +40,7 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     """
     layouts = channel_layouts(loaded)
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
-    responses = [binned(response_of(loaded, lattice), bins // max(lattice.step)) for _, lattice in parts]
+    responses = [_response(loaded, lattice, bins // max(lattice.step)) for _, lattice in parts]
     backgrounds, variances = zip(*(_known(loaded, lattice) for _, lattice in parts), strict=True)
     grid = plane_grid(loaded, 1.0).binned(bins)
     views = len(loaded.settings.view)
@@ -67,6 +67,12 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
         grid,
     )
+
+
+def _response(loaded: ElementalSet, lattice: Lattice, bins: int) -> NDArray[np.float32]:
+    """Return the response of bins of a lattice (row, column), zero where one of their pixels is unusable."""
+    response = response_of(loaded, lattice)
+    return np.where(binned(response > 0, bins) == 1, binned(response, bins), np.float32(0))
 
 
 def _electrons(loaded: ElementalSet, view: int) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:

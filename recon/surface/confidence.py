@@ -25,7 +25,7 @@ _SHARPNESS = 0.1
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-12.885, 0.404, 0.642, 3.037, 0.682, -1.330, 1.248, 9.319)
+COEFFICIENTS = (-12.285, 0.404, 0.642, 3.037, 0.682, -1.330, 1.248, 9.319)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95

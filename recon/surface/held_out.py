@@ -49,8 +49,9 @@ def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) 
 def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp]) -> NDArray[np.float32]:
     """Return the squared errors of pixels (view, row, column) over their variance, given what is expected of them."""
     variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
-    squares = np.square(evidence.views.light_e[views] - expected) / np.maximum(variance, np.float32(1e-6))
-    return np.asarray(squares, np.float32)
+    light_e = evidence.views.light_e[views]
+    errors = np.where(light_e > UNKNOWN, light_e - expected, 0)
+    return np.asarray(np.square(errors) / np.maximum(variance, np.float32(1e-6)), np.float32)
 
 
 def predicted(
