@@ -10,16 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats import frames as frames_module
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import encoded, write_frame
-from faintfield.pipelines.reconstruction import surface, surface_depths, surface_files
-from faintfield.recon.surface.estimate import SurfaceEstimate
-from faintfield.recon.surface.pinhole_views import PinholeViews
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.reconstruction import surface, surface_files
 from tests.pipelines.forms import form_of_result
+from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
 from tests.pipelines.test_golden import GOLDEN
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -27,25 +25,6 @@ type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
 
 RANGE = ("--depth-range-mm", "400:900")
 FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
-DEPTH_MM, CONFIDENCE = 600.0, 0.5
-
-
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[PinholeViews]:
-    """Replace what is slow, the search for depths, by one depth everywhere, and previews; return the views."""
-    given: list[PinholeViews] = []
-
-    def flat(views: PinholeViews, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
-        given.append(views)
-        shape = views.grid.shape
-        return SurfaceEstimate(
-            np.full(shape, 1 / DEPTH_MM), np.full(shape, CONFIDENCE, np.float32), rounds=2, prediction=None
-        )
-
-    monkeypatch.setattr(surface_depths, "estimate_surface", flat)
-    preview = encoded(np.zeros((4, 4), np.uint8), ".png")
-    monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
-    return given
 
 
 def _record(folder: Path) -> dict[str, Any]:
@@ -86,20 +65,20 @@ def test_a_second_call_keeps_all_files_and_prints_the_same_record(
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "report.html"} == before
 
 
-def test_the_maps_follow_from_depth_and_confidence(seen: list[PinholeViews], scene: Path, done: Command) -> None:
+def test_the_maps_follow_from_depth_and_confidence(seen: Searches, scene: Path, done: Command) -> None:
     out = scene / "out"
     done("reconstruct", scene, "--surface", *FAST, "--out", out)
-    np.testing.assert_allclose(tifffile.imread(out / "depth_mm.tiff"), DEPTH_MM, rtol=1e-6)
+    np.testing.assert_allclose(tifffile.imread(out / "depth_mm.tiff"), FOUND_MM, rtol=1e-6)
     # Half of a normal distribution lies within 0.6745 σ, and here within 2 %
-    np.testing.assert_allclose(tifffile.imread(out / "depth_sigma_mm.tiff"), 0.02 * DEPTH_MM / 0.67449, rtol=1e-4)
-    np.testing.assert_allclose(tifffile.imread(out / "depth_confidence.tiff"), CONFIDENCE)
+    np.testing.assert_allclose(tifffile.imread(out / "depth_sigma_mm.tiff"), 0.02 * FOUND_MM / 0.67449, rtol=1e-4)
+    np.testing.assert_allclose(tifffile.imread(out / "depth_confidence.tiff"), FOUND_CONFIDENCE)
     surface_record = _record(out)["surface"]
     assert (surface_record["known_share"], surface_record["sure_share"], surface_record["held_out"]) == (1, 0, None)
     assert surface_record["searched"] == pytest.approx([400, 900])
     assert len(seen) == 1
 
 
-def test_disparities_are_those_of_the_nodes(seen: list[PinholeViews], scene: Path, done: Command) -> None:
+def test_disparities_are_those_of_the_nodes(seen: Searches, scene: Path, done: Command) -> None:
     """The nodes are 50 mm apart and f is 120 px: 10 px at 600 mm, up to the errors of the simulated poses."""
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     options = ("--disparity-range-px=-15:-5", *FAST[2:])
@@ -115,9 +94,7 @@ def test_disparities_are_those_of_the_nodes(seen: list[PinholeViews], scene: Pat
 @pytest.mark.parametrize(
     "change", [("--depth-range-mm", "400:1000"), ("--penalty-weight", 0.6), ("--passes", 3), ("--penalty", "none")]
 )
-def test_other_options_make_it_again(
-    change: tuple[object, ...], seen: list[PinholeViews], scene: Path, done: Command
-) -> None:
+def test_other_options_make_it_again(change: tuple[object, ...], seen: Searches, scene: Path, done: Command) -> None:
     options: dict[object, object] = dict(zip(FAST[::2], FAST[1::2], strict=True))
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     done("reconstruct", scene, "--surface", "--depth-range-mm", "900:400", *FAST[2:], "--out", scene / "out")
@@ -127,7 +104,7 @@ def test_other_options_make_it_again(
     assert len(seen) == 2
 
 
-def test_another_pixel_or_a_damaged_file_makes_it_again(seen: list[PinholeViews], scene: Path, done: Command) -> None:
+def test_another_pixel_or_a_damaged_file_makes_it_again(seen: Searches, scene: Path, done: Command) -> None:
     call = ("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     done(*call)
     picture = (scene / "out" / "picture.tiff").read_bytes()
@@ -155,7 +132,7 @@ class TestInterrupted:
         ],
     )
     def test_at_any_stage(
-        self, module: Any, name: str, calls: int, survives: bool, seen: list[PinholeViews], scene: Path,
+        self, module: Any, name: str, calls: int, survives: bool, seen: Searches, scene: Path,
         monkeypatch: pytest.MonkeyPatch, faintfield: Command, done: Command,
     ) -> None:  # fmt: skip
         out, again = scene / "out", ("--depth-range-mm", "400:950", *FAST[2:])
@@ -185,9 +162,7 @@ class TestInterrupted:
 class TestFolder:
     """A surface and other results in one folder."""
 
-    def test_planes_and_a_surface_are_shown_on_one_page(
-        self, seen: list[PinholeViews], scene: Path, done: Command
-    ) -> None:
+    def test_planes_and_a_surface_are_shown_on_one_page(self, seen: Searches, scene: Path, done: Command) -> None:
         done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
         done("reconstruct", scene, "--depth-mm", 500, "--passes", 2, "--out", scene / "out")
         done("verify", scene / "out", "--inputs", scene)
@@ -198,7 +173,7 @@ class TestFolder:
         assert "500 mm" in page
 
     def test_a_depth_map_and_a_surface_refuse_each_other(
-        self, seen: list[PinholeViews], scene: Path, faintfield: Command, done: Command
+        self, seen: Searches, scene: Path, faintfield: Command, done: Command
     ) -> None:
         sweep = ("--sweep-mm", "400:800:5", "--method", "backprojection", "--depth-map")
         for first, second in ((("--surface", *FAST), sweep), (sweep, ("--surface", *FAST))):
@@ -224,7 +199,7 @@ class TestFolder:
         assert "holds a surface and no planes; open its TIFFs or surface.ply" in ended.stderr
 
     def test_a_full_disk_is_said_before_a_view_is_read(
-        self, seen: list[PinholeViews], scene: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+        self, seen: Searches, scene: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
     ) -> None:
         free = shutil.disk_usage(scene)._replace(free=10_000_000)
         monkeypatch.setattr(shutil, "disk_usage", lambda _: free)

@@ -15,33 +15,14 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import encoded, write_frame
-from faintfield.pipelines.reconstruction import surface_depths, surface_files
-from faintfield.recon.surface.estimate import SurfaceEstimate
-from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.recon.surface.pinhole_views import UNKNOWN
+from tests.pipelines.surfaces import Searches
 
 type Command = Callable[..., CompletedProcess[str]]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
-type Given = tuple[PinholeViews, NDArray[np.float64], NDArray[np.intp]]
-
 RANGE = ("--depth-range-mm", "400:900")
 FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
-
-
-@pytest.fixture
-def seen(monkeypatch: pytest.MonkeyPatch) -> list[Given]:
-    """Replace the search for depths and the previews, which are slow; return what the search was given."""
-    given: list[Given] = []
-
-    def flat(views: PinholeViews, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
-        given.append((views, inverse_depths, nodes))
-        shape = views.grid.shape
-        return SurfaceEstimate(np.full(shape, 1 / 600), np.full(shape, 0.5, np.float32), rounds=1, prediction=None)
-
-    preview = encoded(np.zeros((4, 4), np.uint8), ".png")
-    monkeypatch.setattr(surface_depths, "estimate_surface", flat)
-    monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
-    return given
 
 
 def _plain(settings: dict[str, Any]) -> None:
@@ -55,7 +36,7 @@ def _light_e(folder: Path, view: str) -> NDArray[np.float64]:
     return np.asarray((read_frame(folder / view).pixels_dn - 100.0) / 2.0 - 0.02)
 
 
-def test_the_search_is_given_electrons_of_light(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_the_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     ((views, inverse_depths, nodes),) = seen
@@ -65,7 +46,7 @@ def test_the_search_is_given_electrons_of_light(seen: list[Given], scene: Path, 
     assert nodes[5].tolist() == [1, 2]
 
 
-def test_frames_of_one_view_add_up(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_frames_of_one_view_add_up(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     def twice(settings: dict[str, Any]) -> None:
         _plain(settings)
         for view in settings["view"]:
@@ -78,7 +59,7 @@ def test_frames_of_one_view_add_up(seen: list[Given], scene: Path, edit: Edit, d
     np.testing.assert_allclose(seen[0][0].light_e[1], by_hand, atol=1e-4)
 
 
-def test_colours_add_up_and_each_has_a_picture(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_colours_add_up_and_each_has_a_picture(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     for path in scene.glob("view_*.tiff"):
         grey = read_frame(path).pixels_dn
@@ -92,7 +73,7 @@ def test_colours_add_up_and_each_has_a_picture(seen: list[Given], scene: Path, e
 
 
 def test_a_mosaic_is_binned_by_its_period(
-    seen: list[Given], tmp_path: Path, edit: Edit, small_options: tuple[object, ...], done: Command
+    seen: Searches, tmp_path: Path, edit: Edit, small_options: tuple[object, ...], done: Command
 ) -> None:
     done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
     edit(tmp_path / "set", _plain)
@@ -103,7 +84,7 @@ def test_a_mosaic_is_binned_by_its_period(
     assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (72, 96)
 
 
-def test_a_saturated_view_does_not_count(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_a_saturated_view_does_not_count(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     write_frame(scene / "view_r0_c1.tiff", np.full((72, 96), 65535, np.uint16))
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
@@ -114,15 +95,16 @@ def test_a_saturated_view_does_not_count(seen: list[Given], scene: Path, edit: E
 
 
 def test_distortion_is_undone_and_the_flat_field_divided_out(
-    seen: list[Given], scene: Path, edit: Edit, done: Command
+    seen: Searches, scene: Path, edit: Edit, done: Command
 ) -> None:
     """Each pixel holds as many electrons as the column where a pinhole camera shows its point, by OpenCV, plus 50."""
+    edit(scene, lambda settings: settings["camera"].update(distortion=[-0.2, 0.02, 0.0005, -0.0003, 0.0]))
     flat, camera = tifffile.imread(scene / "flat.tiff"), tomllib.loads((scene / "elemental.toml").read_text())["camera"]
     matrix = np.array([[camera["fx_px"], 0, camera["cx_px"]], [0, camera["fy_px"], camera["cy_px"]], [0, 0, 1]])
     rows, columns = np.indices(flat.shape, np.float64)
     pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
     ideal = cv2.undistortPoints(pixels, matrix, np.array(camera["distortion"]), P=matrix).reshape(*flat.shape, 2)
-    assert np.abs(ideal[:, :, 0] - columns).max() > 1
+    assert np.abs(ideal[:, :, 0] - columns).max() > 2
     for path in scene.glob("view_*.tiff"):
         write_frame(path, np.rint(100 + 2 * (flat * (50 + ideal[:, :, 0]) + 0.02)).astype(np.uint16))
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
@@ -132,14 +114,14 @@ def test_distortion_is_undone_and_the_flat_field_divided_out(
     np.testing.assert_allclose(light_e[known], np.broadcast_to(50 + columns, light_e.shape)[known], atol=0.7)
 
 
-def test_views_without_nodes_are_a_row(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_views_without_nodes_are_a_row(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, lambda settings: [view.pop("node") for view in settings["view"]])
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     assert seen[0][2].tolist() == [[0, index] for index in range(9)]
 
 
 def test_an_imported_grid_may_have_principal_points_of_its_own(
-    seen: list[Given], scene: Path, tmp_path: Path, done: Command
+    seen: Searches, scene: Path, tmp_path: Path, done: Command
 ) -> None:
     """Pictures aligned on a plane: what moves by −12 px from node to node, aligned on −2 px, is left with −10 px."""
     (tmp_path / "pictures").mkdir()
@@ -153,7 +135,7 @@ def test_an_imported_grid_may_have_principal_points_of_its_own(
     assert depth[0] / depth[-1] == pytest.approx((12 + 2) / (1 + 2), rel=1e-6)
 
 
-def test_a_view_that_sees_nothing_is_named(seen: list[Given], scene: Path, edit: Edit, done: Command) -> None:
+def test_a_view_that_sees_nothing_is_named(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, lambda settings: settings["view"][2].update(rt_cam_ref=[0.0, 3.0, 0.0, 50.0, 50.0, 0.0]))
     said = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out").stderr
     assert "1 views see nothing of the surface, view_r0_c2.tiff for one" in said
@@ -189,7 +171,7 @@ def _all_at_once(settings: dict[str, Any]) -> None:
 )
 def test_what_cannot_be_is_refused_in_one_line(
     change: Callable[[dict[str, Any]], object] | None, words: tuple[object, ...], code: int, said: str,
-    seen: list[Given], scene: Path, edit: Edit, faintfield: Command,
+    seen: Searches, scene: Path, edit: Edit, faintfield: Command,
 ) -> None:  # fmt: skip
     if change is not None:
         edit(scene, change)
@@ -207,7 +189,7 @@ def test_a_range_without_a_surface_is_wrong_usage(scene: Path, faintfield: Comma
 
 
 def test_a_range_up_to_infinity_and_a_coarse_one_are_done(
-    seen: list[Given], scene: Path, faintfield: Command, done: Command
+    seen: Searches, scene: Path, faintfield: Command, done: Command
 ) -> None:
     call = ("reconstruct", scene, "--surface", *FAST[2:], "--out", scene / "out", "--depth-range-mm")
     assert "warning" not in done(*call, "400:1000000000").stderr
@@ -215,7 +197,7 @@ def test_a_range_up_to_infinity_and_a_coarse_one_are_done(
     assert 1 / seen[0][1][0] == pytest.approx(1e9)
 
 
-def test_a_scene_that_no_view_sees_is_refused(seen: list[Given], scene: Path, faintfield: Command) -> None:
+def test_a_scene_that_no_view_sees_is_refused(seen: Searches, scene: Path, faintfield: Command) -> None:
     for path in scene.glob("view_*.tiff"):
         write_frame(path, np.full((72, 96), 65535, np.uint16))
     ended = faintfield("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
@@ -224,7 +206,7 @@ def test_a_scene_that_no_view_sees_is_refused(seen: list[Given], scene: Path, fa
     assert not (scene / "out").exists()
 
 
-def test_views_that_are_too_small_are_refused(seen: list[Given], tmp_path: Path, faintfield: Command) -> None:
+def test_views_that_are_too_small_are_refused(seen: Searches, tmp_path: Path, faintfield: Command) -> None:
     words = ("simulate", tmp_path / "set", "--size-px", 30, 20, "--rows", 2, "--columns", 2)
     assert run([str(word) for word in words]) == 0
     ended = faintfield("reconstruct", tmp_path / "set", "--surface", *FAST, "--out", tmp_path / "out")
