@@ -68,7 +68,7 @@ def scene(simulated_scene: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
-    """Replace what is slow about a surface, the search for depths, previews and film; return what the search is given."""
+    """Replace what is slow about a surface, the search for depths and its pictures; return what the search is given."""
     given: Searches = []
 
     def search(views: Any, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
