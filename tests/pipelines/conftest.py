@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import encoded, write_frame
-from faintfield.pipelines.reconstruction import surface_depths, surface_files
+from faintfield.pipelines.reconstruction import planes, surface, surface_depths, surface_files
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from tests.pipelines.surfaces import Searches, found_at_once
 
@@ -68,7 +68,7 @@ def scene(simulated_scene: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
-    """Replace what is slow about a surface, the search for depths and its pictures; return what the search is given."""
+    """Replace what is slow: the search for depths, σ, refinement and pictures; return what the search is given."""
     given: Searches = []
 
     def search(views: Any, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
@@ -78,6 +78,8 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
     preview = encoded(np.zeros((4, 4), np.uint8), ".png")
     monkeypatch.setattr(surface_depths, "estimate_surface", search)
     monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
+    monkeypatch.setattr(surface, "refined", lambda operator, images, plane: plane)
+    monkeypatch.setattr(planes, "standard_deviation", lambda plane, *_: np.ones_like(plane))
     monkeypatch.setattr(surface_files, "render_parallax", lambda *_: [np.zeros((4, 4), np.uint8)] * 2)
     return given
 

@@ -3,6 +3,7 @@
 import shutil
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -16,6 +17,10 @@ from numpy.typing import NDArray
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.planes import Settings, solve, solve_then_sigma
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.surfaces import Searches
 
@@ -212,3 +217,26 @@ def test_views_that_are_too_small_are_refused(seen: Searches, tmp_path: Path, fa
     ended = faintfield("reconstruct", tmp_path / "set", "--surface", *FAST, "--out", tmp_path / "out")
     assert (ended.returncode, seen) == (1, [])
     assert "has views of 30 x 20 px, and a surface needs at least 24 px" in ended.stderr
+
+
+def test_the_deviation_without_images_is_that_of_a_plane(simulated_scene: Path) -> None:
+    loaded = load_set(simulated_scene)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout)
+    operator = OperatorFactory(loaded, layout, images).at(500.0, plane_grid(loaded, 500.0))
+    settings = Settings(penalty_weight=0.5, passes=5)
+    solution, sigma = solve_then_sigma(operator, images, settings)
+    expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
+    np.testing.assert_array_equal(solution.plane, expected.plane)
+    np.testing.assert_array_equal(sigma(), expected.sidecars["sigma"])
+
+
+@pytest.mark.parametrize("place", ["file", "file/out"])
+def test_a_place_that_cannot_be_written_is_named(
+    place: str, seen: Searches, scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    (tmp_path / "file").write_text("in the way")
+    ended = faintfield("reconstruct", scene, "--surface", *FAST, "--out", tmp_path / place)
+    assert (ended.returncode, seen) == (1, [])
+    assert "CannotWrite: " in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
