@@ -1,6 +1,7 @@
 """`faintfield reconstruct`: planes of a session or an elemental set at chosen depths."""
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -11,7 +12,7 @@ from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
-from faintfield.pipelines.formats.results.records import Method
+from faintfield.pipelines.formats.results.records import REPORT_FILE, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from faintfield.pipelines.pages.report import write_report
@@ -84,8 +85,9 @@ def reconstruct(
         Also compute, from the sweep, the depth of each pixel, the probability that it is right, and an all-in-focus
         picture.
     surface
-        Instead of planes, reconstruct one picture of the scene from the reference view, sharp everywhere, with the depth
-        of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and others, see docs/results.md.
+        Instead of planes, reconstruct one picture of the scene from the reference view, sharp everywhere, with the
+        depth of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and others, see
+        docs/results.md. For a session, its folder is reconstructions/surface by default.
     depth_range_mm
         NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
     disparity_range_px
@@ -124,17 +126,15 @@ def reconstruct(
     """
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty)
-    if surface:
+    asked = select_surface(surface, depth_range_mm, disparity_range_px, settings)
+    if asked is not None:
         _refuse_beside_surface(
             depth_mm=depth_mm, sweep_mm=sweep_mm, disparity_px=disparity_px, sweep_px=sweep_px, plane_pose=plane_pose,
             depth_map=depth_map, method=method, joint=joint, occlusion=occlusion, uncertainty=uncertainty,
             pitch_mm=pitch_mm, workers=workers, scheduler=scheduler,
         )  # fmt: skip
-        asked = select_surface(depth_range_mm, disparity_range_px, settings)
-        loaded, out = _open(elemental_set, out, scene, geometry, SURFACE_FOLDER)
-        return surface_and_report(loaded, out, asked.resolve(loaded))
-    if depth_range_mm or disparity_range_px:
-        raise WrongUsage("--depth-range-mm and --disparity-range-px are the range of a surface; add --surface")
+        loaded, page_in = _open(elemental_set, out, scene, geometry)
+        return surface_and_report(loaded, out or page_in / SURFACE_FOLDER, asked.resolve(loaded), page_in=page_in)
     runner = make_runner(workers, scheduler)
     selection = select_planes(
         *(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
@@ -164,18 +164,20 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     return msgspec.structs.replace(outcome, report=str(report))
 
 
-def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest) -> Outcome:
-    """Reconstruct the surface of a set into `out`, and write the report of it.
+def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest, *, page_in: Path) -> Outcome:
+    """Reconstruct the surface of a set into `out`, and write the report of all that is in `page_in`, the same or above.
 
     Raises
     ------
     OutputBusy
-        Another command is writing to `out`.
+        Another command is writing to one of the two.
     """
     started = time.monotonic()
-    with exclusive(out):
-        record = reconstruct_surface(loaded, out, request)
-        report = write_report(out)
+    with ExitStack() as locks:
+        for folder in dict.fromkeys((page_in, out)):
+            locks.enter_context(exclusive(folder))
+        record = reconstruct_surface(loaded, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
+        report = write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     return Outcome(
@@ -189,18 +191,16 @@ def _refuse_beside_surface(**options: object) -> None:
     given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value]
     if given:
         raise WrongUsage(
-            f"--surface makes one picture at all depths, and {' and '.join(given)} would have no effect; leave it out, or "
-            "reconstruct planes in a call of their own, with another --out"
+            f"--surface makes one picture at all depths, and {' and '.join(given)} would have no effect; leave it out, "
+            "or reconstruct planes in a call of their own"
         )
 
 
-def _open(
-    folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None, results: str = ""
-) -> tuple[ElementalSet, Path]:
-    """Return a set, or that of a session, and the folder of its results: by default, `results` in that of the scene."""
+def _open(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> tuple[ElementalSet, Path]:
+    """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene."""
     if has_session(folder):
         loaded = load_session(folder, scene, geometry)
-        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene) / results
+        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
     if out is None:
         raise WrongUsage("no folder for the results is named; give --out")
     loaded = load_set(folder)

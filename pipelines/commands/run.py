@@ -3,12 +3,13 @@
 from pathlib import Path
 
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
-from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
+from faintfield.pipelines.commands.reconstruct import reconstruct_and_report, surface_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.planes import Settings
@@ -20,6 +21,7 @@ from faintfield.pipelines.reconstruction.request import (
     swept_depths,
 )
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
+from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 
@@ -29,6 +31,8 @@ def run(
     *,
     depth_mm: list[Positive] | None = None,
     sweep_mm: str | None = None,
+    surface: bool = False,
+    depth_range_mm: str | None = None,
     method: list[Method] | None = None,
     penalty_weight: NotNegative | None = None,
     passes: Count | None = None,
@@ -49,6 +53,11 @@ def run(
         Depth of a plane; repeat it for further planes. By default, the depths under [scene] in the rig.toml.
     sweep_mm
         FIRST:LAST:COUNT: COUNT planes in equal steps of depth, with a curve of focus against depth.
+    surface
+        Also reconstruct one picture that is sharp everywhere, with the depth of each pixel, as `reconstruct --surface`
+        does; its files are in reconstructions/surface.
+    depth_range_mm
+        NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
     method
         Method of reconstruction, as for `reconstruct`; repeat it for further methods.
     penalty_weight
@@ -66,17 +75,26 @@ def run(
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
     swept = swept_depths(sweep_mm) if sweep_mm else []
     depths = distinct_depths([*(depth_mm or ([] if swept else read_plan(session).rig.scene.depth_mm)), *swept])
-    if not depths:
+    settings = Settings(penalty_weight, passes)
+    relief = select_surface(surface, depth_range_mm, None, settings)
+    if not depths and (relief is None or method or pitch_mm):
         raise WrongUsage(
-            "no plane is asked for; give --depth-mm or --sweep-mm FIRST:LAST:COUNT, or state [scene] "
-            "depth_mm in the rig.toml before a capture"
+            "no plane is asked for; give --depth-mm or --sweep-mm FIRST:LAST:COUNT, or state [scene] depth_mm in the "
+            "rig.toml before a capture, or give --surface without options of planes"
         )
-    request = Request(depths, method or [DEFAULT_METHOD], Settings(penalty_weight, passes), pitch_mm, bool(swept))
-    return run_steps(session, session_steps(session, request, lens, limit_px))
+    planes = Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)) if depths else None
+    asked = None if relief is None else SurfaceRequest(relief.range_mm, settings=settings)
+    return run_steps(session, session_steps(session, planes, lens, limit_px, asked))
 
 
-def session_steps(session: Path, request: Request, lens: LensName = "opencv5", limit_px: float = 0.5) -> list[Step]:
-    """Return the steps from a captured session to the planes of a request, in order."""
+def session_steps(
+    session: Path,
+    planes: Request | None,
+    lens: LensName = "opencv5",
+    limit_px: float = 0.5,
+    surface: SurfaceRequest | None = None,
+) -> list[Step]:
+    """Return the steps from a captured session to the planes and the surface that are asked for, in order."""
     # Depths of the rig, not of the request: the geometry stays the same for other planes
     gated_mm = list(read_plan(session).rig.scene.depth_mm or DEFAULT_DEPTHS_MM)
 
@@ -103,13 +121,20 @@ def session_steps(session: Path, request: Request, lens: LensName = "opencv5", l
             make=measure_geometry,
             inputs=lambda: _frames(session, "charuco"),
         ),
-        *_steps_of_request(session, request),
+        *(made := [*_steps_of_planes(session, planes), *_steps_of_surface(session, surface)]),
+        Step(
+            "report",
+            results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
+            make=lambda: write_report(session / RECONSTRUCTIONS),
+            needs=tuple(step.name for step in made),
+        ),
     ]
 
 
-def _steps_of_request(session: Path, request: Request) -> list[Step]:
-    """Return the steps from a calibrated session to the planes and the report."""
-    out = session / RECONSTRUCTIONS
+def _steps_of_planes(session: Path, request: Request | None) -> list[Step]:
+    """Return the step from a calibrated session to its planes, if any are asked for."""
+    if request is None:
+        return []
     folders = {name: folder_of_method(Path(RECONSTRUCTIONS), name, request.methods) for name in request.methods}
     return [
         Step(
@@ -118,16 +143,27 @@ def _steps_of_request(session: Path, request: Request) -> list[Step]:
                 str(folder / RECONSTRUCTION_FILE): request.options(name, "measured") for name, folder in folders.items()
             }
             | {f"{RECONSTRUCTIONS}/{OVERVIEW_FILE}": None},
-            make=lambda: reconstruct_and_report(load_session(session), out, request),
+            make=lambda: reconstruct_and_report(load_session(session), session / RECONSTRUCTIONS, request),
             needs=("noise", "geometry"),
             inputs=lambda: files_of_scene(session, "dark_scene"),
-        ),
+        )
+    ]
+
+
+def _steps_of_surface(session: Path, request: SurfaceRequest | None) -> list[Step]:
+    """Return the step from a calibrated session to its surface, if one is asked for."""
+    if request is None:
+        return []
+    out = session / RECONSTRUCTIONS
+    return [
         Step(
-            "report",
-            results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
-            make=lambda: write_report(out),
-            needs=("reconstruct",),
-        ),
+            "surface",
+            command="reconstruct",
+            results={f"{RECONSTRUCTIONS}/{SURFACE_FOLDER}/{SURFACE_FILE}": request.options("measured")},
+            make=lambda: surface_and_report(load_session(session), out / SURFACE_FOLDER, request, page_in=out),
+            needs=("noise", "geometry"),
+            inputs=lambda: files_of_scene(session, "dark_scene"),
+        )
     ]
 
 

@@ -13,8 +13,8 @@ from faintfield.pipelines.errors import MissingPackage
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import white_level
 from faintfield.pipelines.formats.results.records import PlaneRecord, ReconstructionRecord
-from faintfield.pipelines.formats.results.result_files import results_below
 from faintfield.pipelines.formats.results.stacks import planes_in_order, stack_scale
+from faintfield.pipelines.formats.results.surface import planes_below
 from faintfield.pipelines.pages.report_planes import method_title
 
 # Planes at fewer depths than this are a layer each; more, in equal steps, are one layer with a slider.
@@ -47,7 +47,7 @@ def show_planes(directory: Path) -> list[str]:
     MissingPackage
         napari is not installed.
     """
-    by_method = [_layers(directory, folder, result) for folder, result in results_below(directory).items()]
+    by_method = [_layers(directory, folder, result) for folder, result in planes_below(directory).items()]
     try:
         import napari
     except ImportError as failure:

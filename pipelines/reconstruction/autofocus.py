@@ -108,12 +108,12 @@ def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:
     if baseline_mm <= 0:
         raise NothingInFocus("all views were taken from one place, which tells no depths apart; give --depth-mm")
     depths = np.geomspace(0.3 * baseline_mm, 1000 * baseline_mm, _OVERLAP_DEPTHS)
-    shared = np.array([_overlap(loaded, depth) for depth in depths])
+    shared = np.array([overlap(loaded, depth) for depth in depths])
     best = int(shared.argmax())
     if shared[best] < _MIN_OVERLAP:
         raise NothingInFocus(
             f"the views share {shared[best]:.0%} of the reference view at most, at {depths[best]:.3g} mm; "
-            "give the range to search by --sweep-mm"
+            "give the range to search by --sweep-mm, or that of a surface by --depth-range-mm"
         )
     overlapping = shared >= _MIN_OVERLAP
     first = best - int(np.argmin(np.append(overlapping[best::-1], False))) + 1
@@ -121,7 +121,7 @@ def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:
     return float(depths[first]), float(min(depths[last], _DEPTHS * depths[first]))
 
 
-def _overlap(loaded: ElementalSet, depth_mm: float) -> float:
+def overlap(loaded: ElementalSet, depth_mm: float) -> float:
     """Return the share of the reference view's part of a plane that the views see, too, on average."""
     pixels = image_lattice(loaded.settings.camera.size_px)
     plane = fronto_parallel_rt_ref_plane(depth_mm)

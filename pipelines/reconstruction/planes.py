@@ -1,6 +1,8 @@
 """One colour of one plane: run a method on it and record how it went."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -188,6 +190,20 @@ def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
         for one, metric in zip(solutions, posed.fit(level_e).metric_of_each(iterate.plane), strict=True):
             one.sidecars["sigma"] = standard_deviation(one.plane, metric, choice.weight, penalty, generator)
     return solutions
+
+
+def solve_then_sigma(
+    operator: PlaneOperator, images: ElementalImages, settings: Settings
+) -> tuple[Solution, Callable[[], Image]]:
+    """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
+
+    That needs much memory, but neither the images nor the operator: the caller can drop these first.
+    """
+    objective = Objective.of(SceneProblem(operator, images), settings)
+    (solution,) = solve_pmlem(objective, replace(settings, uncertainty=False))
+    (metric,) = objective.posed.fit(objective.level_e).metric_of_each(solution.plane)
+    weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
+    return solution, partial(standard_deviation, solution.plane, metric, weight, objective.penalty, generator)
 
 
 def _certificate(iterate: PmlemIterate) -> Certificate:

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
@@ -27,7 +28,7 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.stacks import write_stack
-from faintfield.pipelines.formats.results.surface import SurfaceRecord
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
@@ -61,11 +62,18 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
 
     Planes that exist and were made from the same files with the same options are kept. An earlier report is removed,
     since it shows other planes. The caller has `out` to itself, see `formats.files.exclusive`.
+
+    Raises
+    ------
+    OutputExists
+        A depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
     """
     started = time.monotonic()
     depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
     request = replace(request, depths_mm=depths, methods=methods)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
+    if request.with_depth_map:
+        _refuse_surfaces(list(folders.values()))
     sweep = _sweep(loaded, folders, request)
     glance = look_at(loaded)  # here, as what is wrong with a set is to be found before its planes are made
     read_truth(loaded.folder)
@@ -97,6 +105,15 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     return Outcome(
         out=str(out), planes=records, focus=focus, best_focus=request.found, depth_map=depth_map, metrics=metrics
     )
+
+
+def _refuse_surfaces(folders: list[Path]) -> None:
+    """Refuse folders that hold a surface (OutputExists)."""
+    for folder in folders:
+        if (folder / SURFACE_FILE).exists():
+            raise OutputExists(
+                f"{folder}: holds a surface, whose files have the names of the depth map's; give another --out"
+            )
 
 
 def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: Runner) -> None:

@@ -24,7 +24,7 @@ class Step:
     Attributes
     ----------
     name : str
-        Name of the command that does it alone.
+        Its name in messages.
     results : dict of str to mapping or msgspec.Struct
         The options of each result file, if it is up to date; None if it records none.
     make : callable
@@ -33,6 +33,8 @@ class Step:
         Names of the steps whose results it reads.
     inputs : callable
         Returns the names of all files that it reads.
+    command : str, optional
+        Name of the command that does it alone, which its results record; by default that of the step.
     """
 
     name: str
@@ -40,6 +42,7 @@ class Step:
     make: Callable[[], object]
     needs: tuple[str, ...] = ()
     inputs: Callable[[], Sequence[str]] = tuple
+    command: str | None = None
 
 
 class StepOutcome(msgspec.Struct, frozen=True):
@@ -67,7 +70,8 @@ def run_steps(session: Path, steps: Sequence[Step]) -> RunOutcome:
     RigError, CalibrationError, ReconstructionError, InputError
         The first failure, after all other steps were done.
     """
-    for folder in (session, session / RECONSTRUCTIONS):
+    folders = {session, *((session / file).parent for step in steps for file in step.results)}
+    for folder in sorted(folders, reverse=True):  # the inner ones first, as one that is empty is not kept
         with exclusive(folder):
             pass  # removes what a killed command left there, even if all steps are up to date
     hashes = Hashes(session)
@@ -126,7 +130,8 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         if options is None:
             continue
         try:
-            difference = first_difference(read_content(session / file), provenance(step.name, options, inputs))
+            now = provenance(step.command or step.name, options, inputs)
+            difference = first_difference(read_content(session / file), now)
         except (MissingFile, *JSON_FAILURES):
             return f"{file} is damaged"
         if difference:

@@ -1,7 +1,8 @@
 """One picture, sharp everywhere, with the depth of each of its samples: `reconstruct --surface`."""
 
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -10,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import erfinv
 
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.files import remove_leftovers
+from faintfield.pipelines.errors import BadValue, OutputExists
+from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import read_current
@@ -25,23 +26,30 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
+from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
-from faintfield.pipelines.reconstruction.planes import Settings, mean_e, solve
+from faintfield.pipelines.reconstruction.planes import Settings, mean_e, solve_then_sigma
+from faintfield.pipelines.reconstruction.surface_depths import depths_of_set, limits_mm, naming_range
 from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
+from faintfield.recon.errors import NothingInFocus
+from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.collaborative import refined
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
-from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
+from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.held_out import Prediction
-from faintfield.recon.surface.pinhole_views import PinholeViews
-from faintfield.recon.surface.sweep import equal_steps, found_range
 
 # Fewest views whose halves can find depths by each other's light.
 _MIN_VIEWS = 4
+
+# Smallest side of a view: a smaller one has no room for the patches and windows in which detail is compared.
+_MIN_SIDE_PX = 24
+
+# Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
+# bytes of previews, film and page, which do not grow with the picture.
+_NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
 
 
 @dataclass(frozen=True)
@@ -62,17 +70,34 @@ class _Light:
     record: SolveRecord
 
 
-def reconstruct_surface(loaded: ElementalSet, out: Path, request: SurfaceRequest) -> SurfaceRecord:
+def reconstruct_surface(
+    loaded: ElementalSet, out: Path, request: SurfaceRequest, pages: Sequence[Path] = ()
+) -> SurfaceRecord:
     """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
 
     The caller has `out` to itself, see `formats.files.exclusive`.
 
+    Parameters
+    ----------
+    loaded : ElementalSet
+        The set.
+    out : Path
+        Folder of the files.
+    request : SurfaceRequest
+        The range of depths, and how the light is solved.
+    pages : sequence of Path
+        Pages that show an earlier surface: they are removed before its files are.
+
     Raises
     ------
-    WrongUsage
-        The set has too few views, or `out` holds a depth map whose files have the same names.
+    BadValue
+        The set has too few views, or too small ones.
+    OutputExists
+        `out` holds a depth map, whose files have the same names.
+    GeometryMismatch
+        The views share too little at the depths of a given range, or the range is too wide.
     NothingInFocus
-        No range of depths is given, and none is found.
+        All views were taken from one place; or no range of depths is given, and none is found.
     """
     started = time.monotonic()
     _check(loaded, out)
@@ -80,23 +105,23 @@ def reconstruct_surface(loaded: ElementalSet, out: Path, request: SurfaceRequest
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface
+    layouts = channel_layouts(loaded)
+    grid = plane_grid(loaded, 1.0)
+    require_room(out, _needed_bytes(grid.shape, len(layouts)))
+    range_mm = limits_mm(loaded, request)
     remove_leftovers(out)
     bins = default_bins(loaded)
-    views = luminance(loaded, bins)
-    nodes = _nodes(loaded)
-    far, near = _range(loaded, views, nodes, request)
-    depths = equal_steps(views, far, near)
-    inform(f"surface between {1 / near:.4g} and {1 / far:.4g} mm: comparing {len(depths)} depths")
-    estimate = estimate_surface(views, depths, nodes)
-    del views
-    inverse_depth = _enlarged(estimate.inverse_depth, plane_grid(loaded, 1.0).shape, bins)
-    lights = {
-        layout.name: _light(loaded, layout, inverse_depth, request.settings, out)
-        for layout in progress(channel_layouts(loaded), "picture")
-    }
+    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=request.depth_range_mm is None)
+    far, near = float(depths[0]), float(depths[-1])
+    inverse_depth = _enlarged(estimate.inverse_depth, grid.shape, bins)
+    with naming_range(far, near):
+        lights = {
+            layout.name: _light(loaded, layout, inverse_depth, request.settings, out)
+            for layout in progress(layouts, "picture")
+        }
     facts = SurfaceFacts(
         unit=request.unit,
-        searched=tuple(_in_unit(loaded, np.array([near, far]), request.unit).tolist()),
+        searched=(_in_unit(loaded, near, request.unit), _in_unit(loaded, far, request.unit)),
         range_found=request.depth_range_mm is None,
         depths=len(depths),
         bins_px=bins,
@@ -107,53 +132,61 @@ def reconstruct_surface(loaded: ElementalSet, out: Path, request: SurfaceRequest
         wall_time_s=time.monotonic() - started,
     )
     maps = _maps(loaded, inverse_depth, estimate, list(lights.values()), request.unit, bins)
+    for page in pages:
+        remove(page)
     return write_surface(out, maps, facts, origin)
 
 
 def _check(loaded: ElementalSet, out: Path) -> None:
     """Refuse sets and folders for which no surface can be made."""
-    views = len(loaded.settings.view)
+    views, size_px = len(loaded.settings.view), loaded.settings.camera.size_px
     if views < _MIN_VIEWS:
-        raise WrongUsage(f"--surface needs at least {_MIN_VIEWS} views, and the set has {views}; capture more nodes")
+        raise BadValue(
+            f"{loaded.folder}: has {views} views, and a surface needs at least {_MIN_VIEWS}; capture more nodes"
+        )
+    if min(size_px) < _MIN_SIDE_PX:
+        raise BadValue(
+            f"{loaded.folder}: has views of {size_px[0]} x {size_px[1]} px, and a surface needs at least "
+            f"{_MIN_SIDE_PX} px along each side; use larger ones"
+        )
+    if not np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
+        raise NothingInFocus(
+            f"{loaded.folder}: all views were taken from one place, which tells no depths apart; correct the poses, or "
+            "capture several nodes"
+        )
     if (out / DEPTH_MAP_FILE).exists():
-        raise WrongUsage(
+        raise OutputExists(
             f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
         )
 
 
-def _nodes(loaded: ElementalSet) -> NDArray[np.intp]:
-    """Return row and column of the node of each view; a row of views if no nodes are stated."""
-    views = loaded.settings.view
-    if any(view.node is None for view in views):
-        return np.array([(0, index) for index in range(len(views))])
-    return np.array([view.node for view in views])
-
-
-def _range(
-    loaded: ElementalSet, views: PinholeViews, nodes: NDArray[np.intp], request: SurfaceRequest
-) -> tuple[float, float]:
-    """Return the range of 1/depth, far and near, in 1/mm."""
-    if request.depth_range_mm is not None:
-        near_mm, far_mm = sorted(request.depth_range_mm)
-        return 1 / far_mm, 1 / near_mm
-    near_mm, far_mm = searched_range_mm(loaded)
-    return found_range(views, nodes, 1 / far_mm, 1 / near_mm)
+def _needed_bytes(shape: tuple[int, int], colours: int) -> int:
+    """Return about how much disk the results take, with the page that shows them again."""
+    numbers = _NUMBERS + _NUMBERS_PER_COLOUR * colours
+    of_sample = numbers * np.dtype(np.float32).itemsize + _POINT_BYTES + 3 * colours
+    return shape[0] * shape[1] * of_sample + _FIXED_BYTES
 
 
 def _light(
     loaded: ElementalSet, layout: ChannelLayout, inverse_depth: NDArray[np.floating], settings: Settings, out: Path
 ) -> _Light:
-    """Return one colour of the picture on a surface of known depth."""
+    """Return one colour of the picture on a surface of known depth; its σ is computed when the images are gone."""
     images = load_channel(loaded, layout, memory_or_file(out))
     factory = OperatorFactory(loaded, layout, images)
     operator = factory.of_surface(inverse_depth, plane_grid(loaded, 1.0))
-    solution = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
-    return _Light(
-        refined(operator, images, solution.plane),
-        solution.sidecars["sigma"],
-        operator.coverage(),
-        solution.record,
-    )
+    _name_blind_views(loaded, operator, len(layout.lattices))
+    solution, sigma = solve_then_sigma(operator, images, settings)
+    picture, visibility = refined(operator, images, solution.plane), operator.coverage()
+    del images, factory, operator
+    return _Light(picture, sigma(), visibility, solution.record)
+
+
+def _name_blind_views(loaded: ElementalSet, operator: SurfaceOperator, phases: int) -> None:
+    """Inform the user of views that see nothing of the surface: a pose may be wrong."""
+    blind = {int(view) // phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
+    if blind:
+        first = loaded.settings.view[min(blind)].image
+        inform(f"{len(blind)} views see nothing of the surface, {first} for one; are their poses right?")
 
 
 def _channel(name: str, light: _Light) -> SurfaceChannel:
@@ -172,8 +205,8 @@ def _channel(name: str, light: _Light) -> SurfaceChannel:
 
 
 def _held_out(prediction: Prediction | None) -> HeldOutRecord | None:
-    """Return the record of the views that were left out."""
-    if prediction is None:
+    """Return the record of the views that were left out, None if there are none, or none sees the surface."""
+    if prediction is None or not prediction.pixels:
         return None
     return HeldOutRecord(
         views=prediction.views.tolist(),
@@ -214,14 +247,14 @@ def _maps(
     )
 
 
-def _in_unit(
-    loaded: ElementalSet, inverse_depth: NDArray[np.float64], unit: Literal["mm", "px"]
-) -> NDArray[np.float64]:
+def _in_unit[Numbers: (float, NDArray[np.float64])](
+    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px"]
+) -> Numbers:
     """Return depths in mm, or disparities in px from one node to the next."""
     if unit == "mm":
         return 1 / inverse_depth
-    zero, one = (1 / loaded.depth_of_disparity(disparity_px) for disparity_px in (-1.0, -2.0))
-    return -1 - (inverse_depth - zero) / (one - zero)
+    at_zero, slope = loaded.inverse_depth_of_disparity()
+    return (inverse_depth - at_zero) / slope
 
 
 def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> NDArray[np.float64]:

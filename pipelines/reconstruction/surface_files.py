@@ -34,6 +34,12 @@ from faintfield.recon.operator.grid import PlaneGrid
 
 POINTS, FILM = "surface.ply", "parallax.webp"
 
+# The depth and its standard deviation, by unit.
+_DEPTH_FILES = {
+    "mm": ("depth_mm.tiff", "depth_sigma_mm.tiff"),
+    "px": ("disparity_px.tiff", "disparity_sigma_px.tiff"),
+}
+
 
 @dataclass(frozen=True)
 class SurfaceMaps:
@@ -95,7 +101,8 @@ def write_surface(
         A file cannot be written; there is then no record, so that nothing vouches for the others.
     """
     remove(folder / SURFACE_FILE)
-    for name in (POINTS, FILM):
+    depths = [name for of_unit in _DEPTH_FILES.values() for name in of_unit]  # an earlier surface may have another unit
+    for name in (POINTS, FILM, *depths, *map(preview_name, depths)):
         remove(folder / name)
     levels = grey_levels(maps.picture, white_level(maps.picture))
     points = _write_points(folder, maps, levels) if facts.unit == "mm" else None
@@ -110,14 +117,14 @@ def write_surface(
 
 def _record(maps: SurfaceMaps, facts: SurfaceFacts, points: str | None, film: str | None) -> SurfaceRecord:
     """Return the record of a surface; its numbers are those of the maps."""
-    depth = "depth_{}mm.tiff" if facts.unit == "mm" else "disparity_{}px.tiff"
+    depth, depth_sigma = _DEPTH_FILES[facts.unit]
     known = np.isfinite(maps.depth)
     return SurfaceRecord(
         **msgspec.structs.asdict(facts),
         picture="picture.tiff",
         picture_sigma="picture_sigma.tiff",
-        depth=depth.format(""),
-        depth_sigma=depth.format("sigma_"),
+        depth=depth,
+        depth_sigma=depth_sigma,
         depth_confidence="depth_confidence.tiff",
         visibility="visibility.tiff",
         points=points,

@@ -15,6 +15,9 @@ SURFACE_FOLDER = "surface"
 
 _NUMBER = r"(-?\d+(?:\.\d*)?)"
 
+# Depths beyond this look like infinity to any camera, and sums of theirs overflow.
+_FARTHEST_MM = 1e9
+
 
 @dataclass(frozen=True)
 class SurfaceRequest:
@@ -78,20 +81,29 @@ class SurfaceSelection:
         return SurfaceRequest((near_mm, far_mm), "px", self.settings)
 
 
-def select_surface(depth_range_mm: str | None, disparity_range_px: str | None, settings: Settings) -> SurfaceSelection:
-    """Return the surface that options select.
+def select_surface(
+    wanted: bool, depth_range_mm: str | None, disparity_range_px: str | None, settings: Settings
+) -> SurfaceSelection | None:
+    """Return the surface that options select, None if none is `wanted`.
 
     Raises
     ------
     WrongUsage
-        A range is no range, or two are given.
+        A range is no range, two are given, or one although no surface is wanted.
     """
+    if not wanted:
+        if depth_range_mm or disparity_range_px:
+            raise WrongUsage("a range of depths or disparities is that of a surface; add --surface")
+        return None
     if depth_range_mm and disparity_range_px:
         raise WrongUsage("--depth-range-mm and --disparity-range-px say the same of a surface; give one of them")
     range_mm = _ends("--depth-range-mm", depth_range_mm, "400:1500") if depth_range_mm else None
     range_px = _ends("--disparity-range-px", disparity_range_px, "-3.6:1") if disparity_range_px else None
-    if range_mm is not None and range_mm[0] <= 0:
-        raise WrongUsage(f"--depth-range-mm {depth_range_mm}: depths are positive; give NEAR:FAR, such as 400:1500")
+    if range_mm is not None and not 0 < range_mm[0] < range_mm[1] <= _FARTHEST_MM:
+        raise WrongUsage(
+            f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
+            "NEAR:FAR, such as 400:1500"
+        )
     return SurfaceSelection(range_mm, range_px, settings)
 
 

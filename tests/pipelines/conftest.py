@@ -14,7 +14,10 @@ import tomli_w
 from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
-from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.image_files import encoded, write_frame
+from faintfield.pipelines.reconstruction import planes, surface, surface_depths, surface_files
+from faintfield.recon.surface.estimate import SurfaceEstimate
+from tests.pipelines.surfaces import Searches, found_at_once
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]
@@ -61,6 +64,24 @@ def simulated_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def scene(simulated_scene: Path, tmp_path: Path) -> Path:
     """A copy of the small dark set that a test may change."""
     return Path(shutil.copytree(simulated_scene, tmp_path / "scene"))
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
+    """Replace what is slow: the search for depths, σ, refinement and pictures; return what the search is given."""
+    given: Searches = []
+
+    def search(views: Any, inverse_depths: NDArray[np.float64], nodes: NDArray[np.intp]) -> SurfaceEstimate:
+        given.append((views, inverse_depths, nodes))
+        return found_at_once(views)
+
+    preview = encoded(np.zeros((4, 4), np.uint8), ".png")
+    monkeypatch.setattr(surface_depths, "estimate_surface", search)
+    monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
+    monkeypatch.setattr(surface, "refined", lambda operator, images, plane: plane)
+    monkeypatch.setattr(planes, "standard_deviation", lambda plane, *_: np.ones_like(plane))
+    monkeypatch.setattr(surface_files, "render_parallax", lambda *_: [np.zeros((4, 4), np.uint8)] * 2)
+    return given
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.records import Certificate, WeightScore
@@ -15,6 +16,14 @@ from faintfield.pipelines.formats.results.surface import (
 )
 from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.surface.estimate import SurfaceEstimate
+from faintfield.recon.surface.pinhole_views import PinholeViews
+
+# What a search for depths is given: the views, the 1/depths to compare, and the nodes.
+type Searches = list[tuple[PinholeViews, NDArray[np.float64], NDArray[np.intp]]]
+
+# What the search that stands in for the slow one finds everywhere.
+FOUND_MM, FOUND_CONFIDENCE = 600.0, 0.5
 
 SHAPE, PITCH = (90, 120), 1 / 150
 GRID = PlaneGrid(SHAPE, PITCH, (-59.5 * PITCH, -44.5 * PITCH))
@@ -84,3 +93,10 @@ def write_example(folder: Path, *, unit: str = "mm", colours: int = 1) -> Surfac
     channels = ("grey",) if colours == 1 else ("red", "green", "blue")
     origin = provenance("reconstruct", OPTIONS, {"elemental.toml": "0" * 64})
     return write_surface(folder, surface_maps(colours=colours), surface_facts(unit, channels), origin)
+
+
+def found_at_once(views: PinholeViews) -> SurfaceEstimate:
+    """Return one depth everywhere, with one probability."""
+    shape = views.grid.shape
+    depths, confidence = np.full(shape, 1 / FOUND_MM), np.full(shape, FOUND_CONFIDENCE, np.float32)
+    return SurfaceEstimate(depths, confidence, rounds=2, prediction=None)

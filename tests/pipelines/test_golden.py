@@ -1,10 +1,8 @@
 """Results as they were first written: files that others read stay the same, key by key."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
-from typing import Any
 
 import msgspec
 import pytest
@@ -17,6 +15,8 @@ from faintfield.pipelines.formats.results.records import (
     PlaneFileRecord,
     ReconstructionRecord,
 )
+from faintfield.pipelines.formats.results.surface import SurfaceFileRecord
+from tests.pipelines.forms import form_of_result
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -29,6 +29,7 @@ KINDS: dict[str, type[msgspec.Struct]] = {
     "depth_map": DepthMapFileRecord,
     "metrics": Metrics,
     "overview": Overview,
+    "surface": SurfaceFileRecord,
 }
 
 PAIR = ("--depth-mm", 500, "--depth-mm", 700)
@@ -49,25 +50,6 @@ FRESH: dict[str, tuple[str, tuple[object, ...]]] = {
 
 def _kinds_of_files() -> list[tuple[Path, type[msgspec.Struct]]]:
     return [(path, kind) for name, kind in KINDS.items() for path in sorted(GOLDEN.glob(f"{name}_*.json"))]
-
-
-def _form(value: Any) -> Any:
-    """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements."""
-    if isinstance(value, dict):
-        return [(key, _form(one)) for key, one in value.items()]
-    if isinstance(value, list):
-        forms = [_form(one) for one in value]
-        return [form for index, form in enumerate(forms) if form not in forms[:index]]
-    return type(value).__name__
-
-
-def _comparable(path: Path) -> Any:
-    """Return the form of a result, without the names of its inputs and without its digest, which came later."""
-    content = json.loads(path.read_bytes())
-    content.pop("record_sha256", None)
-    if "inputs" in content:
-        content["inputs"] = sorted({type(digest).__name__ for digest in content["inputs"].values()})
-    return _form(content)
 
 
 @pytest.mark.parametrize(("path", "kind"), [pytest.param(*pair, id=pair[0].stem) for pair in _kinds_of_files()])
@@ -98,4 +80,4 @@ def test_a_fresh_result_has_the_form_of_its_golden_file(
 ) -> None:
     file, options = FRESH[name]
     done("reconstruct", golden_scene, "--out", tmp_path, *options)
-    assert _comparable(tmp_path / file) == _comparable(GOLDEN / f"{name}.json")
+    assert form_of_result(tmp_path / file) == form_of_result(GOLDEN / f"{name}.json")

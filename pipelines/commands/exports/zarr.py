@@ -6,7 +6,7 @@ import msgspec
 
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.zarr import plane_stack, require_zarr, write_zarr
-from faintfield.pipelines.formats.results.result_files import results_below
+from faintfield.pipelines.formats.results.surface import planes_below
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -35,7 +35,7 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Za
         Replace an earlier export in OUT.
     """
     require_zarr()
-    results = results_below(directory)
+    results = planes_below(directory)
     if len(results) > 1:
         names = ", ".join(str(folder) for folder in results)
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")

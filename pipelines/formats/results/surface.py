@@ -16,11 +16,12 @@ from faintfield.pipelines.formats.results.records import (
     Count,
     FileName,
     Poses,
+    ReconstructionRecord,
     Sha256,
     WeightScore,
     preview_name,
 )
-from faintfield.pipelines.formats.results.result_files import file_within, files_below, read_result
+from faintfield.pipelines.formats.results.result_files import file_within, files_below, read_result, results_below
 
 SURFACE_FILE = "surface.json"
 
@@ -183,6 +184,22 @@ class SurfaceFileRecord(Provenance[SurfaceOptions], frozen=True):
     def files(self) -> list[str]:
         """Names of all files beside the record, previews included."""
         return self.surface.files
+
+
+def planes_below(directory: Path) -> dict[Path, ReconstructionRecord]:
+    """Return each reconstruction.json in a folder and below it, by its folder: for what shows planes alone.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        There is none, perhaps because a surface was reconstructed; or one that cannot be read.
+    """
+    if not results_below(directory, required=False) and surfaces_below(directory):
+        raise MissingFile(
+            f"{directory}: holds a surface and no planes; open its TIFFs or surface.ply by other programs, or "
+            "reconstruct planes"
+        )
+    return results_below(directory)
 
 
 def surfaces_below(directory: Path) -> dict[Path, SurfaceFileRecord]:

@@ -133,17 +133,10 @@ class ElementalSet:
         BadValue
             The views have no nodes, or no plane in front of the cameras has this disparity.
         """
-        camera = self.settings.camera
-        views = self.settings.view
-        nodes = np.array([view.node or (np.nan, np.nan) for view in views], float)
-        if np.isnan(nodes).any():
-            raise BadValue(f"{self.folder}: disparities need the node of every view; give --depth-mm instead")
-        steps = (nodes - nodes[self.reference_view])[:, ::-1]
-        centres = self.principal_points_px()
-        shift_px = centres - centres[self.reference_view]
-        moved_px = self.poses_rt_cam_ref[:, 3:5] * [camera.fx_px, camera.fy_px]
-        inverse_depth = np.sum((disparity_px * steps - shift_px) * moved_px) / max(float(np.sum(moved_px**2)), 1e-30)
+        at_zero, slope = self.inverse_depth_of_disparity()
+        inverse_depth = at_zero + slope * disparity_px
         if not inverse_depth > 0:
+            steps, shift_px = self._steps_and_shifts()
             at_infinity_px = np.sum(steps * shift_px) / max(float(np.sum(steps**2)), 1e-30)
             raise BadValue(
                 f"no plane in front of the cameras has a disparity of {disparity_px:g} px from node to node; "
@@ -151,7 +144,32 @@ class ElementalSet:
                 "points (cameras that move right see near points move left, by a negative number), or import pictures "
                 "that were aligned on a plane again, with its --disparity-px"
             )
-        return float(1 / inverse_depth)
+        return 1 / inverse_depth
+
+    def inverse_depth_of_disparity(self) -> tuple[float, float]:
+        """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity.
+
+        Raises
+        ------
+        BadValue
+            The views have no nodes.
+        """
+        steps, shift_px = self._steps_and_shifts()
+        camera = self.settings.camera
+        moved_px = self.poses_rt_cam_ref[:, 3:5] * [camera.fx_px, camera.fy_px]
+        total = max(float(np.sum(moved_px**2)), 1e-30)
+        return float(-np.sum(shift_px * moved_px)) / total, float(np.sum(steps * moved_px)) / total
+
+    def _steps_and_shifts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return for each view the columns and rows of nodes from the reference, and the shift of its principal point.
+
+        Both are arrays (view, 2): right, down.
+        """
+        nodes = np.array([view.node or (np.nan, np.nan) for view in self.settings.view], float)
+        if np.isnan(nodes).any():
+            raise BadValue(f"{self.folder}: disparities need the node of every view; give depths in mm instead")
+        centres = self.principal_points_px()
+        return (nodes - nodes[self.reference_view])[:, ::-1], centres - centres[self.reference_view]
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""

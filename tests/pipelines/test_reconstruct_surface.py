@@ -1,0 +1,210 @@
+"""`reconstruct --surface`: what it makes, keeps and makes again, and what it refuses."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats import frames as frames_module
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.reconstruction import surface, surface_files
+from tests.pipelines.forms import form_of_result
+from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
+from tests.pipelines.test_golden import GOLDEN
+
+type Command = Callable[..., CompletedProcess[str]]
+type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+
+RANGE = ("--depth-range-mm", "400:900")
+FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((folder / "surface.json").read_bytes())
+    return record
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A scene of surfaces, and what is made of it with nothing replaced; to be read only."""
+    folder = tmp_path_factory.mktemp("real")
+    small = ("--size-px", "96", "72", "--rows", "3", "--columns", "3", "--snr", "4")
+    assert run(["simulate", str(folder / "set"), "--objects", "surfaces", *small]) == 0
+    assert run(["reconstruct", str(folder / "set"), "--surface", *RANGE, "--out", str(folder / "out")]) == 0
+    return folder / "set", folder / "out"
+
+
+def test_a_new_surface_has_the_form_of_the_golden_one(real: tuple[Path, Path]) -> None:
+    assert form_of_result(real[1] / "surface.json") == form_of_result(GOLDEN / "surface_set.json")
+
+
+def test_a_second_call_keeps_all_files_and_prints_the_same_record(
+    real: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
+) -> None:
+    out = Path(shutil.copytree(real[1], tmp_path / "out"))
+    (out / ".picture.tiff.0123abcd.unfinished").write_bytes(b"left by a command that was killed")
+    before = {path.name: path.read_bytes() for path in real[1].iterdir() if path.name != "report.html"}
+
+    def refuse(file: object, path: Path, *_: object) -> None:
+        raise AssertionError(f"{path} is decoded")
+
+    flat = read_frame(real[0] / "flat.tiff")
+    monkeypatch.setattr(frames_module, "_decoded", refuse)
+    monkeypatch.setattr("faintfield.pipelines.formats.sets.elemental_set.read_frame", lambda *_: flat)
+    outcome = json.loads(done("reconstruct", real[0], "--surface", *RANGE, "--out", out, "--json").stdout)
+    assert outcome["surface"] == _record(real[1])["surface"]
+    assert (outcome["planes"], outcome["report"]) == ([], str(out / "report.html"))
+    assert {path.name: path.read_bytes() for path in out.iterdir() if path.name != "report.html"} == before
+
+
+def test_the_maps_follow_from_depth_and_confidence(seen: Searches, scene: Path, done: Command) -> None:
+    out = scene / "out"
+    done("reconstruct", scene, "--surface", *FAST, "--out", out)
+    np.testing.assert_allclose(tifffile.imread(out / "depth_mm.tiff"), FOUND_MM, rtol=1e-6)
+    # Half of a normal distribution lies within 0.6745 σ, and here within 2 %
+    np.testing.assert_allclose(tifffile.imread(out / "depth_sigma_mm.tiff"), 0.02 * FOUND_MM / 0.67449, rtol=1e-4)
+    np.testing.assert_allclose(tifffile.imread(out / "depth_confidence.tiff"), FOUND_CONFIDENCE)
+    surface_record = _record(out)["surface"]
+    assert (surface_record["known_share"], surface_record["sure_share"], surface_record["held_out"]) == (1, 0, None)
+    assert surface_record["searched"] == pytest.approx([400, 900])
+    assert len(seen) == 1
+
+
+def test_disparities_are_those_of_the_nodes(seen: Searches, scene: Path, done: Command) -> None:
+    """The nodes are 50 mm apart and f is 120 px: 10 px at 600 mm, up to the errors of the simulated poses."""
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    options = ("--disparity-range-px=-15:-5", *FAST[2:])
+    done("reconstruct", scene, "--surface", *options, "--out", scene / "out")
+    record = _record(scene / "out")["surface"]
+    np.testing.assert_allclose(tifffile.imread(scene / "out" / "disparity_px.tiff"), -10, rtol=0.03)
+    assert record["searched"] == pytest.approx([-15, -5])
+    assert (record["unit"], record["points"]) == ("px", None)
+    left = {path.name for path in (scene / "out").glob("*") if "_mm" in path.name or path.suffix == ".ply"}
+    assert left == set(), "files of the earlier unit"
+
+
+@pytest.mark.parametrize(
+    "change", [("--depth-range-mm", "400:1000"), ("--penalty-weight", 0.6), ("--passes", 3), ("--penalty", "none")]
+)
+def test_other_options_make_it_again(change: tuple[object, ...], seen: Searches, scene: Path, done: Command) -> None:
+    options: dict[object, object] = dict(zip(FAST[::2], FAST[1::2], strict=True))
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    done("reconstruct", scene, "--surface", "--depth-range-mm", "900:400", *FAST[2:], "--out", scene / "out")
+    assert len(seen) == 1, "the same range from its other end"
+    changed = {**options, change[0]: change[1]}
+    done("reconstruct", scene, "--surface", *(w for it in changed.items() for w in it), "--out", scene / "out")
+    assert len(seen) == 2
+
+
+def test_another_pixel_or_a_damaged_file_makes_it_again(seen: Searches, scene: Path, done: Command) -> None:
+    call = ("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    done(*call)
+    picture = (scene / "out" / "picture.tiff").read_bytes()
+    (scene / "out" / "picture.tiff").write_bytes(picture[:-1] + bytes([picture[-1] ^ 1]))
+    assert "picture.tiff was altered; it is made again" in done(*call).stderr
+    assert (scene / "out" / "picture.tiff").read_bytes() == picture
+    pixels = read_frame(scene / "view_r0_c0.tiff").pixels_dn.copy()
+    pixels[3, 4] += 1
+    write_frame(scene / "view_r0_c0.tiff", pixels)
+    done(*call)
+    assert len(seen) == 3
+
+
+class TestInterrupted:
+    """An interrupt leaves an earlier surface whole, or nothing that vouches for anything."""
+
+    @pytest.mark.parametrize(
+        ("module", "name", "calls", "survives"),
+        [
+            (surface, "load_channel", 1, True),
+            (surface, "refined", 1, True),
+            (surface_files, "write_points", 1, False),
+            (surface_files, "write_plane", 4, False),
+            (surface_files, "write_record", 1, False),
+        ],
+    )
+    def test_at_any_stage(
+        self, module: Any, name: str, calls: int, survives: bool, seen: Searches, scene: Path,
+        monkeypatch: pytest.MonkeyPatch, faintfield: Command, done: Command,
+    ) -> None:  # fmt: skip
+        out, again = scene / "out", ("--depth-range-mm", "400:950", *FAST[2:])
+        done("reconstruct", scene, "--surface", *FAST, "--out", out)
+        left = [calls]
+        whole = getattr(module, name)
+
+        def interrupted(*arguments: object, **named: object) -> object:
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+            return whole(*arguments, **named)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(module, name, interrupted)
+            ended = faintfield("reconstruct", scene, "--surface", *again, "--out", out)
+        assert (ended.returncode, left) == (1, [0])
+        assert (out / "surface.json").exists() == (out / "report.html").exists() == survives
+        if survives:
+            done("verify", out)
+        assert not list(out.glob(".*"))
+        done("reconstruct", scene, "--surface", *again, "--out", out)
+        done("verify", out, "--inputs", scene)
+        assert _record(out)["options"]["depth_range_mm"] == [400, 950]
+
+
+class TestFolder:
+    """A surface and other results in one folder."""
+
+    def test_planes_and_a_surface_are_shown_on_one_page(self, seen: Searches, scene: Path, done: Command) -> None:
+        done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+        done("reconstruct", scene, "--depth-mm", 500, "--passes", 2, "--out", scene / "out")
+        done("verify", scene / "out", "--inputs", scene)
+        done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+        assert len(seen) == 1
+        page = (scene / "out" / "report.html").read_text()
+        assert 'id="surface"' in page
+        assert "500 mm" in page
+
+    def test_a_depth_map_and_a_surface_refuse_each_other(
+        self, seen: Searches, scene: Path, faintfield: Command, done: Command
+    ) -> None:
+        sweep = ("--sweep-mm", "400:800:5", "--method", "backprojection", "--depth-map")
+        for first, second in ((("--surface", *FAST), sweep), (sweep, ("--surface", *FAST))):
+            out = scene / first[0].strip("-")
+            done("reconstruct", scene, *first, "--out", out)
+            before = {path.name for path in out.iterdir()}
+            refused = faintfield("reconstruct", scene, *second, "--out", out)
+            assert refused.returncode == 1
+            assert "OutputExists" in refused.stderr
+            assert "give another --out" in refused.stderr
+            assert {path.name for path in out.iterdir()} == before
+            done("verify", out)
+
+    @pytest.mark.parametrize("command", [("view",), ("export", "zarr")])
+    def test_what_shows_planes_says_that_there_are_none(
+        self, command: tuple[str, ...], real: tuple[Path, Path], tmp_path: Path, faintfield: Command
+    ) -> None:
+        if command == ("export", "zarr"):
+            pytest.importorskip("zarr")
+        out = [tmp_path / "zarr"] if command == ("export", "zarr") else []
+        ended = faintfield(*command, real[1], *out)
+        assert ended.returncode == 1
+        assert "holds a surface and no planes; open its TIFFs or surface.ply" in ended.stderr
+
+    def test_a_full_disk_is_said_before_a_view_is_read(
+        self, seen: Searches, scene: Path, monkeypatch: pytest.MonkeyPatch, faintfield: Command
+    ) -> None:
+        free = shutil.disk_usage(scene)._replace(free=10_000_000)
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: free)
+        ended = faintfield("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+        assert ended.returncode == 1
+        assert "DiskFull" in ended.stderr
+        assert "10.0 MB are free" in ended.stderr
+        assert (seen, (scene / "out").exists()) == ([], False)

@@ -1,0 +1,119 @@
+"""The surface of a session: a step of `faintfield run`, and the same by `reconstruct`."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.commands.reconstruct import reconstruct
+from faintfield.pipelines.commands.run import run
+from faintfield.pipelines.commands.verify import verify
+from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.recon.errors import NothingInFocus
+from tests.pipelines.sessions import captured, rig_toml
+from tests.pipelines.surfaces import FOUND_MM, Searches
+
+RANGE = "400:900"
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session with noise, geometry and one plane, to be read only."""
+    session = captured(tmp_path_factory.mktemp("calibrated"), rig_toml())
+    run(session, depth_mm=[700.0], method=["backprojection"], penalty_weight=0.5, passes=2)
+    return session
+
+
+@pytest.fixture
+def session(calibrated: Path, tmp_path: Path) -> Path:
+    """A copy of the session that a test may change."""
+    return Path(shutil.copytree(calibrated, tmp_path / "session"))
+
+
+def _ran(session: Path, *, depth_mm: list[float] | None = None, depth_range_mm: str = RANGE) -> list[str]:
+    planes: dict[str, Any] = {"depth_mm": depth_mm, "method": ["backprojection"]} if depth_mm else {}
+    outcome = run(session, surface=True, depth_range_mm=depth_range_mm, penalty_weight=0.5, passes=2, **planes)
+    return [step.step for step in outcome.steps if step.ran]
+
+
+def test_a_surface_is_made_beside_the_planes_only_if_it_is_out_of_date(seen: Searches, session: Path) -> None:
+    out = session / "reconstructions"
+    assert _ran(session, depth_mm=[700.0]) == ["surface"]
+    page = (out / "report.html").read_text()
+    assert 'id="surface"' in page
+    assert "700 mm" in page
+    np.testing.assert_allclose(tifffile.imread(out / "surface" / "depth_mm.tiff"), FOUND_MM, rtol=1e-6)
+    record = json.loads((out / "surface" / "surface.json").read_bytes())
+    assert (record["command"], record["options"]["poses"]) == ("reconstruct", "measured")
+    assert verify(session).results is not None
+    assert _ran(session, depth_mm=[700.0]) == []
+    assert _ran(session, depth_mm=[700.0], depth_range_mm="900:400") == []
+    assert _ran(session, depth_mm=[500.0]) == ["reconstruct"]
+    assert len(seen) == 1
+    assert _ran(session, depth_mm=[500.0], depth_range_mm="400:1000") == ["surface"]
+    frame = next((session / "frames").glob("*_dark_scene_0_r0_c0_*"))
+    pixels = read_frame(frame).pixels_dn.copy()
+    pixels[10, 20] += 7
+    write_frame(frame, pixels)
+    assert _ran(session, depth_mm=[500.0], depth_range_mm="400:1000") == ["reconstruct", "surface"]
+    (out / "surface" / "visibility.tiff").unlink()
+    assert _ran(session, depth_mm=[500.0], depth_range_mm="400:1000") == ["surface"]
+
+
+def test_a_surface_alone_is_enough(seen: Searches, session: Path) -> None:
+    shutil.rmtree(session / "reconstructions")
+    assert _ran(session) == ["surface"]
+    assert {path.name for path in (session / "reconstructions").iterdir()} == {"surface", "report.html"}
+    assert _ran(session) == []
+    (session / "reconstructions" / "report.html").unlink()
+    assert _ran(session) == ["report"]
+
+
+def test_run_and_reconstruct_make_the_same_surface(seen: Searches, session: Path) -> None:
+    reconstruct(session, surface=True, depth_range_mm=RANGE, penalty_weight=0.5, passes=2)
+    assert _ran(session) == []
+    assert not (session / "reconstructions" / "surface" / "report.html").exists()
+
+
+def test_an_interrupt_leaves_no_page_of_an_earlier_surface(
+    seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _ran(session)
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("faintfield.pipelines.commands.reconstruct.write_report", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            _ran(session, depth_range_mm="400:1000")
+    assert not (session / "reconstructions" / "report.html").exists()
+    (session / "reconstructions" / "surface" / ".picture.tiff.0123abcd.unfinished").touch()
+    assert _ran(session, depth_range_mm="400:1000") == ["report"]
+    assert not list((session / "reconstructions" / "surface").glob(".*"))
+
+
+def test_planes_are_kept_if_no_surface_is_found(seen: Searches, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(*_: object) -> None:
+        raise NothingInFocus("nothing there; use more light")
+
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.surface_depths.estimate_surface", nothing)
+    with pytest.raises(NothingInFocus, match=r"more light; mend that .* still to be done: surface, report"):
+        _ran(session, depth_mm=[500.0])
+    assert "500 mm" in (session / "reconstructions" / "report.html").read_text()
+    assert not (session / "reconstructions" / "surface").exists()
+
+
+def test_options_without_effect_are_wrong_usage(calibrated: Path) -> None:
+    with pytest.raises(WrongUsage, match="add --surface"):
+        run(calibrated, depth_mm=[500.0], depth_range_mm=RANGE)
+    with pytest.raises(WrongUsage, match="or give --surface"):
+        run(calibrated)
+    with pytest.raises(WrongUsage, match="without options of planes"):
+        run(calibrated, surface=True, method=["mlem"])
