@@ -71,7 +71,7 @@ def depths_of_set(
     NothingInFocus
         Nothing is found in the range.
     """
-    views, nodes = luminance(loaded, bins), _nodes(loaded)
+    views, nodes = luminance(loaded, bins), nodes_of(loaded)
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(far, near):
         if find_range:
@@ -91,7 +91,7 @@ def naming_range(far: float, near: float) -> Iterator[None]:
         raise GeometryMismatch(f"surface between {1 / near:.4g} and {1 / far:.4g} mm: {failure}") from failure
 
 
-def _nodes(loaded: ElementalSet) -> NDArray[np.intp]:
+def nodes_of(loaded: ElementalSet) -> NDArray[np.intp]:
     """Return row and column of the node of each view; a row of views if no nodes are stated."""
     views = loaded.settings.view
     if any(view.node is None for view in views):

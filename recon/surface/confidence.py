@@ -15,8 +15,8 @@ SURE, UNKNOWN_BELOW = 0.9, 0.05
 # Samples from an edge beyond which it does not matter, and within which depths often are those of the other side.
 _FAR_FROM_EDGE, _BESIDE_EDGE = 12.0, 4.0
 
-# Samples from the border of the picture, and steps from the ends of the range, beyond which these do not matter.
-_FAR_FROM_BORDER, _FAR_FROM_END = 10.0, 2.0
+# Samples from the border of the picture beyond which it does not matter.
+_FAR_FROM_BORDER = 10.0
 
 # Sharpness of the costs as a probability.
 _SHARPNESS = 0.1
@@ -25,7 +25,7 @@ _SHARPNESS = 0.1
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-12.285, 0.404, 0.642, 3.037, 0.682, -1.330, 1.248, 9.319)
+COEFFICIENTS = (-2.784, 0.489, 0.623, 2.991, 0.733, -1.685, 1.188)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
@@ -58,7 +58,7 @@ def features(
 
     In order: one; the log odds of the depths within the tolerance, by the costs; by how much alternatives cost more
     (logarithm); the distance to the next edge of something nearer; whether one is close; the tolerance in steps
-    (logarithm); the distances to the border of the picture, and to the ends of the range.
+    (logarithm); the distance to the border of the picture.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
@@ -76,7 +76,6 @@ def features(
     edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
     rows, columns = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in index.shape)
     border = np.minimum(np.minimum(rows[:, np.newaxis], columns), _FAR_FROM_BORDER)
-    end = np.minimum(np.minimum(index, costs.shape[2] - 1 - index), _FAR_FROM_END)
     return np.stack(
         [
             np.ones_like(q),
@@ -86,6 +85,5 @@ def features(
             edge < _BESIDE_EDGE,
             np.log(tolerance),
             border / _FAR_FROM_BORDER,
-            end / _FAR_FROM_END,
         ]
     )

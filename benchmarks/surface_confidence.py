@@ -1,0 +1,88 @@
+"""Fit the probability that a depth is right: the coefficients of `recon.surface.confidence`.
+
+For each set, depths are found in twice the range of the true ones. A sample counts with its features, and with whether
+its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal prior.
+
+Call `python -m benchmarks.surface_confidence SET=TRUTH …`, with a folder of elemental.toml and one that holds
+true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy on other scenes.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
+from faintfield.pipelines.reconstruction.surface import nodes_of
+from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
+from faintfield.recon.surface.estimate import first_depths, halves, next_depths
+from faintfield.recon.surface.evidence import DepthEvidence
+from faintfield.recon.surface.sweep import equal_steps
+
+# Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
+_ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
+
+# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 % in
+# difficult ones; this asks less of the clear ones.
+_SHIFT = 0.6
+
+
+def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
+    loaded = load_set(folder)
+    bins = default_bins(loaded)
+    views, nodes = luminance(loaded, bins), nodes_of(loaded)
+    true_mm = tifffile.imread(truth / "true_depth_mm.tiff")[bins // 2 :: bins, bins // 2 :: bins]
+    true_mm = true_mm[: views.grid.shape[0], : views.grid.shape[1]]
+    depths = equal_steps(views, 1 / (1.2 * float(np.nanmax(true_mm))), 1 / (0.85 * float(np.nanmin(true_mm))))
+    evidence = DepthEvidence(views, depths, halves(nodes))
+    index = first_depths(evidence)
+    for _ in range(_ROUNDS):
+        index, costs = next_depths(evidence, evidence.explained(index))
+    found_mm = 1 / np.interp(index, np.arange(len(depths)), depths)
+    right = np.abs(found_mm / true_mm - 1) < RIGHT_WITHIN
+    thin = np.s_[..., ::_STRIDE, ::_STRIDE]
+    measured = features(index, costs, depths)[thin]
+    return measured.reshape(len(measured), -1).T, right[thin].ravel()
+
+
+def fitted(sets: Sequence[tuple[NDArray[np.float64], NDArray[np.bool_]]]) -> NDArray[np.float64]:
+    """Return the coefficients (feature,) under which sets are most likely, all sets counting alike."""
+    x = np.concatenate([features for features, _ in sets])
+    sign = np.concatenate([2.0 * right - 1 for _, right in sets])
+    weight = np.concatenate([np.full(len(right), 1 / (len(right) * len(sets))) for _, right in sets])
+
+    def loss(a: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        margin = (x @ a) * sign
+        slope = -(x.T @ (weight * sign / (1 + np.exp(margin))))
+        prior = np.concatenate([[0], a[1:]])
+        return float(weight @ np.logaddexp(0, -margin)) + _PRIOR * float(prior @ prior), slope + 2 * _PRIOR * prior
+
+    return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x)
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Print the fitted coefficients, and what they and the present ones say of each set."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_confidence", description=__doc__)
+    parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
+    named = [name.split("=") for name in parser.parse_args(words).sets]
+    sets = [samples_of(Path(folder), Path(truth)) for folder, truth in named]
+    found = fitted(sets)
+    found[0] += _SHIFT
+    print("fitted", ", ".join(f"{value:.3f}" for value in found))
+    for (folder, _), (x, right) in zip(named, sets, strict=True):
+        for name, coefficients in {"fitted": found, "present": np.array(COEFFICIENTS)}.items():
+            sure = 1 / (1 + np.exp(-x @ coefficients)) >= SURE
+            share = right[sure].mean() if sure.any() else float("nan")
+            print(
+                f"{folder:30} {name:8} {right.mean():6.1%} right, {sure.mean():6.1%} sure, {share:6.1%} of these right"
+            )
+
+
+if __name__ == "__main__":
+    main()
