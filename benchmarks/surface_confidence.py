@@ -1,6 +1,6 @@
 """Fit the probability that a depth is right: the coefficients of `recon.surface.confidence`.
 
-For each set, depths are found in twice the range of the true ones. A sample counts with its features, and with whether
+For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with whether
 its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal prior.
 
 Call `python -m benchmarks.surface_confidence SET=TRUTH …`, with a folder of elemental.toml and one that holds
@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
-from faintfield.pipelines.reconstruction.surface import nodes_of
+from faintfield.pipelines.reconstruction.surface_depths import nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
