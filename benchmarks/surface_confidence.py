@@ -1,7 +1,8 @@
 """Fit the probability that a depth is right: the coefficients of `recon.surface.confidence`.
 
-For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with whether
-its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal prior.
+For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with
+whether its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal
+prior.
 
 Call `python -m benchmarks.surface_confidence SET=TRUTH …`, with a folder of elemental.toml and one that holds
 true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy on other scenes.
@@ -27,8 +28,8 @@ from faintfield.recon.surface.sweep import equal_steps
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
-# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 % in
-# difficult ones; this asks less of the clear ones.
+# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 %
+# in difficult ones; this asks less of the clear ones.
 _SHIFT = 0.6
 
 
