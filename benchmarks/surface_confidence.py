@@ -27,8 +27,8 @@ from faintfield.recon.surface.sweep import equal_steps
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
-# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 % in
-# difficult ones; this asks less of the clear ones.
+# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 %
+# in difficult ones; this asks less of the clear ones.
 _SHIFT = 0.6
 
 
