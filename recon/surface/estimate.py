@@ -126,9 +126,14 @@ def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:
 
 
 def halves(nodes: NDArray[np.intp], views: NDArray[np.intp] | None = None) -> Halves:
-    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes."""
+    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes.
+
+    Views whose nodes have nearly all one colour are divided in turn instead.
+    """
     views = np.arange(len(nodes)) if views is None else views
     odd = nodes[views].sum(axis=1) % 2 == 1
+    if not len(views) <= 4 * np.count_nonzero(odd) <= 3 * len(views):
+        odd = np.arange(len(views)) % 2 == 1
     return Halves(views[~odd], views[odd])
 
 
