@@ -11,7 +11,7 @@ from faintfield.calib.homography import ray_from_surface
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 
@@ -51,7 +51,7 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     for view in progress(range(views), "reading views"):
         total = np.zeros(shape, np.float32)
         for response, background, (lattice, sum_e, over) in zip(
-            responses, backgrounds, _electrons(loaded, view), strict=True
+            responses, backgrounds, _electrons(loaded, layouts, view), strict=True
         ):
             usable = (response > 0) & (_summed(over, lattice, bins) == 0)
             light_e = _summed(sum_e - np.asarray(background, np.float32), lattice, bins)
@@ -88,9 +88,11 @@ def _summed(values: NDArray[Any], lattice: Lattice, bins: int) -> NDArray[Any]:
     return np.asarray(whole.sum(axis=(1, 3)))
 
 
-def _electrons(loaded: ElementalSet, view: int) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
+def _electrons(
+    loaded: ElementalSet, layouts: list[ChannelLayout], view: int
+) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield the electrons of a view on each lattice of each colour, and where they are saturated."""
-    for layout in channel_layouts(loaded):
+    for layout in layouts:
         found = view_electrons(loaded, layout, loaded.frame_paths(view))
         for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
             yield lattice, sum_e, over
