@@ -8,7 +8,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from benchmarks import surface_accuracy, surface_scenes
+from benchmarks import surface_accuracy, surface_confidence, surface_scenes
 from benchmarks.surface_accuracy import (
     depth_accuracy,
     depth_edges,
@@ -131,6 +131,18 @@ def test_the_command_scales_the_truth_and_prints_the_table(tmp_path: Path, capsy
     with pytest.raises(SystemExit):
         surface_accuracy.main([str(result), str(tmp_path / "small")])
     assert "different sizes" in capsys.readouterr().err
+
+
+def test_the_fit_finds_the_coefficients_under_which_samples_were_drawn() -> None:
+    """Of two sets, one of which has four times as many samples: they count alike."""
+    generator = np.random.default_rng(1)
+    sets = []
+    for count, shift in ((80_000, 0.5), (20_000, -0.5)):
+        x = np.column_stack([np.ones(count), generator.standard_normal((count, 2))])
+        right = generator.random(count) < 1 / (1 + np.exp(-(x @ [shift, 1.0, -0.5])))
+        sets.append((x, right))
+    # The mean of both sets is steeper nowhere: coefficients shrink a little where their constants differ
+    assert surface_confidence.fitted(sets) == pytest.approx([0.0, 0.94, -0.47], abs=0.05)
 
 
 def test_a_set_of_mitsubas_has_the_poses_of_its_nodes(tmp_path: Path) -> None:

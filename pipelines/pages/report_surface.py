@@ -138,8 +138,8 @@ def _predictions(held_out: HeldOutRecord) -> list[Prediction]:
     """Return how well views that were left out are predicted, in the order of the page."""
     known = [
         ("this surface", held_out.surface),
-        ("planes of best focus", held_out.planes),
-        ("the mean of each view’s neighbours, denoised", held_out.neighbours),
+        ("the same depths on a few planes", held_out.planes),
+        ("the mean of each view’s neighbours, blurred", held_out.neighbours),
     ]
     deviances = [deviance for _, deviance in known if deviance is not None]
     return [Prediction(by, deviance, deviance == min(deviances)) for by, deviance in known if deviance is not None]

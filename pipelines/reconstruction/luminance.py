@@ -1,6 +1,7 @@
 """All colours of a set together, as pinhole cameras of larger pixels see it: what depths are found from."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,9 +11,8 @@ from faintfield.calib.homography import ray_from_surface
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
-from faintfield.recon.likelihood.images import binned
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
 
 # Most pixels of a view, and the fewest pixels along a side that are still added up in twos.
@@ -22,7 +22,7 @@ _MAX_PIXELS, _MIN_SIDE_PX = 80_000, 120
 def default_bins(loaded: ElementalSet) -> int:
     """Return the width in detector pixels of the bins: two, or more if views are large; whole periods of a mosaic."""
     width, height = loaded.settings.camera.size_px
-    period = max(max(lattice.step) for layout in channel_layouts(loaded) for lattice in layout.lattices)
+    period = int(np.lcm(*channel_layouts(loaded)[0].lattices[0].step))
     needed = int(np.ceil(np.sqrt(width * height / _MAX_PIXELS)))
     smallest = 2 if min(width, height) >= _MIN_SIDE_PX else 1
     return -(-max(needed, smallest) // period) * period
@@ -40,7 +40,7 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     """
     layouts = channel_layouts(loaded)
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
-    responses = [_response(loaded, lattice, bins // max(lattice.step)) for _, lattice in parts]
+    responses = [_response(loaded, lattice, bins) for _, lattice in parts]
     backgrounds, variances = zip(*(_known(loaded, lattice) for _, lattice in parts), strict=True)
     grid = plane_grid(loaded, 1.0).binned(bins)
     views = len(loaded.settings.view)
@@ -51,17 +51,16 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     for view in progress(range(views), "reading views"):
         total = np.zeros(shape, np.float32)
         for response, background, (lattice, sum_e, over) in zip(
-            responses, backgrounds, _electrons(loaded, view), strict=True
+            responses, backgrounds, _electrons(loaded, layouts, view), strict=True
         ):
-            step = bins // max(lattice.step)
-            usable = (response > 0) & (binned(over, step) == 0)
-            light_e = binned(sum_e - np.asarray(background, np.float32), step) * np.float32(step**2)
+            usable = (response > 0) & (_summed(over, lattice, bins) == 0)
+            light_e = _summed(sum_e - np.asarray(background, np.float32), lattice, bins)
             total += np.where(usable, light_e / np.where(response > 0, response, 1), UNKNOWN)
         light[view] = _resampled(total, undistorted)
     camera = loaded.settings.camera
     return PinholeViews(
         light,
-        float(np.sum(variances)) * (bins // max(parts[0][1].step)) ** 2,
+        float(np.sum(variances)) * _pixels(parts[0][1], bins),
         ray_from_surface(loaded.poses_rt_cam_ref, principal_shift(loaded)),
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
@@ -71,13 +70,29 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
 
 def _response(loaded: ElementalSet, lattice: Lattice, bins: int) -> NDArray[np.float32]:
     """Return the response of bins of a lattice (row, column), zero where one of their pixels is unusable."""
-    response = response_of(loaded, lattice)
-    return np.where(binned(response > 0, bins) == 1, binned(response, bins), np.float32(0))
+    response, pixels = response_of(loaded, lattice), _pixels(lattice, bins)
+    whole = _summed(response > 0, lattice, bins) == pixels
+    return np.where(whole, _summed(response, lattice, bins) / np.float32(pixels), np.float32(0))
 
 
-def _electrons(loaded: ElementalSet, view: int) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
+def _pixels(lattice: Lattice, bins: int) -> int:
+    """Return the number of a lattice's pixels in a bin."""
+    return (bins // lattice.step[0]) * (bins // lattice.step[1])
+
+
+def _summed(values: NDArray[Any], lattice: Lattice, bins: int) -> NDArray[Any]:
+    """Return values of a lattice (row, column) added up in bins of `bins` by `bins` detector pixels."""
+    down, right = (bins // step for step in lattice.step)
+    rows, columns = values.shape[0] // down, values.shape[1] // right
+    whole = values[: rows * down, : columns * right].reshape(rows, down, columns, right)
+    return np.asarray(whole.sum(axis=(1, 3)))
+
+
+def _electrons(
+    loaded: ElementalSet, layouts: list[ChannelLayout], view: int
+) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield the electrons of a view on each lattice of each colour, and where they are saturated."""
-    for layout in channel_layouts(loaded):
+    for layout in layouts:
         found = view_electrons(loaded, layout, loaded.frame_paths(view))
         for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
             yield lattice, sum_e, over

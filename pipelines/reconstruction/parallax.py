@@ -105,6 +105,7 @@ def render_parallax(
     far, middle, near = np.quantile(depths, [_QUANTILES[0], 0.5, _QUANTILES[1]]).tolist()
     nearness = (np.clip(depths, far, near) - middle) * (size[0] / (pitch * width))  # px per mm of viewpoint
     margins = np.ceil(np.abs(offsets_mm).max(axis=0) * np.abs(nearness).max()).astype(int)
+    margins = np.minimum(margins, np.array(size) // 4)  # of a strip, something is left
     columns, rows = (slice(int(cut), side - int(cut)) for cut, side in zip(margins, size, strict=True))
     return [shrunk(frame[rows, columns], _WIDTH_PX) for frame in _frames(picture, nearness, offsets_mm)]
 

@@ -176,9 +176,20 @@ def _light(
     operator = factory.of_surface(inverse_depth, plane_grid(loaded, 1.0))
     _name_blind_views(loaded, operator, len(layout.lattices))
     solution, sigma = solve_then_sigma(operator, images, settings)
-    picture, visibility = refined(operator, images, solution.plane), operator.coverage()
+    picture, visibility = refined(operator, images, solution.plane), _visibility(operator, layout)
     del images, factory, operator
     return _Light(picture, sigma(), visibility, solution.record)
+
+
+def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
+    """Return the number of views that see each sample: pixels count alike, whatever their response.
+
+    A view has fewer pixels than samples in a colour of a mosaic.
+    """
+    response = operator.response()
+    inverse = np.divide(1, response, out=np.zeros_like(response), where=response > 0)
+    samples_per_px = np.prod(layout.lattices[0].step) / len(layout.lattices)
+    return operator.adjoint_of_map(inverse) * operator.dtype.type(samples_per_px)
 
 
 def _name_blind_views(loaded: ElementalSet, operator: SurfaceOperator, phases: int) -> None:

@@ -18,8 +18,8 @@ from faintfield.recon.surface.held_out import Prediction, predicted, seen_of, sq
 from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
-# Rounds of depth and light at most; the last is one more, with all views.
-_MAX_ROUNDS = 3
+# Rounds of depth and light without the views that judge them; the last is one more, with all views.
+_ROUNDS = 3
 
 # Fewest views of which some are left out to judge the rounds: both halves of the others must find depths.
 _MIN_JUDGED = 2 * MIN_VIEWS
@@ -85,7 +85,7 @@ def estimate_surface(
     candidates = [first_depths(evidence)]
     known = evidence.explained(candidates[0])
     best, judged = 0, _Judged.of(evidence, known, left_out)
-    for number in range(1, _MAX_ROUNDS + 1):
+    for number in range(1, _ROUNDS + 1):
         candidates.append(next_depths(evidence, known)[0])
         known = evidence.explained(candidates[-1])
         new = _Judged.of(evidence, known, left_out)
@@ -126,9 +126,14 @@ def first_depths(evidence: DepthEvidence) -> NDArray[np.float32]:
 
 
 def halves(nodes: NDArray[np.intp], views: NDArray[np.intp] | None = None) -> Halves:
-    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes."""
+    """Return two halves of the views (all by default) that look from all over: a checkerboard of their nodes.
+
+    Views whose nodes have nearly all one colour are divided in turn instead.
+    """
     views = np.arange(len(nodes)) if views is None else views
     odd = nodes[views].sum(axis=1) % 2 == 1
+    if not len(views) <= 4 * np.count_nonzero(odd) <= 3 * len(views):
+        odd = np.arange(len(views)) % 2 == 1
     return Halves(views[~odd], views[odd])
 
 

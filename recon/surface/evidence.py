@@ -32,6 +32,9 @@ _SPARSE, _UNSEEN_LIGHT, _DETAIL = 4.0, 5.0, 2.0
 # The same of light at one depth while no surface is known, and the scale of the light in the variance.
 _COARSE_DETAIL, _MEAN_LIGHT = 12.0, 8.0
 
+# Least variance as a share of that of the mean light: without background and read noise, pixels in the dark have none.
+_LEAST_VARIANCE = 1e-3
+
 # A view does not count where something hides a sample that lies at least this many samples away from it in the picture.
 _REACH = 8.0
 
@@ -100,8 +103,9 @@ class DepthEvidence:
         self._half = np.repeat(np.arange(2), [len(half) for half in halves])
         self._subset = _of_views(views, self._numbers)
         middle = self._sums(self._stack(), float(np.median(inverse_depths)), self._nothing(), self._anywhere())
-        mean = _ratio(middle[0, 1] + middle[1, 1], middle[0, 0] + middle[1, 0], _MEAN_LIGHT)
-        self.variance = np.maximum(mean, 0) + np.float32(views.variance_e2)
+        mean = blurred_mean(middle[0, 1] + middle[1, 1], middle[0, 0] + middle[1, 0], _MEAN_LIGHT)
+        variance = np.maximum(mean, 0) + np.float32(views.variance_e2)
+        self.variance = np.maximum(variance, np.float32(max(_LEAST_VARIANCE * float(variance.mean()), 1e-6)))
 
     def at_first(self) -> Image:
         """Return the evidence (row, column, depth) before any surface is known: where both halves show alike detail."""
@@ -195,7 +199,7 @@ class DepthEvidence:
     def _denoised(self, sum_e: Image, count: Image, strength: float, workers: int | None = 1) -> Image:
         """Return light (row, column) from its sum over views, smoothed by total variation as its noise asks for."""
         share = np.clip(count / np.float32(_FEW_VIEWS), 0, 1)
-        light = share * sum_e / np.maximum(count, np.float32(0.5)) + (1 - share) * _ratio(sum_e, count, _SPARSE)
+        light = share * sum_e / np.maximum(count, np.float32(0.5)) + (1 - share) * blurred_mean(sum_e, count, _SPARSE)
         metric = np.maximum(count, np.float32(1)) / self.variance
         weight = strength * float(np.sqrt(np.median(metric)))
         dual = DualField.zero([light.shape], np.dtype(np.float32))
@@ -215,7 +219,7 @@ def _of_views(views: PinholeViews, numbers: NDArray[np.intp]) -> PinholeViews:
     )
 
 
-def _ratio(sum_e: Image, count: Image, scale: float) -> Image:
+def blurred_mean(sum_e: Image, count: Image, scale: float) -> Image:
     """Return blurred sums over blurred numbers of views."""
     blurred = gaussian(count, scale)
     return np.asarray(gaussian(sum_e, scale) / np.maximum(blurred, np.float32(0.3)), np.float32)
@@ -223,4 +227,4 @@ def _ratio(sum_e: Image, count: Image, scale: float) -> Image:
 
 def _detail(light: Image, count: Image, scale: float) -> Image:
     """Return light less its mean over neighbours, weighted by the views that see them."""
-    return np.asarray(light - _ratio(light * count, count, scale))
+    return np.asarray(light - blurred_mean(light * count, count, scale))

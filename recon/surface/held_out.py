@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.surface.blur import gaussian
-from faintfield.recon.surface.evidence import DepthEvidence, Explained
+from faintfield.recon.surface.evidence import DepthEvidence, Explained, blurred_mean
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 
 # Number of planes that stand for a surface, each a share of its samples.
@@ -27,9 +26,9 @@ class Prediction:
     views : int array (view,)
         The views.
     pixels : int
-        Number of their pixels that were compared: those that see the surface.
+        Number of their pixels that were compared: those that see the surface and the planes.
     surface, planes : float
-        Mean squared error over variance, by the surface, and by the same depths on a few planes.
+        Mean squared error over variance, by the surface, and by the same depths on a few planes; NaN without pixels.
     neighbours : float, optional
         The same by the mean of the views next to each, blurred as suits it best; None without such views.
     """
@@ -92,13 +91,19 @@ def _by_neighbours(
     if not beside or min(map(len, beside)) == 0:
         return None
     light = evidence.views.light_e
-    means = [np.maximum(light[near], 0).mean(axis=0, dtype=np.float32) for near in beside]
+    counts = [np.asarray((light[near] > UNKNOWN).sum(axis=0), np.float32) for near in beside]
+    sums = [np.where(light[near] > UNKNOWN, light[near], 0).sum(axis=0, dtype=np.float32) for near in beside]
     return min(
-        _mean(squared_errors(evidence, np.stack([gaussian(mean, blur) for mean in means]), views), seen)
+        _mean(
+            squared_errors(
+                evidence, np.stack([blurred_mean(*of_view, blur) for of_view in zip(sums, counts, strict=True)]), views
+            ),
+            seen,
+        )
         for blur in _BLURS
     )
 
 
 def _mean(squares: NDArray[np.float32], seen: NDArray[np.bool_]) -> float:
-    """Return the mean of the errors of pixels that count."""
-    return float(np.mean(squares[seen], dtype=np.float64))
+    """Return the mean of the errors of pixels that count, NaN of none."""
+    return float(np.mean(squares[seen], dtype=np.float64)) if seen.any() else float("nan")

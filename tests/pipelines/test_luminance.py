@@ -40,7 +40,9 @@ def _summed(frame: NDArray[np.uint16], bins: int) -> NDArray[np.float64]:
     return sums
 
 
-@pytest.mark.parametrize(("mosaic", "bins"), [(None, 1), (None, 3), (BAYER, 2), (BAYER, 4)])
+@pytest.mark.parametrize(
+    ("mosaic", "bins"), [(None, 1), (None, 3), (BAYER, 2), (BAYER, 4), (["RGB"], 3), (["RGGB", "GBRG"], 4)]
+)
 def test_all_pixels_of_a_bin_are_added_up_whatever_their_colour(
     mosaic: list[str] | None, bins: int, make_set: SetMaker
 ) -> None:
@@ -148,7 +150,14 @@ def test_views_look_where_their_pose_and_principal_point_say(make_set: SetMaker,
 
 @pytest.mark.parametrize(
     ("size", "mosaic", "bins"),
-    [((64, 48), None, 1), ((64, 48), BAYER, 2), ((160, 120), None, 2), ((1040, 780), None, 4), ((800, 600), BAYER, 4)],
+    [
+        ((64, 48), None, 1),
+        ((64, 48), BAYER, 2),
+        ((64, 48), ["RGGB", "GBRG"], 4),
+        ((160, 120), None, 2),
+        ((1040, 780), None, 4),
+        ((800, 600), BAYER, 4),
+    ],
 )
 def test_bins_leave_small_views_as_they_are_and_hold_whole_periods(
     size: tuple[int, int], mosaic: list[str] | None, bins: int, make_set: SetMaker

@@ -107,6 +107,13 @@ def test_large_pictures_are_reduced() -> None:
     assert len({frame.shape for frame in frames}) == 1
 
 
+def test_a_strip_keeps_its_middle() -> None:
+    picture = np.zeros((24, 700), np.uint8)
+    ramp = np.tile(np.linspace(FAR, NEAR, 700), (24, 1))
+    frames = render_parallax(picture, ramp, 1 / 1000, viewpoints(ramp, 1 / 1000, (0.0, 300.0)))
+    assert min(frames[0].shape) >= 8
+
+
 @pytest.mark.parametrize("aperture_mm", [(300.0, 200.0), (2.0, 1.0), (100.0, 0.0)])
 def test_viewpoints_go_around_inside_the_nodes_and_end_where_they_begin(aperture_mm: tuple[float, float]) -> None:
     _, inverse_depth = _two_planes()

@@ -59,7 +59,7 @@ def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command
     assert "Sure 12 % of the picture: the depth is right within 2 % with a probability of at least 90 %" in said
     assert "3 of the views took no part" in said
     assert "this surface 1.012" in said
-    assert "planes of best focus 1.340" in said
+    assert "the same depths on a few planes 1.340" in said
     assert "The surface predicts them best" in said
     page = (surface / "report.html").read_text()
     assert "<title>faintfield · &lt;toys &amp; more&gt;: a surface</title>" in page
@@ -117,7 +117,7 @@ def test_planes_and_a_surface_stand_on_one_page(
 def test_what_is_predicted_better_by_others_is_said(surface: Path, done: Command) -> None:
     _change(surface, held_out={"views": [3], "pixels": 100, "surface": 1.5, "planes": 1.4, "neighbours": None})
     said = _words(_section(surface, done))
-    assert "They are predicted better by planes of best focus: take the depths with caution." in said
+    assert "They are predicted better by the same depths on a few planes: take the depths with caution." in said
     assert "neighbours" not in said
 
 

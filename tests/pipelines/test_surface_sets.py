@@ -86,6 +86,8 @@ def test_a_mosaic_is_binned_by_its_period(
     cells = _light_e(tmp_path / "set", "view_r1_c1.tiff").reshape(36, 2, 48, 2).sum(axis=(1, 3))
     np.testing.assert_allclose(seen[0][0].light_e[4], cells, atol=1e-3)
     assert tifffile.imread(tmp_path / "out" / "picture.tiff").shape == (72, 96, 3)
+    visibility = tifffile.imread(tmp_path / "out" / "visibility.tiff")
+    assert visibility[28:44, 38:58].mean() == pytest.approx(9, rel=0.1)
     assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (72, 96)
 
 

@@ -1,6 +1,7 @@
 """Surfaces and their range from simulated views, against the truth; views that were left out as a figure of merit."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
 
@@ -161,6 +162,31 @@ def test_halves_are_a_checkerboard_of_those_that_count() -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("nodes", "first"),
+    [
+        ([(row, column) for row in (0, 2, 4) for column in (1, 3, 5)], [0, 2, 4, 6, 8]),  # every second node
+        ([(k, k) for k in range(6)], [0, 2, 4]),  # along a diagonal
+        ([(0, 1), (1, 0), (1, 1), (1, 2), (2, 1)], [0, 2, 4]),  # a cross
+    ],
+)
+def test_both_halves_have_views_however_nodes_lie(nodes: list[tuple[int, int]], first: list[int]) -> None:
+    both = halves(np.array(nodes))
+    assert both.first.tolist() == first
+    assert both.second.tolist() == sorted({*range(len(nodes))} - {*first})
+
+
+def test_darkness_without_any_noise_is_no_evidence() -> None:
+    """Pixels that never count a photon have no variance: a division by it would spoil the samples around them."""
+    light = surface_scene.expected_light(LEVEL_E).astype(np.float32)
+    light[:, :, 20:] = 0
+    views = replace(surface_scene.views_of(light), variance_e2=0.0)
+    evidence = _evidence(views)
+    ratios = evidence.at_first()
+    assert np.isfinite(ratios).all()
+    assert np.ptp(ratios[20:40, 5:15], axis=2).max() > 1
+
+
 def test_steps_are_equal_and_as_fine_as_the_outermost_view_asks_for() -> None:
     views = surface_scene.drawn_views(LEVEL_E)
     outermost = max(np.hypot(*surface_scene.CENTRES_MM.T)) * surface_scene.FOCAL_PX  # samples per 1/depth
@@ -217,6 +243,25 @@ def test_the_right_surface_predicts_better_than_its_rivals() -> None:
     assert right.views.tolist() == LEFT_OUT.tolist()
     assert 0.75 * _size() < right.pixels < _size()
     assert predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, []).neighbours is None
+
+
+def test_neighbours_predict_faint_light_without_bias_and_without_pixels_that_have_no_number() -> None:
+    """Light of 2 e⁻ everywhere, of which neighbours show a third as unknown: the noise is the only error."""
+    generator = np.random.default_rng(4)
+    light = 2.0 + generator.normal(0, 2.0, (25, *SHAPE))
+    light[generator.random(light.shape) < 1 / 3] = UNKNOWN
+    evidence = _evidence(surface_scene.views_of(light))
+    beside = [np.setdiff1d(np.arange(25), LEFT_OUT)[:4]] * len(LEFT_OUT)
+    found = predicted(evidence, _index_of(np.full(SHAPE, FAR)), LEFT_OUT, beside)
+    assert found.neighbours == pytest.approx(1, abs=0.03)
+
+
+def test_views_without_any_number_have_no_deviance() -> None:
+    light = surface_scene.expected_light(LEVEL_E).astype(np.float32)
+    light[LEFT_OUT] = UNKNOWN
+    found = predicted(_evidence(surface_scene.views_of(light)), _index_of(np.full(SHAPE, FAR)), LEFT_OUT, [])
+    assert found.pixels == 0
+    assert np.isnan([found.surface, found.planes]).all()
 
 
 def _size() -> int:

@@ -53,8 +53,8 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
     pixels : int
         Number of their pixels that were compared.
     surface, planes, neighbours : float
-        Mean deviance per pixel of their prediction by the surface; by the planes of best focus; and by the mean of each
-        view's neighbours, denoised. None if it was not computed. Smaller is better.
+        Mean deviance per pixel of their prediction by the surface; by the same depths on a few planes; and by the mean
+        of each view's neighbours, blurred. None if it was not computed. Smaller is better.
     """
 
     views: list[Count]
