@@ -14,6 +14,10 @@ from faintfield.pipelines.pages.page import data_uri, figure
 _FILMS = (".webp", ".png")
 
 
+# A gain over planes that counts, in standard errors.
+_SIGNIFICANT = 3.0
+
+
 @dataclass(frozen=True)
 class Figure:
     """A picture as data URI with its name and caption; `moving` is a film of it, if there is one."""
@@ -80,7 +84,7 @@ def _section(directory: Path, folder: Path, made: SurfaceFileRecord) -> SurfaceS
         figures=_figures(folder, surface),
         rows=_rows(surface),
         predictions=predictions,
-        verdict=_verdict(predictions),
+        verdict=_verdict(surface.held_out, predictions),
     )
 
 
@@ -145,11 +149,15 @@ def _predictions(held_out: HeldOutRecord) -> list[Prediction]:
     return [Prediction(by, deviance, deviance == min(deviances)) for by, deviance in known if deviance is not None]
 
 
-def _verdict(predictions: Sequence[Prediction]) -> str:
+def _verdict(held_out: HeldOutRecord | None, predictions: Sequence[Prediction]) -> str:
     """Return in words what the predictions say of the surface, which is the first of them."""
-    if len(predictions) < 2:
+    if held_out is None or len(predictions) < 2:
         return ""
     if predictions[0].best:
+        if held_out.planes is not None and held_out.standard_error is not None:
+            gain = held_out.planes - held_out.surface
+            if gain < _SIGNIFICANT * held_out.standard_error:
+                return "The surface predicts them no better than planes do: the views do not show its shapes."
         return "The surface predicts them best: its depths explain what other cameras see."
     best = next(one.by for one in predictions if one.best)
     return f"They are predicted better by {best}: take the depths with caution."

@@ -224,6 +224,7 @@ def _held_out(prediction: Prediction | None) -> HeldOutRecord | None:
         pixels=prediction.pixels,
         surface=prediction.surface,
         planes=prediction.planes,
+        standard_error=prediction.standard_error,
         neighbours=prediction.neighbours,
     )
 

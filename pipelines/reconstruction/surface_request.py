@@ -13,7 +13,7 @@ from faintfield.pipelines.reconstruction.planes import Settings
 # Folder of the surface among the results of a session.
 SURFACE_FOLDER = "surface"
 
-_NUMBER = r"(-?\d+(?:\.\d*)?)"
+_NUMBER = r"(-?\d+(?:\.\d*)?(?:[eE]\+?\d{1,2})?)"
 
 # Depths beyond this look like infinity to any camera, and sums of theirs overflow.
 _FARTHEST_MM = 1e9

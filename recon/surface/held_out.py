@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, blurred_mean
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 
@@ -15,6 +16,9 @@ _PLANES = 4
 
 # Blurs of the mean of neighbours, in pixels: the best counts.
 _BLURS = (1.0, 2.0, 4.0)
+
+# Scale in pixels of the blur that tells the light of a pixel, for its variance.
+_LEVEL_SCALE = 8.0
 
 
 @dataclass(frozen=True)
@@ -29,6 +33,8 @@ class Prediction:
         Number of their pixels that were compared: those that see the surface and the planes.
     surface, planes : float
         Mean squared error over variance, by the surface, and by the same depths on a few planes; NaN without pixels.
+    standard_error : float
+        Of the difference between the two, as the errors of the pixels scatter.
     neighbours : float, optional
         The same by the mean of the views next to each, blurred as suits it best; None without such views.
     """
@@ -37,6 +43,7 @@ class Prediction:
     pixels: int
     surface: float
     planes: float
+    standard_error: float
     neighbours: float | None
 
 
@@ -46,10 +53,16 @@ def seen_of(evidence: DepthEvidence, known: Explained, views: NDArray[np.intp]) 
 
 
 def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.intp]) -> NDArray[np.float32]:
-    """Return the squared errors of pixels (view, row, column) over their variance, given what is expected of them."""
-    variance = np.maximum(expected, 0) + np.float32(evidence.views.variance_e2)
+    """Return the squared errors of pixels (view, row, column) over their variance, given what is expected of them.
+
+    The variance is that of the pixels' own light, blurred: were it that of what is expected, whoever expects too much
+    would seem to err less.
+    """
     light_e = evidence.views.light_e[views]
-    errors = np.where(light_e > UNKNOWN, light_e - expected, 0)
+    known = light_e > UNKNOWN
+    level_e = np.stack([gaussian(picture, _LEVEL_SCALE) for picture in np.where(known, light_e, 0)])
+    variance = np.maximum(level_e, 0) + np.float32(evidence.views.variance_e2)
+    errors = np.where(known, light_e - expected, 0)
     return np.asarray(np.square(errors) / np.maximum(variance, np.float32(1e-6)), np.float32)
 
 
@@ -75,10 +88,18 @@ def predicted(
     surface = evidence.explained(index)
     seen = seen_of(evidence, surface, views) & seen_of(evidence, planes, views)
     by_surface, by_planes = (
-        _mean(squared_errors(evidence, known.operator.forward(known.light(), views), views), seen)
-        for known in (surface, planes)
+        squared_errors(evidence, known.operator.forward(known.light(), views), views) for known in (surface, planes)
     )
-    return Prediction(views, int(seen.sum()), by_surface, by_planes, _by_neighbours(evidence, views, beside, seen))
+    pixels = int(seen.sum())
+    scatter = float(np.std((by_planes - by_surface)[seen], dtype=np.float64)) if pixels else float("nan")
+    return Prediction(
+        views,
+        pixels,
+        _mean(by_surface, seen),
+        _mean(by_planes, seen),
+        scatter / max(pixels, 1) ** 0.5,
+        _by_neighbours(evidence, views, beside, seen),
+    )
 
 
 def _by_neighbours(

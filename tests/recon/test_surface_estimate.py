@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface import estimate
@@ -292,14 +293,15 @@ def _slanted() -> NDArray[np.float64]:
 
 @pytest.mark.parametrize("scale", [1.0, 1.2])
 def test_the_deviance_of_the_truth_is_one(scale: float) -> None:
-    """A prediction s times λ, with the variance s λ + σ², has (λ + σ² + ((s − 1) λ)²)/(s λ + σ²) on average."""
+    """A prediction s times λ has (λ + σ² + ((s − 1) λ)²)/v on average, whatever it says of the variance v."""
     views = surface_scene.drawn_views(LEVEL_E)
     light = surface_scene.expected_light(LEVEL_E)[LEFT_OUT]
     seen = np.ones(light.shape, bool)
     variance = light + surface_scene.READ_VARIANCE_E2
-    mean = np.mean((variance + ((scale - 1) * light) ** 2) / (scale * light + surface_scene.READ_VARIANCE_E2))
+    common = gaussian_filter(light, (0, 8, 8), mode="mirror") + surface_scene.READ_VARIANCE_E2
+    mean = np.mean((variance + ((scale - 1) * light) ** 2) / common)
     found = squared_errors(_evidence(views), (scale * light).astype(np.float32), LEFT_OUT)[seen].mean()
-    assert mean == pytest.approx(1) or mean > 1.4
+    assert mean == pytest.approx(1, abs=0.05) or mean > 1.4
     assert found == pytest.approx(mean, abs=0.04)  # 4σ of 24 000 pixels
 
 

@@ -54,13 +54,17 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
         Number of their pixels that were compared.
     surface, planes, neighbours : float
         Mean deviance per pixel of their prediction by the surface; by the same depths on a few planes; and by the mean
-        of each view's neighbours, blurred. None if it was not computed. Smaller is better.
+        of each view's neighbours, blurred. None if it was not computed. Smaller is better; a perfect prediction has
+        about 1.
+    standard_error : float
+        Of the difference between `planes` and `surface`.
     """
 
     views: list[Count]
     pixels: int
     surface: float
     planes: float | None = None
+    standard_error: float | None = None
     neighbours: float | None = None
 
 
