@@ -28,10 +28,6 @@ from faintfield.recon.surface.sweep import equal_steps
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
-# What is added to the constant. By the fit alone, 97 to 99 % of what is called sure in clear scenes is right, and 91 %
-# in difficult ones; this asks less of the clear ones.
-_SHIFT = 0.6
-
 
 def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
@@ -74,7 +70,6 @@ def main(words: Sequence[str] | None = None) -> None:
     named = [name.split("=") for name in parser.parse_args(words).sets]
     sets = [samples_of(Path(folder), Path(truth)) for folder, truth in named]
     found = fitted(sets)
-    found[0] += _SHIFT
     print("fitted", ", ".join(f"{value:.3f}" for value in found))
     for (folder, _), (x, right) in zip(named, sets, strict=True):
         for name, coefficients in {"fitted": found, "present": np.array(COEFFICIENTS)}.items():

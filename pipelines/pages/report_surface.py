@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec import UNSET
+
 from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import preview_name
@@ -154,7 +156,7 @@ def _verdict(held_out: HeldOutRecord | None, predictions: Sequence[Prediction]) 
     if held_out is None or len(predictions) < 2:
         return ""
     if predictions[0].best:
-        if held_out.planes is not None and held_out.standard_error is not None:
+        if held_out.planes is not None and held_out.standard_error is not UNSET:
             gain = held_out.planes - held_out.surface
             if gain < _SIGNIFICANT * held_out.standard_error:
                 return "The surface predicts them no better than planes do: the views do not show its shapes."

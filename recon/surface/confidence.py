@@ -25,7 +25,7 @@ _SHARPNESS = 0.1
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-2.784, 0.489, 0.623, 2.991, 0.733, -1.685, 1.188)
+COEFFICIENTS = (-3.384, 0.489, 0.623, 2.991, 0.733, -1.685, 1.188)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.surface.blur import gaussian
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, blurred_mean
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 
@@ -60,7 +59,12 @@ def squared_errors(evidence: DepthEvidence, expected: Image, views: NDArray[np.i
     """
     light_e = evidence.views.light_e[views]
     known = light_e > UNKNOWN
-    level_e = np.stack([gaussian(picture, _LEVEL_SCALE) for picture in np.where(known, light_e, 0)])
+    level_e = np.stack(
+        [
+            blurred_mean(np.where(there, picture, 0), there.astype(np.float32), _LEVEL_SCALE)
+            for picture, there in zip(light_e, known, strict=True)
+        ]
+    )
     variance = np.maximum(level_e, 0) + np.float32(evidence.views.variance_e2)
     errors = np.where(known, light_e - expected, 0)
     return np.asarray(np.square(errors) / np.maximum(variance, np.float32(1e-6)), np.float32)

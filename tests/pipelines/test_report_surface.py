@@ -57,7 +57,7 @@ def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command
     assert "Depth searched 400 to 900 mm found in the views; 64 depths compared in bins of 2 × 2 pixels" in said
     assert "Known 98 % of the picture" in said
     assert "Sure 12 % of the picture: the depth is right within 2 % with a probability of at least 90 %" in said
-    assert "3 of the views took no part" in said
+    assert "3 of the views were left out of all rounds but the last" in said
     assert "this surface 1.012" in said
     assert "the same depths on a few planes 1.340" in said
     assert "The surface predicts them best" in said

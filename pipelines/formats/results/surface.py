@@ -7,7 +7,7 @@ states: mm, or px of disparity from one node to the next if the set knows no len
 from pathlib import Path
 from typing import Annotated, Literal
 
-from msgspec import Meta, Struct
+from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.provenance import Provenance
@@ -64,7 +64,7 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
     pixels: int
     surface: float
     planes: float | None = None
-    standard_error: float | None = None
+    standard_error: float | UnsetType = UNSET
     neighbours: float | None = None
 
 
