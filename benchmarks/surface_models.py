@@ -30,6 +30,9 @@ _LAMPS: tuple[dict[str, Any], ...] = (
 # Direct light only, one ray to the lamp: exact, as the lamps are points.
 _INTEGRATOR = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0, "hide_emitters": True}
 
+# Through glass and by mirrors too; what is matt reflects light of the lamps only once or twice.
+_REFLECTIONS = {"type": "path", "max_depth": 5, "hide_emitters": True}
+
 
 def model(name: str) -> list[Any]:
     """Return a scene once per lamp, as Mitsuba's objects."""
@@ -84,7 +87,49 @@ def even() -> dict[str, Any]:
     }
 
 
-SCENES: dict[str, Callable[[], dict[str, Any]]] = {"room": room, "desk": desk, "hills": hills, "even": even}
+def mirror() -> dict[str, Any]:
+    """Return the room with a mirror before its wall and a mirror ball, and a wall behind the camera that they show."""
+    silver = {"type": "twosided", "sides": {"type": "conductor", "material": "none"}}
+    flat = rectangle((110, 10, 700), (240, 260), ((_Y, -12),), plain())
+    return {
+        "integrator": _REFLECTIONS,
+        "wall": rectangle((0, 0, 820), (1600, 1300), ((_Y, 22),), noise(1, 1.0, 768)),
+        "floor": rectangle((0, 210, 700), (1800, 1100), ((_X, 90),), blobs(2, 1.3, 768, low=0.2)),
+        "behind": rectangle((0, 0, -200), (1600, 500), (), blobs(5, 1.2)),
+        "mirror": {**flat, "bsdf": silver},
+        "mirror_ball": {**sphere((-110, 110, 620), 95, plain()), "bsdf": silver},
+    }
+
+
+def glass() -> dict[str, Any]:
+    """Return the room with a ball and a pane of glass before its wall."""
+    pane = rectangle((110, 10, 640), (240, 260), ((_Y, -30),), plain())
+    return {
+        "integrator": _REFLECTIONS,
+        "wall": rectangle((0, 0, 820), (1600, 1300), ((_Y, 22),), noise(1, 1.0, 768)),
+        "floor": rectangle((0, 210, 700), (1800, 1100), ((_X, 90),), blobs(2, 1.3, 768, low=0.2)),
+        "ball": {**sphere((-110, 110, 620), 95, plain()), "bsdf": {"type": "dielectric"}},
+        "pane": {**pane, "bsdf": {"type": "thindielectric"}},
+    }
+
+
+def repeated() -> dict[str, Any]:
+    """Return a wall and a floor of squares of 10 mm, all alike, so that several depths explain the views alike."""
+    return {
+        "wall": rectangle((0, 0, 820), (1600, 1280), (), squares(160, 128)),
+        "floor": rectangle((0, 210, 700), (1800, 1120), ((_X, 90),), squares(180, 112)),
+    }
+
+
+SCENES: dict[str, Callable[[], dict[str, Any]]] = {
+    "room": room,
+    "desk": desk,
+    "hills": hills,
+    "even": even,
+    "mirror": mirror,
+    "glass": glass,
+    "repeated": repeated,
+}
 
 
 def rectangle(centre: Vector, size: tuple[float, float], rotations: Rotations, tile: Tile) -> dict[str, Any]:
@@ -144,6 +189,12 @@ def checks(seed: int) -> Tile:
     index = np.arange(512) // 64
     odd = (index[:, np.newaxis] + index) % 2
     return np.clip(np.where(odd, 0.85, 0.2) + 0.04 * spectrum(seed, 1.3, 512), 0.08, 0.95)
+
+
+def squares(across: int, down: int) -> Tile:
+    """Return a chessboard of even squares, 8 × 8 numbers each."""
+    odd = np.add.outer(np.arange(8 * down) // 8, np.arange(8 * across) // 8) % 2
+    return np.where(odd, 0.85, 0.2)
 
 
 def stripes(seed: int) -> Tile:

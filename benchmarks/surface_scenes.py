@@ -7,7 +7,9 @@ to be darkened by `faintfield darken`, with true_depth_mm.tiff and true_picture.
 serves development only and stays out of .venv: make an environment for it alone (`python -m venv build/mitsuba`,
 `build/mitsuba/bin/pip install mitsuba numpy scipy tifffile`) and call its Python. Nothing of faintfield is imported.
 
-The scenes are `room`, `desk` and `hills`, and `even`, most of which has no texture, so that its depth cannot be known.
+The scenes are `room`, `desk` and `hills`, and four whose depth cannot be known everywhere: most of `even` has no
+texture; `mirror` and `glass` show what is elsewhere, while the true depth is theirs; and `repeated` consists of squares
+that are all alike.
 """
 
 import argparse
