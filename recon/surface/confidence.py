@@ -25,7 +25,7 @@ _SHARPNESS = 0.1
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-3.384, 0.489, 0.623, 2.991, 0.733, -1.685, 1.188)
+COEFFICIENTS = (-4.730, 0.217, 0.871, 3.124, 0.777, 1.299)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
@@ -57,8 +57,8 @@ def features(
     """Return what the probability depends on (feature, row, column); the first is one everywhere.
 
     In order: one; the log odds of the depths within the tolerance, by the costs; by how much alternatives cost more
-    (logarithm); the distance to the next edge of something nearer; whether one is close; the tolerance in steps
-    (logarithm); the distance to the border of the picture.
+    (logarithm); the distance to the next edge of something nearer; whether one is close; the distance to the border of
+    the picture.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
@@ -83,7 +83,6 @@ def features(
             np.log1p(np.maximum(margin, 0)),
             edge / _FAR_FROM_EDGE,
             edge < _BESIDE_EDGE,
-            np.log(tolerance),
             border / _FAR_FROM_BORDER,
         ]
     )
