@@ -10,7 +10,7 @@ from faintfield.recon.surface.edges import near_side, values_at
 RIGHT_WITHIN = 0.02
 
 # Probability above which a depth is called sure, and below which none is stated.
-SURE, UNKNOWN_BELOW = 0.9, 0.05
+SURE, UNKNOWN_BELOW = 0.9, 0.03
 
 # Samples from an edge beyond which it does not matter, and within which depths often are those of the other side.
 _FAR_FROM_EDGE, _BESIDE_EDGE = 12.0, 4.0
