@@ -58,8 +58,8 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
         likely = confidence(index, costs, depths) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             raise NothingInFocus(
-                f"between {1 / limits[1]:.4g} and {1 / limits[0]:.4g} mm the views tell the depth of {likely.mean():.1%} of the "
-                "picture; give the range by --depth-range-mm NEAR:FAR, or more light"
+                f"between {1 / limits[1]:.4g} and {1 / limits[0]:.4g} mm the views tell the depth of {likely.mean():.1%} "
+                "of the picture; give the range by --depth-range-mm NEAR:FAR, or more light"
             )
         first, last = np.quantile(index[likely], _QUANTILES)
         margin = _MARGIN * (last - first) + _MARGIN_STEPS
