@@ -50,7 +50,7 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
         Nowhere do the views agree on anything.
     """
     coarse = views.binned(_BINS)
-    limits = far, near
+    limits, searched_mm = (far, near), f"{1 / near:.4g} and {1 / far:.4g} mm"
     for _ in range(_SEARCHES):
         depths = equal_steps(coarse, far, near)
         evidence = DepthEvidence(coarse, depths, halves(nodes))
@@ -58,7 +58,7 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
         likely = confidence(index, costs, depths) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             raise NothingInFocus(
-                f"between {1 / limits[1]:.4g} and {1 / limits[0]:.4g} mm the views tell the depth of {likely.mean():.1%} "
+                f"between {searched_mm} the views tell the depth of {likely.mean():.1%} "
                 "of the picture; give the range by --depth-range-mm NEAR:FAR, or more light"
             )
         first, last = np.quantile(index[likely], _QUANTILES)
