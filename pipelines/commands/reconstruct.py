@@ -20,7 +20,6 @@ from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes, selected_methods
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.reconstruction.surface import reconstruct_surface
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.recon.likelihood.images import LikelihoodName
@@ -172,6 +171,9 @@ def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest,
     OutputBusy
         Another command is writing to one of the two.
     """
+    # Here, because planes need none of it
+    from faintfield.pipelines.reconstruction.surface import reconstruct_surface
+
     started = time.monotonic()
     with ExitStack() as locks:
         for folder in dict.fromkeys((page_in, out)):
