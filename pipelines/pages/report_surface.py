@@ -101,7 +101,11 @@ def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
         (surface.depth, f"{what.capitalize()}, {unit}.", known),
         (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within 2 %"),
         (surface.depth_sigma, f"σ of the {what}, {unit}.", "Standard deviation, if the right surface was found"),
-        (surface.picture_sigma, "σ of the picture, e⁻.", "Standard deviation of the light of each sample"),
+        (
+            surface.picture_sigma,
+            "σ of the picture, e⁻.",
+            "Standard deviation of the light of each sample by noise, if its depth is right",
+        ),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
     ]
     found = [
