@@ -99,7 +99,7 @@ def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
     entries = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
         (surface.depth, f"{what.capitalize()}, {unit}.", known),
-        (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within 2 %"),
+        (surface.depth_confidence, "How sure.", "Probability that the depth is right within 2 %"),
         (surface.depth_sigma, f"σ of the {what}, {unit}.", "Standard deviation, if the right surface was found"),
         (
             surface.picture_sigma,
