@@ -23,6 +23,7 @@ from faintfield.pipelines.reconstruction.surface_depths import nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
+from faintfield.recon.surface.goodness import explained_share
 from faintfield.recon.surface.sweep import equal_steps
 
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
@@ -44,7 +45,7 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     found_mm = 1 / np.interp(index, np.arange(len(depths)), depths)
     right = np.abs(found_mm / true_mm - 1) < RIGHT_WITHIN
     thin = np.s_[..., ::_STRIDE, ::_STRIDE]
-    measured = features(index, costs, depths)[thin]
+    measured = features(index, costs, depths, explained_share(evidence, index))[thin]
     return measured.reshape(len(measured), -1).T, right[thin].ravel()
 
 

@@ -12,27 +12,30 @@ RIGHT_WITHIN = 0.02
 # Probability above which a depth is called sure, and below which none is stated.
 SURE, UNKNOWN_BELOW = 0.9, 0.03
 
-# Samples from an edge beyond which it does not matter, and within which depths often are those of the other side.
-_FAR_FROM_EDGE, _BESIDE_EDGE = 12.0, 4.0
+# Samples from an edge beyond which it does not matter.
+_FAR_FROM_EDGE = 12.0
 
 # Samples from the border of the picture beyond which it does not matter.
 _FAR_FROM_BORDER = 10.0
 
-# Sharpness of the costs as a probability.
-_SHARPNESS = 0.1
+# Share of the detail from which a surface explains the views well enough.
+_EXPLAINED = 0.5
 
 # Alternatives to a depth lie at least this many steps away from it.
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-4.730, 0.217, 0.871, 3.124, 0.777, 1.299)
+COEFFICIENTS = (-3.452, 0.938, 1.763, 0.621, 1.072)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
 
 
 def confidence(
-    index: NDArray[np.floating], costs: NDArray[np.floating], inverse_depths: NDArray[np.floating]
+    index: NDArray[np.floating],
+    costs: NDArray[np.floating],
+    inverse_depths: NDArray[np.floating],
+    explained: NDArray[np.floating],
 ) -> NDArray[np.float32]:
     """Return the probability (row, column) that depths are right within `RIGHT_WITHIN`.
 
@@ -46,32 +49,31 @@ def confidence(
         Costs by paths, see `sum_over_paths`.
     inverse_depths : float array (depth,)
         1/depth.
+    explained : float array (row, column)
+        How much of the views' detail the surface explains, see `explained_share`.
     """
-    logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths), 1)
+    logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths, explained), 1)
     return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), _MAX_CONFIDENCE), np.float32)
 
 
 def features(
-    index: NDArray[np.floating], costs: NDArray[np.floating], inverse_depths: NDArray[np.floating]
+    index: NDArray[np.floating],
+    costs: NDArray[np.floating],
+    inverse_depths: NDArray[np.floating],
+    explained: NDArray[np.floating],
 ) -> NDArray[np.float64]:
     """Return what the probability depends on (feature, row, column); the first is one everywhere.
 
-    In order: one; the log odds of the depths within the tolerance, by the costs; by how much alternatives cost more
-    (logarithm); the distance to the next edge of something nearer; whether one is close; the distance to the border of
-    the picture.
+    In order: one; by how much alternatives cost more (logarithm); the distance to the next edge of something nearer; the
+    distance to the border of the picture; how much of the detail is explained (logarithm), if it is little.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])
     away = np.empty_like(costs)
     np.subtract(np.arange(costs.shape[2], dtype=costs.dtype), index[:, :, np.newaxis], out=away)
     np.abs(away, out=away)
-    own = values_at(costs, index)
-    least = costs.min(axis=2)
     others = np.where(away <= np.maximum(2 * tolerance, _APART_STEPS)[:, :, np.newaxis], np.float32(np.inf), costs)
-    margin = np.minimum(others.min(axis=2) - own, np.float32(1e6))
-    del others
-    chances = np.exp(np.float32(_SHARPNESS) * (least[:, :, np.newaxis] - costs))
-    share = np.where(away <= tolerance[:, :, np.newaxis], chances, 0).sum(axis=2) / chances.sum(axis=2)
+    margin = np.minimum(others.min(axis=2) - values_at(costs, index), np.float32(1e6))
     near = near_side(index)
     edge = np.minimum(distance_transform_edt(~near), _FAR_FROM_EDGE) if near.any() else np.full(q.shape, _FAR_FROM_EDGE)
     rows, columns = (np.minimum(np.arange(size), np.arange(size)[::-1]) for size in index.shape)
@@ -79,10 +81,9 @@ def features(
     return np.stack(
         [
             np.ones_like(q),
-            np.log((share + 0.01) / (1.01 - share)),
             np.log1p(np.maximum(margin, 0)),
             edge / _FAR_FROM_EDGE,
-            edge < _BESIDE_EDGE,
             border / _FAR_FROM_BORDER,
+            np.log(np.minimum(explained / _EXPLAINED, 1)),
         ]
     )

@@ -14,6 +14,7 @@ from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.edges import moved_edges
 from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
+from faintfield.recon.surface.goodness import explained_share
 from faintfield.recon.surface.held_out import Prediction, predicted, seen_of, squared_errors
 from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import PinholeViews
@@ -97,7 +98,7 @@ def estimate_surface(
         prediction = predicted(evidence, candidates[best], left_out, beside)
     final = DepthEvidence(views, inverse_depths, halves(nodes))
     index, costs = next_depths(final, final.explained(candidates[best]))
-    sure = confidence(index, costs, inverse_depths)
+    sure = confidence(index, costs, inverse_depths, explained_share(final, index))
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     return SurfaceEstimate(depths, sure, best + 1, prediction)
 

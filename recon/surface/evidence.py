@@ -116,8 +116,8 @@ class DepthEvidence:
             lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e in sums]
             total = np.zeros_like(self.variance)
             for (count, sum_e), other in zip(sums, reversed(lights), strict=True):
-                light = _detail(other, count, _COARSE_DETAIL)
-                seen = _detail(sum_e / np.maximum(count, 0.5), count, _COARSE_DETAIL)
+                light = detail(other, count, _COARSE_DETAIL)
+                seen = detail(sum_e / np.maximum(count, 0.5), count, _COARSE_DETAIL)
                 total += count * (seen * light - 0.5 * light**2)
             return [total]
 
@@ -145,15 +145,15 @@ class DepthEvidence:
         """Return the evidence for each depth against a surface and its light."""
         stack = self._stack(self._explanation(known))
         relief, tolerance = known.relief[self._numbers], _REACH / np.maximum(self._subset.reach, np.float32(1e-9))
-        details = [_detail(light, np.ones_like(light), _DETAIL) for light in known.lights]
+        details = [detail(light, np.ones_like(light), _DETAIL) for light in known.lights]
 
         def ratio(inverse_depth: float) -> list[Image]:
             sums = self._sums(stack, inverse_depth, relief, tolerance)
             lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e, _ in sums]
             own, matched = np.zeros_like(self.variance), np.zeros_like(self.variance)
-            for (count, sum_e, of_known), light, detail in zip(sums, reversed(lights), reversed(details), strict=True):
+            for (count, sum_e, of_known), light, of_surface in zip(sums, reversed(lights), reversed(details), strict=True):
                 own += sum_e * light - np.float32(0.5) * count * light**2 - of_known
-                matched += count * _detail(sum_e / np.maximum(count, 0.5), count, _DETAIL) * detail
+                matched += count * detail(sum_e / np.maximum(count, 0.5), count, _DETAIL) * of_surface
             return [own, np.float32(0.5) * (own + matched)]
 
         return Ratios(*self._of_all_depths(ratio, 2))
@@ -225,6 +225,6 @@ def blurred_mean(sum_e: Image, count: Image, scale: float) -> Image:
     return np.asarray(gaussian(sum_e, scale) / np.maximum(blurred, np.float32(0.3)), np.float32)
 
 
-def _detail(light: Image, count: Image, scale: float) -> Image:
+def detail(light: Image, count: Image, scale: float) -> Image:
     """Return light less its mean over neighbours, weighted by the views that see them."""
     return np.asarray(light - blurred_mean(light * count, count, scale))

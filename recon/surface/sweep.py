@@ -7,6 +7,7 @@ from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface.confidence import confidence
 from faintfield.recon.surface.estimate import first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
+from faintfield.recon.surface.goodness import explained_share
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
 # Movement of the outermost view from one depth to the next, in samples; fewest and most depths.
@@ -55,7 +56,7 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
         depths = equal_steps(coarse, far, near)
         evidence = DepthEvidence(coarse, depths, halves(nodes))
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
-        likely = confidence(index, costs, depths) >= _LIKELY
+        likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
             raise NothingInFocus(
                 f"between {searched_mm} the views tell the depth of {likely.mean():.1%} "
