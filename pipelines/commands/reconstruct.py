@@ -81,8 +81,8 @@ def reconstruct(
     plane_pose
         TOML file of planes of any pose, each with a name and either rt_ref_plane or point_mm and normal.
     depth_map
-        Also compute, from the sweep, the depth of each pixel, the probability that it is right, and an all-in-focus
-        picture.
+        Also compute, in the range of the sweep, the depth of each pixel, the probability that it is right, and an
+        all-in-focus picture.
     surface
         Instead of planes, reconstruct one picture of the scene from the reference view, sharp everywhere, with the
         depth of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and others, see

@@ -9,7 +9,7 @@ from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_latt
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.depth_map import Compared, compared_depths
+from faintfield.pipelines.reconstruction.comparison import Compared, compared_depths
 from faintfield.recon.depth.agreement import DepthEstimate
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
 from faintfield.recon.errors import NothingInFocus

@@ -3,111 +3,64 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import progress
 from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import encoded, grey_levels, white_level, write_plane
-from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.map_pictures import map_picture
-from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.recon.depth.agreement import Agreement, DepthEstimate, agreement, bins_for, depth_map
-from faintfield.recon.depth.focus import SURE
-
-# Fewest bins across the detector: limits the size of a bin.
-_MIN_BINS_ACROSS = 8
+from faintfield.pipelines.reconstruction.operators import plane_grid
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
 
 
 @dataclass(frozen=True)
-class Compared:
-    """The agreement of the views at each depth, all colours together.
-
-    Attributes
-    ----------
-    planes : list of Agreement
-        In the order of the depths.
-    depths_mm : sequence of float
-        The depths.
-    bins_px : int
-        Width of the bins in which pixels were added up, in detector pixels.
-    """
-
-    planes: list[Agreement]
-    depths_mm: Sequence[float]
-    bins_px: int
-
-    def depth_map(self) -> DepthEstimate:
-        """Return where each sample is sharp."""
-        return depth_map(self.planes, np.asarray(self.depths_mm))
-
-
-def compared_depths(
-    loaded: ElementalSet, depths_mm: Sequence[float], out: Path, *, min_bins_px: int = 1, bins_px: int | None = None
-) -> Compared:
-    """Compare the views at each depth; the images of one colour at a time are in memory, or in a file in `out`.
-
-    Pixels are added up in bins of `bins_px`; by default in bins of at least `min_bins_px`, larger ones in low light.
-    """
-    planes: list[Agreement] = []
-    bins = 0
-    for layout in channel_layouts(loaded):
-        images = load_channel(loaded, layout, memory_or_file(out))
-        step = max(layout.lattices[0].step)
-        if bins_px is not None:
-            bins = bins_px // step
-        elif not bins:
-            middle_mm = sorted(depths_mm)[len(depths_mm) // 2]
-            needed = bins_for(
-                OperatorFactory(loaded, layout, images).at(middle_mm, plane_grid(loaded, middle_mm)), images
-            )
-            bins = min(max(needed, -(-min_bins_px // step)), min(layout.lattices[0].shape) // _MIN_BINS_ACROSS)
-        images = images.binned(bins)
-        factory = OperatorFactory(loaded, layout, images, bins=bins)
-        found = [
-            agreement(factory.at(depth, plane_grid(loaded, depth).binned(bins * step)), images)
-            for depth in progress(depths_mm, f"comparing views, {layout.name}")
-        ]
-        planes = [_sum(*pair) for pair in zip(planes, found, strict=True)] if planes else found
-    return Compared(planes, depths_mm, bins * step)
-
-
-def _sum(one: Agreement, other: Agreement) -> Agreement:
-    """Return the agreement of two colours together."""
-    return Agreement(*(a + b for a, b in zip(one, other, strict=True)))
-
-
-@dataclass(frozen=True)
 class _Map:
-    """A depth map on the samples of the planes.
+    """A depth map on the samples of the reference view.
 
     Attributes
     ----------
     record : DepthMapRecord
         What reconstruction.json records of it.
-    scale : list of float
-        Depth in mm, or disparity in px, of each plane.
+    limits : (float, float)
+        Of the sweep, in the unit of the record, ascending.
     index : float array (row, column)
-        Between which planes each sample is sharp.
+        Between which planes of the sweep each sample lies; given everywhere, even where nothing is known.
     values, confidence : float array (row, column)
-        In the unit of the scale, NaN where not known; and the probability that this is right.
+        Depth in mm or disparity in px, NaN where it is not known; and the probability that this is right.
     """
 
     record: DepthMapRecord
-    scale: list[float]
+    limits: tuple[float, float]
     index: NDArray[np.float64]
     values: NDArray[np.float64]
     confidence: NDArray[np.float64]
+
+
+def check_sweep(loaded: ElementalSet, depths_mm: Sequence[float]) -> None:
+    """Refuse a set or a sweep that can have no depth map, before its planes are made.
+
+    Raises
+    ------
+    BadValue
+        The set has too few views, or too small ones.
+    GeometryMismatch
+        The views share too little at the depths of the sweep.
+    NothingInFocus
+        All views were taken from one place.
+    """
+    from faintfield.pipelines.reconstruction.surface_depths import check_overlap, check_views
+
+    check_views(loaded, "a depth map")
+    check_overlap(loaded, (min(depths_mm), max(depths_mm)))
 
 
 def write_depth_map(
@@ -115,9 +68,10 @@ def write_depth_map(
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
     origins: Mapping[Method, Origin],
-    out: Path,
 ) -> DepthMapRecord:
     """Write the maps and the all-in-focus picture into each folder of planes, and return their record.
+
+    Depths and their confidence are those of `reconstruct --surface` in the range of the sweep.
 
     Parameters
     ----------
@@ -129,8 +83,11 @@ def write_depth_map(
         Disparity of every depth if disparities were asked for: the map then is in px.
     origins : mapping of Method to Provenance
         Provenance of each method's planes: maps with the same are kept.
-    out : Path
-        Folder of a temporary file for the images if memory is short.
+
+    Raises
+    ------
+    GeometryMismatch
+        The range of the sweep is too wide, or views, poses and range do not fit together.
     """
     folders = {method: path.parent for (method, _), path in planes.items()}
     kept = [
@@ -139,8 +96,7 @@ def write_depth_map(
     if kept and kept[0] is not None and all(kept):
         return kept[0].depth_map
     depths = sorted({depth for _, depth in planes})
-    compared = compared_depths(loaded, depths, out)
-    found = _map_of(loaded, compared, disparities_px)
+    found = _map_of(loaded, depths, disparities_px)
     for method, folder in folders.items():
         remove(folder / DEPTH_MAP_FILE)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
@@ -150,27 +106,50 @@ def write_depth_map(
     return found.record
 
 
-def _map_of(loaded: ElementalSet, compared: Compared, disparities_px: Mapping[float, float]) -> _Map:
-    """Return the depth map of compared depths on the samples of the planes, in px if there are disparities."""
-    depths = compared.depths_mm
-    scale = [disparities_px[depth] if disparities_px else depth for depth in depths]
-    found = compared.depth_map()
-    shape = plane_grid(loaded, depths[0]).shape
-    index, confidence = (_enlarged(part, shape, compared.bins_px) for part in (found.index, found.confidence))
-    values = np.interp(index, np.arange(len(depths)), scale)
-    values[confidence < SURE] = np.nan
-    known = np.isfinite(values)
+def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
+    """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
+    # Here, because planes need none of it
+    from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
+    from faintfield.pipelines.reconstruction.surface_depths import (
+        BETWEEN_PIXELS,
+        between_pixels,
+        depths_of_set,
+        enlarged,
+        in_unit,
+    )
+    from faintfield.recon.surface.confidence import SURE
+    from faintfield.recon.surface.lit import lit_samples
+
+    bins, shape = default_bins(loaded), plane_grid(loaded, 1.0).shape
+    views = between_pixels(luminance(loaded, bins))
+    compared, estimate = depths_of_set(loaded, views, (depths_mm[0], depths_mm[-1]), find_range=False)
+    knowable = _within(compared, estimate.inverse_depth) & lit_samples(views, estimate.inverse_depth)
+    inverse_depth, confidence = (
+        enlarged(part, shape, bins, moved=BETWEEN_PIXELS)
+        for part in (estimate.inverse_depth, np.where(knowable, estimate.confidence, 0))
+    )
+    unit: Literal["mm", "px"] = "px" if disparities_px else "mm"
+    scale = [disparities_px[depth] if disparities_px else depth for depth in depths_mm]
+    known = confidence.astype(np.float32) >= SURE  # as in the file
+    values = np.clip(in_unit(loaded, inverse_depth, unit), min(scale), max(scale))
     record = DepthMapRecord(
         file="disparity_px.tiff" if disparities_px else "depth_mm.tiff",
         confidence=f"{CONFIDENCE}.tiff",
         all_in_focus=f"{ALL_IN_FOCUS}.tiff",
-        unit="px" if disparities_px else "mm",
-        bins_px=compared.bins_px,
+        unit=unit,
+        bins_px=bins,
         sure_above=SURE,
         sure_share=float(known.mean()),
         median=float(np.median(values[known])) if known.any() else None,
     )
-    return _Map(record, scale, index, values, confidence)
+    index = np.interp(-inverse_depth, -1 / np.asarray(depths_mm), np.arange(len(depths_mm)))
+    return _Map(record, (min(scale), max(scale)), index, np.where(known, values, np.nan), confidence)
+
+
+def _within(compared: NDArray[np.float64], inverse_depth: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return whether 1/depth is more than a step from both ends of those compared: the true one may lie beyond."""
+    step = compared[1] - compared[0]
+    return np.asarray((inverse_depth > compared[0] + step) & (inverse_depth < compared[-1] - step))
 
 
 def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
@@ -178,7 +157,7 @@ def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[s
     record = found.record
     label = "disparity (px)" if record.unit == "px" else "depth (mm)"
     pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
-        record.file: (found.values, map_picture(found.values, label, min(found.scale), max(found.scale))),
+        record.file: (found.values, map_picture(found.values, label, *found.limits)),
         record.confidence: (found.confidence, map_picture(found.confidence, "probability of the depth", 0.0, 1.0)),
         record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
     }
@@ -187,13 +166,6 @@ def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[s
         write_whole((folder / name).with_suffix(".png"), picture)
     files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
     return {path.name: sha256(path) for path in files}
-
-
-def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> NDArray[np.float64]:
-    """Return a map of bins on the samples of the planes; samples beyond the last bin repeat its value."""
-    whole = np.kron(part, np.ones((bins, bins), part.dtype))[: shape[0], : shape[1]]
-    missing = [(0, size - known) for size, known in zip(shape, whole.shape, strict=True)]
-    return np.asarray(np.pad(whole, missing, "edge"), np.float64)
 
 
 def _all_in_focus(paths: Sequence[Path], index: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -33,7 +33,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
-from faintfield.pipelines.reconstruction.depth_map import write_depth_map
+from faintfield.pipelines.reconstruction.depth_map import check_sweep, write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
 from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
@@ -74,6 +74,7 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     if request.with_depth_map:
         _refuse_surfaces(list(folders.values()))
+        check_sweep(loaded, depths)
     sweep = _sweep(loaded, folders, request)
     glance = look_at(loaded)  # here, as what is wrong with a set is to be found before its planes are made
     read_truth(loaded.folder)
@@ -81,7 +82,7 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     write_overview(glance, out)
     depth_map = None
     if request.with_depth_map:
-        depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins, out)
+        depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins)
     metrics = assess(loaded, sweep.written)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import erfinv
 
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.errors import BadValue, OutputExists
+from faintfield.pipelines.errors import OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.provenance import provenance
@@ -27,25 +27,25 @@ from faintfield.pipelines.formats.results.surface import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.luminance import default_bins
+from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
 from faintfield.pipelines.reconstruction.planes import Settings, mean_e, solve_then_sigma
-from faintfield.pipelines.reconstruction.surface_depths import depths_of_set, limits_mm, naming_range
+from faintfield.pipelines.reconstruction.surface_depths import (
+    check_views,
+    depths_of_set,
+    enlarged,
+    in_unit,
+    limits_mm,
+    naming_range,
+)
 from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
-from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver.collaborative import refined
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.held_out import Prediction
-
-# Fewest views whose halves can find depths by each other's light.
-_MIN_VIEWS = 4
-
-# Smallest side of a view: a smaller one has no room for the patches and windows in which detail is compared.
-_MIN_SIDE_PX = 24
 
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.
@@ -111,9 +111,11 @@ def reconstruct_surface(
     range_mm = limits_mm(loaded, request)
     remove_leftovers(out)
     bins = default_bins(loaded)
-    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=request.depth_range_mm is None)
+    depths, estimate = depths_of_set(
+        loaded, luminance(loaded, bins), range_mm, find_range=request.depth_range_mm is None
+    )
     far, near = float(depths[0]), float(depths[-1])
-    inverse_depth = _enlarged(estimate.inverse_depth, grid.shape, bins)
+    inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
     with naming_range(far, near):
         lights = {
             layout.name: _light(loaded, layout, inverse_depth, request.settings, out)
@@ -121,7 +123,7 @@ def reconstruct_surface(
         }
     facts = SurfaceFacts(
         unit=request.unit,
-        searched=(_in_unit(loaded, near, request.unit), _in_unit(loaded, far, request.unit)),
+        searched=(in_unit(loaded, near, request.unit), in_unit(loaded, far, request.unit)),
         range_found=request.depth_range_mm is None,
         depths=len(depths),
         bins_px=bins,
@@ -139,21 +141,7 @@ def reconstruct_surface(
 
 def _check(loaded: ElementalSet, out: Path) -> None:
     """Refuse sets and folders for which no surface can be made."""
-    views, size_px = len(loaded.settings.view), loaded.settings.camera.size_px
-    if views < _MIN_VIEWS:
-        raise BadValue(
-            f"{loaded.folder}: has {views} views, and a surface needs at least {_MIN_VIEWS}; capture more nodes"
-        )
-    if min(size_px) < _MIN_SIDE_PX:
-        raise BadValue(
-            f"{loaded.folder}: has views of {size_px[0]} x {size_px[1]} px, and a surface needs at least "
-            f"{_MIN_SIDE_PX} px along each side; use larger ones"
-        )
-    if not np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
-        raise NothingInFocus(
-            f"{loaded.folder}: all views were taken from one place, which tells no depths apart; correct the poses, or "
-            "capture several nodes"
-        )
+    check_views(loaded, "a surface")
     if (out / DEPTH_MAP_FILE).exists():
         raise OutputExists(
             f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
@@ -239,12 +227,12 @@ def _maps(
 ) -> SurfaceMaps:
     """Return what is known of each sample."""
     grid = plane_grid(loaded, 1.0)
-    confidence = _enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
+    confidence = enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
     known = confidence >= UNKNOWN_BELOW
-    depth = _in_unit(loaded, inverse_depth, unit)
+    depth = in_unit(loaded, inverse_depth, unit)
     # Of a normal distribution that lies within the tolerance with this probability
     sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
-    slope = np.abs(_in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
+    slope = np.abs(in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
     colours = len(lights) > 1
     return SurfaceMaps(
         grid=grid,
@@ -257,21 +245,3 @@ def _maps(
         inverse_depth=inverse_depth,
         aperture_mm=aperture_of(loaded.poses_rt_cam_ref),
     )
-
-
-def _in_unit[Numbers: (float, NDArray[np.float64])](
-    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px"]
-) -> Numbers:
-    """Return depths in mm, or disparities in px from one node to the next."""
-    if unit == "mm":
-        return 1 / inverse_depth
-    at_zero, slope = loaded.inverse_depth_of_disparity()
-    return (inverse_depth - at_zero) / slope
-
-
-def _enlarged(part: NDArray[np.floating], shape: tuple[int, int], bins: int) -> NDArray[np.float64]:
-    """Return a map of bins on the samples of the picture; samples beyond the last bin repeat its value."""
-    rows, columns = (
-        np.minimum(np.arange(size) // bins, count - 1) for size, count in zip(shape, part.shape, strict=True)
-    )
-    return np.asarray(part[np.ix_(rows, columns)], np.float64)

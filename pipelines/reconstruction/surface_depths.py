@@ -1,20 +1,31 @@
-"""The depth of a surface from the views of a set: the range that is asked for or found, and the depths in it."""
+"""The depth of a surface from the views of a set: the range that is asked for or found, and the depths in it.
+
+The maps of `--surface` and of `--depth-map` both come from here.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.autofocus import overlap, searched_range_mm
-from faintfield.pipelines.reconstruction.luminance import luminance
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
-from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
 from faintfield.recon.surface.pinhole_views import PinholeViews
 from faintfield.recon.surface.sweep import equal_steps, found_range
+
+# Fewest views whose halves can find depths by each other's light.
+_MIN_VIEWS = 4
+
+# Smallest side of a view: a smaller one has no room for the patches and windows in which detail is compared.
+_MIN_SIDE_PX = 24
 
 # Least that the other views see of the reference view's part of the scene at some depth of a given range, on average,
 # and the number of depths in it that are tried.
@@ -22,6 +33,43 @@ _MIN_OVERLAP, _TRIED = 0.1, 8
 
 # Movement in samples of the outermost view from one depth to the next above which the user is warned, and refused.
 _COARSE, _TOO_COARSE = 3.5, 16.0
+
+# Place between two pixels, in pixels, at which `w² + (1 − w)²` is 2/3, see `between_pixels`.
+BETWEEN_PIXELS = 0.5 - 0.5 / 3**0.5
+
+
+def check_views(loaded: ElementalSet, wanted: str) -> None:
+    """Refuse a set whose views tell no depths.
+
+    Parameters
+    ----------
+    loaded : ElementalSet
+        The set.
+    wanted : str
+        What the depths are for, as the messages name it.
+
+    Raises
+    ------
+    BadValue
+        The set has too few views, or too small ones.
+    NothingInFocus
+        All views were taken from one place.
+    """
+    views, size_px = len(loaded.settings.view), loaded.settings.camera.size_px
+    if views < _MIN_VIEWS:
+        raise BadValue(
+            f"{loaded.folder}: has {views} views, and {wanted} needs at least {_MIN_VIEWS}; capture more nodes"
+        )
+    if min(size_px) < _MIN_SIDE_PX:
+        raise BadValue(
+            f"{loaded.folder}: has views of {size_px[0]} x {size_px[1]} px, and {wanted} needs at least "
+            f"{_MIN_SIDE_PX} px along each side; use larger ones"
+        )
+    if not np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
+        raise NothingInFocus(
+            f"{loaded.folder}: all views were taken from one place, which tells no depths apart; correct the poses, or "
+            "capture several nodes"
+        )
 
 
 def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, float]:
@@ -36,7 +84,13 @@ def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, flo
     """
     if request.depth_range_mm is None:
         return searched_range_mm(loaded)
-    near_mm, far_mm = request.depth_range_mm
+    check_overlap(loaded, request.depth_range_mm)
+    return request.depth_range_mm
+
+
+def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
+    """Refuse a range of depths, nearest and farthest, at which the views share too little (GeometryMismatch)."""
+    near_mm, far_mm = range_mm
     depths = 1 / np.linspace(1 / near_mm, 1 / far_mm, _TRIED)
     own = 1 / len(loaded.settings.view)  # the share of the reference view itself
     shared = (max(overlap(loaded, depth) for depth in depths.tolist()) - own) / (1 - own)
@@ -45,20 +99,19 @@ def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, flo
             f"between {near_mm:g} and {far_mm:g} mm the other views see {shared:.0%} of what the reference view sees, "
             f"on average, and {_MIN_OVERLAP:.0%} are needed; correct the range, or the poses and their signs"
         )
-    return near_mm, far_mm
 
 
 def depths_of_set(
-    loaded: ElementalSet, bins: int, range_mm: tuple[float, float], *, find_range: bool
+    loaded: ElementalSet, views: PinholeViews, range_mm: tuple[float, float], *, find_range: bool
 ) -> tuple[NDArray[np.float64], SurfaceEstimate]:
-    """Return the 1/depths that are compared, ascending, and the depth of each bin by them.
+    """Return the 1/depths that are compared, ascending, and the depth of each sample of the views by them.
 
     Parameters
     ----------
     loaded : ElementalSet
         The set.
-    bins : int
-        Width of the bins in detector pixels.
+    views : PinholeViews
+        Its light, see `luminance`.
     range_mm : (float, float)
         Nearest and farthest depth.
     find_range : bool
@@ -71,7 +124,7 @@ def depths_of_set(
     NothingInFocus
         Nothing is found in the range.
     """
-    views, nodes = luminance(loaded, bins), nodes_of(loaded)
+    nodes = nodes_of(loaded)
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(far, near):
         if find_range:
@@ -110,3 +163,48 @@ def _check_steps(views: PinholeViews, depths: NDArray[np.float64]) -> None:
         raise GeometryMismatch(f"{apart}; give a narrower range, above all a farther near end")
     if step > _COARSE:
         inform(f"warning: {apart}; a narrower range would find more")
+
+
+def between_pixels(views: PinholeViews) -> PinholeViews:
+    """Return the views with the samples of the surface moved to `BETWEEN_PIXELS`, right and down.
+
+    Interpolation between pixels blurs, and detail that is not blurred counts for more. On a regular grid of nodes, some
+    depths bring all views to whole pixels, and would be favoured. At this place the mean of `w² + (1 − w)²` over the
+    weights w of interpolation is 2/3, as it is over all places: such depths are no longer special.
+    """
+    (x, y), pitch = views.grid.origin_mm, views.grid.pitch_mm
+    moved = BETWEEN_PIXELS * pitch
+    return replace(views, grid=replace(views.grid, origin_mm=(x + moved, y + moved)))
+
+
+def enlarged(
+    part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = 0.0
+) -> NDArray[np.float64]:
+    """Return a map of bins on the samples of a picture, each with the nearest value.
+
+    Parameters
+    ----------
+    part : float array (row, column)
+        The map.
+    shape : (int, int)
+        Rows and columns of the picture.
+    bins : int
+        Samples of the picture along a side of a bin.
+    moved : float
+        By how much the samples of the map lie right of and below the middles of the bins, in bins.
+    """
+    rows, columns = (
+        np.clip(np.floor((np.arange(size) + 0.5) / bins - moved), 0, count - 1).astype(np.intp)
+        for size, count in zip(shape, part.shape, strict=True)
+    )
+    return np.asarray(part[np.ix_(rows, columns)], np.float64)
+
+
+def in_unit[Numbers: (float, NDArray[np.float64])](
+    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px"]
+) -> Numbers:
+    """Return depths in mm, or disparities in px from one node to the next."""
+    if unit == "mm":
+        return 1 / inverse_depth
+    at_zero, slope = loaded.inverse_depth_of_disparity()
+    return (inverse_depth - at_zero) / slope

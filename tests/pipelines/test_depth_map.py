@@ -2,6 +2,9 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +17,9 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
-from faintfield.pipelines.reconstruction.depth_map import compared_depths
+from faintfield.pipelines.reconstruction.comparison import compared_depths
 from faintfield.recon.depth.focus import SURE
-from tests.pipelines.conftest import Command, SetMaker
+from tests.pipelines.conftest import Command, Edit, SetMaker
 
 SWEEP = ("--sweep-mm", "400:900:26", "--method", "backprojection", "--depth-map")
 SMALL = ("--size-px", 160, 120, "--rows", 5, "--columns", 5)
@@ -71,6 +74,29 @@ def test_all_in_focus_is_of_each_objects_own_plane(swept: Path, scene: Path) -> 
         assert there.sum() > 300
         unlike = np.sqrt(np.mean((picture - plane)[there] ** 2))
         assert unlike < 0.25 * np.std(plane[there])
+
+
+def test_what_lies_beyond_the_sweep_is_not_known(scene: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", scene, "--out", tmp_path, "--sweep-mm", "600:900:5", *SWEEP[2:])
+    depth_mm = read_frame(tmp_path / "depth_mm.tiff").pixels_dn
+    truth = read_truth(scene)
+    assert truth is not None
+    shares = {
+        plane.depth_mm: np.isfinite(depth_mm[texture_and_region(scene, plane)[1]]).mean() for plane in truth.planes
+    }
+    assert shares[500.0] < 0.02
+    assert shares[700.0] > 0.5
+
+
+def test_slanted_and_curved_surfaces_have_no_stairs(tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "set", "--objects", "surfaces", "--snr", 2, *SMALL)
+    done("reconstruct", tmp_path / "set", "--out", tmp_path, "--sweep-mm", "400:1400:8", *SWEEP[2:])
+    depth_mm = read_frame(tmp_path / "depth_mm.tiff").pixels_dn
+    true_mm = read_frame(tmp_path / "set" / "truth" / "true_depth_mm.tiff").pixels_dn
+    sure = np.isfinite(depth_mm)
+    assert sure.mean() > 0.15
+    # Neighbouring planes of the sweep are farther apart than 4 %: depths at the nearest plane would mostly be wrong
+    assert (np.abs(depth_mm[sure] / true_mm[sure] - 1) < 0.02).mean() > 0.9
 
 
 def test_the_maps_are_recorded_and_on_the_page(swept: Path) -> None:
@@ -169,6 +195,53 @@ def test_what_does_not_fit_together_is_refused(
     assert ended.returncode == 2
     assert said in ended.stderr
     assert not (tmp_path / "out").exists()
+
+
+def _middle_row(settings: dict[str, Any]) -> None:
+    settings["view"] = settings["view"][3:6]
+    settings["reference_view"] = 1
+
+
+def _all_at_once(settings: dict[str, Any]) -> None:
+    for view in settings["view"]:
+        view["rt_cam_ref"] = [0.0] * 6
+
+
+@pytest.mark.parametrize(
+    ("change", "sweep_mm", "said"),
+    [
+        (_middle_row, "400:900:5", "has 3 views, and a depth map needs at least 4; capture more nodes"),
+        (_all_at_once, "400:900:5", "NothingInFocus: {set}: all views were taken from one place"),
+        (None, "5:20:5", "GeometryMismatch: between 5 and 20 mm the other views see 0%"),
+    ],
+)
+def test_sets_and_sweeps_that_tell_no_depths_are_refused_before_their_planes_are_made(
+    change: Callable[[dict[str, Any]], None] | None,
+    sweep_mm: str,
+    said: str,
+    simulated_scene: Path,
+    edit: Edit,
+    tmp_path: Path,
+    faintfield: Command,
+) -> None:
+    folder = Path(shutil.copytree(simulated_scene, tmp_path / "set"))
+    if change is not None:
+        edit(folder, change)
+    options = ("--sweep-mm", sweep_mm, "--method", "backprojection")
+    ended = faintfield("reconstruct", folder, "--out", tmp_path / "out", *options, "--depth-map")
+    assert ended.returncode == 1
+    assert said.format(set=folder) in ended.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_planes_load_nothing_of_surfaces(simulated_scene: Path, tmp_path: Path) -> None:
+    words = ["reconstruct", simulated_scene, "--out", tmp_path, "--sweep-mm", "400:900:5", "--method", "backprojection"]
+    loaded = (
+        f"import sys; from faintfield.pipelines.cli import run; assert run({[str(word) for word in words]!r}) == 0; "
+        "print(*(name for name in sys.modules if name.startswith('faintfield.recon.surface')))"
+    )
+    said = subprocess.run([sys.executable, "-c", loaded], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines()[-1] == ""
 
 
 def test_the_pieces_of_a_photographed_chess_board_stand_in_their_order(
