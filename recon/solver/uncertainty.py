@@ -25,6 +25,9 @@ _STEPS, _OF_CHANGE, _OF_PLANE, _MAX_INNER_STEPS = 3, 0.1, 3e-3, 300
 # What is known of the squared error relative to the mean square answer before it is measured, and its least value.
 _USUAL_RATIO, _DOUBT, _LEAST_RATIO = 1.1, 0.6, 1.0
 
+# Deviations of the ratio that are added to it.
+_CAUTION = 0.5
+
 # What is added to the usual ratio of small objects: the weight that predicts best suits their dark surroundings.
 _FOR_SMALL_OBJECTS = 0.9
 
@@ -198,9 +201,10 @@ def _ratio_and_excess(
 ) -> tuple[float, float]:
     """Return the squared error of a region relative to its answers, up to 1.1, and what it has beyond that.
 
-    The squared error is the mean of the measured and of the usual, by their variances; it is no less than the measured
-    surely is, for if the penalty leaves nothing, there are no answers either. The variance of the measured is nearly
-    that of the mean of q², of correlated noise.
+    The squared error is the mean of the measured and of the usual, by their variances, plus half the deviation of that
+    mean, since a σ that is too small does more harm. It is no less than the measured surely is: if the penalty leaves
+    nothing, there are no answers either. The variance of the measured is nearly that of the mean of q², of correlated
+    noise.
     """
     if not errors.size:
         return _USUAL_RATIO, 0.0
@@ -208,8 +212,8 @@ def _ratio_and_excess(
     correlation = np.prod([1 + 2 * ((1 - k) / (2 + 2 * k)) ** 2 for k in alternation])
     deviation = float(np.sqrt(2 * correlation / errors.size)) * of_noise
     trust = (_DOUBT * level) ** 2 / max((_DOUBT * level) ** 2 + deviation**2, _TINY)
-    weighted = trust * measured + (1 - trust) * usual * level
-    expected = max(_LEAST_RATIO * level, weighted, measured - 2 * deviation)
+    weighted = trust * measured + (1 - trust) * usual * level + _CAUTION * np.sqrt(trust) * deviation
+    expected = max(_LEAST_RATIO * level, float(weighted), measured - 2 * deviation)
     ratio = min(expected / max(level, _TINY), _USUAL_RATIO)
     return ratio, max(expected - _USUAL_RATIO * level, 0.0)
 
