@@ -29,7 +29,7 @@ from faintfield.recon.solver.one_step_late import (
 from faintfield.recon.solver.penalties import Penalty, PenaltyName, total_variation
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.solver.uncertainty import standard_deviation
+from faintfield.recon.solver.uncertainty import local_fits, standard_deviation
 
 # Largest number of passes over the data. MLEM is stopped early on purpose: further passes fit the noise.
 _MAX_PASSES = {"mlem": 20, "pmlem-osl": 50, "pmlem": 30}
@@ -187,8 +187,8 @@ def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
     solutions = [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
     if settings.uncertainty:
         generator = np.random.default_rng(_SEED)
-        for one, metric in zip(solutions, posed.fit(level_e).metric_of_each(iterate.plane), strict=True):
-            one.sidecars["sigma"] = standard_deviation(one.plane, metric, choice.weight, penalty, generator)
+        for one, local in zip(solutions, local_fits(posed.operator, posed.fit(level_e), iterate.plane), strict=True):
+            one.sidecars["sigma"] = standard_deviation(local, choice.weight, penalty, generator)
     return solutions
 
 
@@ -197,13 +197,13 @@ def solve_then_sigma(
 ) -> tuple[Solution, Callable[[], Image]]:
     """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
 
-    That needs much memory, but neither the images nor the operator: the caller can drop these first.
+    That takes memory for many planes, but neither the images nor the operator: the caller can drop these first.
     """
     objective = Objective.of(SceneProblem(operator, images), settings)
     (solution,) = solve_pmlem(objective, replace(settings, uncertainty=False))
-    (metric,) = objective.posed.fit(objective.level_e).metric_of_each(solution.plane)
+    (local,) = local_fits(operator, objective.posed.fit(objective.level_e), solution.plane)
     weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
-    return solution, partial(standard_deviation, solution.plane, metric, weight, objective.penalty, generator)
+    return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
 
 
 def _certificate(iterate: PmlemIterate) -> Certificate:

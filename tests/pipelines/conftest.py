@@ -79,7 +79,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
     monkeypatch.setattr(surface_depths, "estimate_surface", search)
     monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
     monkeypatch.setattr(surface, "refined", lambda operator, images, plane: plane)
-    monkeypatch.setattr(planes, "standard_deviation", lambda plane, *_: np.ones_like(plane))
+    monkeypatch.setattr(planes, "standard_deviation", lambda local, *_: np.ones_like(local.plane))
     monkeypatch.setattr(surface_files, "render_parallax", lambda *_: [np.zeros((4, 4), np.uint8)] * 2)
     return given
 

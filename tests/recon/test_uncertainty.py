@@ -1,4 +1,4 @@
-"""Standard deviations against inverse matrices, and against errors that were really made."""
+"""Standard deviations against inverse matrices, known errors, and errors that were really made."""
 
 import numpy as np
 import pytest
@@ -8,74 +8,129 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
-from faintfield.recon.solver.uncertainty import standard_deviation
+from faintfield.recon.solver.uncertainty import LocalFit, local_fits, standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_cross_validation import dark_views
 from tests.recon.test_cross_validation import scene as pieces
-from tests.recon.test_scene_fit import scene
+from tests.recon.test_scene_fit import GRIDS, dense, scene
+
+
+def test_local_fits_have_the_diagonal_and_the_alternation_of_the_dense_matrix() -> None:
+    posed = scene(occluded=True)
+    matrix = dense(posed.operator)
+    samples = posed.start()
+    found = local_fits(posed.operator, posed.fit(1.0), samples)
+    first = 0
+    for local, grid in zip(found, GRIDS, strict=True):
+        size = grid.shape[0] * grid.shape[1]
+        own = matrix[:, first : first + size].T @ matrix[:, first : first + size]
+        seen = own.sum(axis=1) > 0.01 * own.sum(axis=1).max()
+        expected = np.divide(np.diag(own), own.sum(axis=1), out=np.zeros(size), where=seen)
+        np.testing.assert_allclose(local.noise_share.ravel(), expected, rtol=1e-10, atol=1e-12)
+        down = (-1.0) ** np.arange(grid.shape[0])[:, np.newaxis] * np.ones(grid.shape)
+        right = (-1.0) ** np.arange(grid.shape[1]) * np.ones(grid.shape)
+        for signs, left in zip((down.ravel(), right.ravel()), local.alternation, strict=True):
+            alone = (signs * (own @ signs))[seen].sum() / own.sum(axis=1)[seen].sum()
+            assert left == pytest.approx(alone, rel=1e-10)
+        first += size
+    gradient = posed.fit(1.0).value_and_gradient(samples)[1]
+    np.testing.assert_allclose(posed.operator.samples_of([local.gradient for local in found]), gradient, rtol=1e-12)
+
+
+def constant(metric: Image, *, light: float = 20.0, alternation: tuple[float, float] = (1.0, 1.0)) -> LocalFit:
+    """A constant plane at its optimum, of which the views tell no errors."""
+    nothing = np.zeros_like(metric)
+    return LocalFit(np.full_like(metric, light), metric, nothing, nothing, alternation)
 
 
 def test_with_a_quadratic_penalty_sigma_is_that_of_the_inverse_matrix() -> None:
     generator = np.random.default_rng(4)
     metric = generator.uniform(3.0, 4.0, SHAPE)
     gradient_of, weight, delta = difference_matrix(), 2.0, 0.5
-    covariance = np.linalg.inv(np.diag(metric.ravel()) + weight / delta * gradient_of.T @ gradient_of)
-    exact = np.sqrt(np.diag(covariance)).reshape(SHAPE)
+    inverse = np.linalg.inv(np.diag(metric.ravel()) + weight / delta * gradient_of.T @ gradient_of)
+    exact = np.diag(inverse @ np.diag(metric.ravel()) @ inverse).reshape(SHAPE)
+    smooth = 0.3 * blurred(exact, (1, 2, 4)) + 0.5 * blurred(exact, (1, 2, 4, 8, 8, 16)) + 0.2 * exact.mean()
     penalty = Penalty("quadratic", delta)
-    draws = [standard_deviation(np.ones(SHAPE), metric, weight, penalty, generator) ** 2 for _ in range(60)]
-    found = np.sqrt(np.mean(draws, axis=0))
-    assert np.median(np.abs(found / exact - 1)) < 0.05
-    assert found.mean() == pytest.approx(exact.mean(), rel=0.03)
+    found = np.mean([standard_deviation(constant(metric), weight, penalty, generator) ** 2 for _ in range(20)], axis=0)
+    assert found.mean() == pytest.approx(1.1 * smooth.mean(), rel=0.05)  # the usual ratio
+    np.testing.assert_allclose(found, 1.1 * smooth, rtol=0.15)
+
+
+def test_noise_that_interpolation_correlates_is_reduced_less_by_a_penalty() -> None:
+    metric, penalty = np.full((48, 48), 4.0), Penalty("quadratic", 0.5)
+    means = [
+        float(standard_deviation(constant(metric, alternation=(k, k)), 2.0, penalty, np.random.default_rng(2)).mean())
+        for k in (1.0, 1 / 3)
+    ]
+    frequency = np.fft.fftfreq(48)
+    down, right = np.meshgrid(frequency, frequency, indexing="ij")
+    penalised = 2.0 / 0.5 * (4 - 2 * np.cos(2 * np.pi * down) - 2 * np.cos(2 * np.pi * right))
+    for found, t in zip(means, (0.0, 0.25), strict=True):
+        seen = np.prod([(1 + 2 * t * np.cos(2 * np.pi * f)) / (1 + 2 * t) for f in (down, right)], axis=0)
+        assert found**2 == pytest.approx(1.1 * np.mean(4 * seen / (4 * seen + penalised) ** 2), rel=0.1)
 
 
 def test_without_a_penalty_sigma_is_that_of_the_data() -> None:
     metric = np.random.default_rng(4).uniform(0.1, 4.0, SHAPE)
-    found = standard_deviation(np.ones(SHAPE), metric, 0.0, Penalty("none"), np.random.default_rng(1))
+    found = standard_deviation(constant(metric), 0.0, Penalty("none"), np.random.default_rng(1))
     np.testing.assert_allclose(found, metric**-0.5, rtol=1e-6)
 
 
-def test_with_total_variation_sigma_is_larger_at_edges_and_below_that_of_the_data() -> None:
-    plane = np.where(np.arange(48) < 24, 0.0, 20.0) * np.ones((40, 1))
-    penalty = Penalty("huber-tv", 0.02)  # of a given weight
-    found = standard_deviation(plane, np.full(plane.shape, 4.0), 3.0, penalty, np.random.default_rng(3))
-    assert found.max() < 0.5 * 1.15  # the draws of an edge scatter
-    assert found[:, 22:26].mean() > 1.1 * found[:, :16].mean()
+def test_sigma_includes_contrast_that_the_penalty_removed_where_it_did() -> None:
+    generator = np.random.default_rng(5)
+    shape, w = (96, 96), 2.0
+    plane = np.where(np.arange(96) < 48, 0.0, 20.0) * np.ones(shape)
+    lost = np.where(plane > 0, generator.normal(0, 1.5, shape), 0.0)
+    noise = generator.normal(0, w**-0.5, shape)
+    metric, share = np.full(shape, w), np.ones(shape)
+    sigmas = [
+        standard_deviation(
+            LocalFit(plane, metric, -w * residual, share, (1.0, 1.0)), 60.0, Penalty(), np.random.default_rng(1)
+        )
+        for residual in (noise, noise + lost)
+    ]
+    on, beside = np.s_[:, 60:], np.s_[:, :36]
+    assert np.sqrt(np.mean(sigmas[0][on] ** 2)) < 0.4
+    assert np.sqrt(np.mean(sigmas[1][on] ** 2)) == pytest.approx(1.5, rel=0.12)
+    assert sigmas[1][beside].mean() < 0.2
 
 
-@pytest.mark.parametrize("name", ["quadratic", "huber-tv"])
+@pytest.mark.parametrize("name", ["tv", "quadratic", "huber-tv"])
 def test_a_larger_weight_reduces_sigma(name: PenaltyName) -> None:
     sigmas = [
-        standard_deviation(np.ones((40, 40)), np.full((40, 40), 2.0), weight, Penalty(name, 0.1), generator)
-        for weight in (0.5, 1.0, 2.0)
-        for generator in [np.random.default_rng(1)]
+        standard_deviation(constant(np.full((40, 40), 2.0)), weight, Penalty(name, 0.1), np.random.default_rng(1))
+        for weight in (0.25, 0.5, 1.0)
     ]
     means = [float(sigma.mean()) for sigma in sigmas]
     assert means[0] > 1.1 * means[1] > 1.1**2 * means[2]
-    assert means[0] < 2**-0.5
+    assert means[0] < 1.1 * 2**-0.5
 
 
-def test_total_variation_takes_its_weight_from_the_roughness_of_the_plane() -> None:
-    rough = blurred(np.random.default_rng(1).normal(0, 4, (40, 40)), (1, 2))
-
-    def mean_of(height: float, weight: float) -> float:
-        metric, generator = np.full(rough.shape, 2.0), np.random.default_rng(1)
-        return float(standard_deviation(5 + height * rough, metric, weight, Penalty(), generator).mean())
-
-    assert mean_of(1.0, 0.3) == pytest.approx(mean_of(1.0, 3.0), rel=0.05)
-    assert 1.1 * mean_of(1.0, 1.0) < mean_of(2.0, 1.0) < 2**-0.5
+def test_sigma_of_a_black_plane_is_not_zero() -> None:
+    metric = np.full(SHAPE, 2.0)
+    black = LocalFit(np.zeros(SHAPE), metric, np.full(SHAPE, 50.0), np.ones(SHAPE), (1.0, 1.0))
+    found = standard_deviation(black, 1.0, Penalty(), np.random.default_rng(1))
+    assert np.isfinite(found).all()
+    assert found.min() >= 0.0099 * 2**-0.5
 
 
-def test_intervals_cover_the_truth_on_objects() -> None:
-    truth: Image = pieces(64)
+def texture(size: int) -> Image:
+    """Fine random texture, most of which total variation removes."""
+    rough = blurred(np.random.default_rng(9).normal(size=(size, size)), (1, 2))
+    return np.asarray(np.maximum(1 + 0.25 * rough / rough.std(), 0), np.float32)
+
+
+@pytest.mark.parametrize("truth", [pieces(64), texture(64)], ids=["pieces", "texture"])
+def test_intervals_cover_the_truth_on_objects(truth: Image) -> None:
     held = []
     for seed in range(3):
         operator, images = dark_views(truth, seed)
         found = solve(operator, images, "pmlem", Settings(uncertainty=True))
         held.append(np.mean((np.abs(found.plane - truth) <= 1.645 * found.sidecars["sigma"])[8:-8, 8:-8]))
-    assert 0.85 <= np.mean(held) <= 0.995
+    assert 0.85 <= np.mean(held) <= 0.96
 
 
-def test_each_plane_of_a_scene_has_sigma_as_if_the_others_were_known() -> None:
+def test_each_plane_of_a_scene_has_sigma() -> None:
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
     settings = Settings(penalty_weight=0.8, uncertainty=True)
