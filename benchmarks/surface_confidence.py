@@ -2,10 +2,11 @@
 
 For each set, depths are found in a larger range than that of the true ones. A sample counts with its features, and with
 whether its depth is right; all sets count alike. Coefficients are the maximum of the likelihood, with a weak normal
-prior.
+prior. The last, of how much of the detail is explained, is fitted on scenes that mislead, given all others: elsewhere
+there is little to learn about it.
 
-Call `python -m benchmarks.surface_confidence SET=TRUTH …`, with a folder of elemental.toml and one that holds
-true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy on other scenes.
+Call `python -m benchmarks.surface_confidence SET=TRUTH … --misleading SET=TRUTH …`, with a folder of elemental.toml and
+one that holds true_depth_mm.tiff, of several scenes at several levels of light. Report accuracy on other scenes.
 """
 
 import argparse
@@ -19,7 +20,7 @@ from scipy.optimize import minimize
 
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
-from faintfield.pipelines.reconstruction.surface_depths import nodes_of
+from faintfield.pipelines.reconstruction.surface_depths import between_pixels, nodes_of
 from faintfield.recon.surface.confidence import COEFFICIENTS, RIGHT_WITHIN, SURE, features
 from faintfield.recon.surface.estimate import first_depths, halves, next_depths
 from faintfield.recon.surface.evidence import DepthEvidence
@@ -29,12 +30,14 @@ from faintfield.recon.surface.sweep import equal_steps
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
+_NOTHING = np.zeros(0)
+
 
 def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
     loaded = load_set(folder)
     bins = default_bins(loaded)
-    views, nodes = luminance(loaded, bins), nodes_of(loaded)
+    views, nodes = between_pixels(luminance(loaded, bins)), nodes_of(loaded)
     true_mm = tifffile.imread(truth / "true_depth_mm.tiff")[bins // 2 :: bins, bins // 2 :: bins]
     true_mm = true_mm[: views.grid.shape[0], : views.grid.shape[1]]
     depths = equal_steps(views, 1 / (1.2 * float(np.nanmax(true_mm))), 1 / (0.85 * float(np.nanmin(true_mm))))
@@ -49,17 +52,22 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
     return measured.reshape(len(measured), -1).T, right[thin].ravel()
 
 
-def fitted(sets: Sequence[tuple[NDArray[np.float64], NDArray[np.bool_]]]) -> NDArray[np.float64]:
-    """Return the coefficients (feature,) under which sets are most likely, all sets counting alike."""
+def fitted(
+    sets: Sequence[tuple[NDArray[np.float64], NDArray[np.bool_]]], known: NDArray[np.float64] = _NOTHING
+) -> NDArray[np.float64]:
+    """Return the coefficients (feature,) after those known under which sets are most likely, all sets counting alike."""
     x = np.concatenate([features for features, _ in sets])
+    offset, x = x[:, : known.size] @ known, x[:, known.size :]
     sign = np.concatenate([2.0 * right - 1 for _, right in sets])
     weight = np.concatenate([np.full(len(right), 1 / (len(right) * len(sets))) for _, right in sets])
+    free = np.arange(x.shape[1]) > (-1 if known.size else 0)  # the prior leaves the constant alone
 
     def loss(a: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        margin = (x @ a) * sign
+        margin = (offset + x @ a) * sign
         slope = -(x.T @ (weight * sign / (1 + np.exp(margin))))
-        prior = np.concatenate([[0], a[1:]])
-        return float(weight @ np.logaddexp(0, -margin)) + _PRIOR * float(prior @ prior), slope + 2 * _PRIOR * prior
+        return float(weight @ np.logaddexp(0, -margin)) + _PRIOR * float(
+            a[free] @ a[free]
+        ), slope + 2 * _PRIOR * a * free
 
     return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x)
 
@@ -68,9 +76,13 @@ def main(words: Sequence[str] | None = None) -> None:
     """Print the fitted coefficients, and what they and the present ones say of each set."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.surface_confidence", description=__doc__)
     parser.add_argument("sets", nargs="+", metavar="SET=TRUTH")
-    named = [name.split("=") for name in parser.parse_args(words).sets]
+    parser.add_argument("--misleading", nargs="*", default=[], metavar="SET=TRUTH")
+    arguments = parser.parse_args(words)
+    named = [name.split("=") for name in (*arguments.sets, *arguments.misleading)]
     sets = [samples_of(Path(folder), Path(truth)) for folder, truth in named]
-    found = fitted(sets)
+    plain, misleading = sets[: len(arguments.sets)], sets[len(arguments.sets) :]
+    found = fitted([(x[:, :-1], right) for x, right in plain])
+    found = np.append(found, fitted(misleading, found) if misleading else COEFFICIENTS[-1])
     print("fitted", ", ".join(f"{value:.3f}" for value in found))
     for (folder, _), (x, right) in zip(named, sets, strict=True):
         for name, coefficients in {"fitted": found, "present": np.array(COEFFICIENTS)}.items():

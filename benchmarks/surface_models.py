@@ -40,6 +40,14 @@ def model(name: str) -> list[Any]:
     return [mi.load_dict({**objects, "lamp": lamp}) for lamp in _LAMPS]
 
 
+def opaque(name: str) -> Any:
+    """Return a scene without its panes of glass, whose light comes from what is behind them."""
+    objects = {
+        key: value for key, value in SCENES[name]().items() if value.get("bsdf", {}).get("type") != "thindielectric"
+    }
+    return mi.load_dict({"type": "scene", **objects})
+
+
 def room() -> dict[str, Any]:
     """Return a room: a slanted wall, a floor, a ball, a cube and a rod 10 mm thick."""
     return {

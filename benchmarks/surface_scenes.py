@@ -8,8 +8,8 @@ serves development only and stays out of .venv: make an environment for it alone
 `build/mitsuba/bin/pip install mitsuba numpy scipy tifffile`) and call its Python. Nothing of faintfield is imported.
 
 The scenes are `room`, `desk` and `hills`, and four whose depth cannot be known everywhere: most of `even` has no
-texture; `mirror` and `glass` show what is elsewhere, while the true depth is theirs; and `repeated` consists of squares
-that are all alike.
+texture; `mirror` and the ball of `glass` show what is elsewhere, while the true depth is theirs; and `repeated` consists of
+squares that are all alike. A pane of glass has the depth of what shines through it.
 """
 
 import argparse
@@ -29,7 +29,7 @@ try:
 except ModuleNotFoundError:
     mi = None
 
-from benchmarks.surface_models import SCENES, model
+from benchmarks.surface_models import SCENES, model, opaque
 
 _WHITE_DN = 50000
 
@@ -175,7 +175,7 @@ def write_scene(name: str, out: Path, camera: Camera, nodes: Sequence[Node]) -> 
         tifffile.imwrite(out / node.image, np.clip(np.rint(view * scale), 0, 65535).astype(np.uint16))
         print(f"{name}: view {index + 1} of {len(nodes)}", file=sys.stderr)
     tifffile.imwrite(out / "true_picture.tiff", reference * np.float32(scale))
-    tifffile.imwrite(out / "true_depth_mm.tiff", true_depth_mm(scenes[0], camera))
+    tifffile.imwrite(out / "true_depth_mm.tiff", true_depth_mm(opaque(name), camera))
     (out / "elemental.toml").write_text(settings_text(camera, nodes))
 
 

@@ -109,25 +109,13 @@ def write_depth_map(
 def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
     """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
     # Here, because planes need none of it
-    from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
-    from faintfield.pipelines.reconstruction.surface_depths import (
-        BETWEEN_PIXELS,
-        between_pixels,
-        depths_of_set,
-        enlarged,
-        in_unit,
-    )
+    from faintfield.pipelines.reconstruction.luminance import default_bins
+    from faintfield.pipelines.reconstruction.surface_depths import depths_of_set, enlarged, in_unit
     from faintfield.recon.surface.confidence import SURE
-    from faintfield.recon.surface.lit import lit_samples
 
     bins, shape = default_bins(loaded), plane_grid(loaded, 1.0).shape
-    views = between_pixels(luminance(loaded, bins))
-    compared, estimate = depths_of_set(loaded, views, (depths_mm[0], depths_mm[-1]), find_range=False)
-    knowable = _within(compared, estimate.inverse_depth) & lit_samples(views, estimate.inverse_depth)
-    inverse_depth, confidence = (
-        enlarged(part, shape, bins, moved=BETWEEN_PIXELS)
-        for part in (estimate.inverse_depth, np.where(knowable, estimate.confidence, 0))
-    )
+    _, estimate = depths_of_set(loaded, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
+    inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
     unit: Literal["mm", "px"] = "px" if disparities_px else "mm"
     scale = [disparities_px[depth] if disparities_px else depth for depth in depths_mm]
     known = confidence.astype(np.float32) >= SURE  # as in the file
@@ -144,12 +132,6 @@ def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Ma
     )
     index = np.interp(-inverse_depth, -1 / np.asarray(depths_mm), np.arange(len(depths_mm)))
     return _Map(record, (min(scale), max(scale)), index, np.where(known, values, np.nan), confidence)
-
-
-def _within(compared: NDArray[np.float64], inverse_depth: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether 1/depth is more than a step from both ends of those compared: the true one may lie beyond."""
-    step = compared[1] - compared[0]
-    return np.asarray((inverse_depth > compared[0] + step) & (inverse_depth < compared[-1] - step))
 
 
 def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:

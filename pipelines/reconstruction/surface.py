@@ -27,7 +27,7 @@ from faintfield.pipelines.formats.results.surface import (
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
-from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
+from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
 from faintfield.pipelines.reconstruction.planes import Settings, mean_e, solve_then_sigma
@@ -111,9 +111,7 @@ def reconstruct_surface(
     range_mm = limits_mm(loaded, request)
     remove_leftovers(out)
     bins = default_bins(loaded)
-    depths, estimate = depths_of_set(
-        loaded, luminance(loaded, bins), range_mm, find_range=request.depth_range_mm is None
-    )
+    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=request.depth_range_mm is None)
     far, near = float(depths[0]), float(depths[-1])
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
     with naming_range(far, near):

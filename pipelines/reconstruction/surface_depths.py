@@ -15,6 +15,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.autofocus import overlap, searched_range_mm
+from faintfield.pipelines.reconstruction.luminance import luminance
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
@@ -102,16 +103,18 @@ def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
 
 
 def depths_of_set(
-    loaded: ElementalSet, views: PinholeViews, range_mm: tuple[float, float], *, find_range: bool
+    loaded: ElementalSet, bins: int, range_mm: tuple[float, float], *, find_range: bool
 ) -> tuple[NDArray[np.float64], SurfaceEstimate]:
-    """Return the 1/depths that are compared, ascending, and the depth of each sample of the views by them.
+    """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
+
+    The samples are those of `between_pixels`; `enlarged` brings their maps to the pixels.
 
     Parameters
     ----------
     loaded : ElementalSet
         The set.
-    views : PinholeViews
-        Its light, see `luminance`.
+    bins : int
+        Pixels along a side of a bin.
     range_mm : (float, float)
         Nearest and farthest depth.
     find_range : bool
@@ -124,7 +127,7 @@ def depths_of_set(
     NothingInFocus
         Nothing is found in the range.
     """
-    nodes = nodes_of(loaded)
+    nodes, views = nodes_of(loaded), between_pixels(luminance(loaded, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
     with naming_range(far, near):
         if find_range:
@@ -178,7 +181,7 @@ def between_pixels(views: PinholeViews) -> PinholeViews:
 
 
 def enlarged(
-    part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = 0.0
+    part: NDArray[np.floating], shape: tuple[int, int], bins: int, *, moved: float = BETWEEN_PIXELS
 ) -> NDArray[np.float64]:
     """Return a map of bins on the samples of a picture, each with the nearest value.
 

@@ -25,10 +25,13 @@ _EXPLAINED = 0.5
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-3.452, 0.938, 1.763, 0.621, 1.072)
+COEFFICIENTS = (-4.040, 1.082, 1.866, 0.941, 1.626)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
+
+# Where a surface explains less of the detail than this, nor above this: other surfaces may explain as much.
+_POORLY_EXPLAINED, _MAX_IF_POORLY = 0.35, 0.85
 
 
 def confidence(
@@ -53,7 +56,8 @@ def confidence(
         How much of the views' detail the surface explains, see `explained_share`.
     """
     logit = np.tensordot(np.asarray(COEFFICIENTS), features(index, costs, inverse_depths, explained), 1)
-    return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), _MAX_CONFIDENCE), np.float32)
+    most = np.where(explained < _POORLY_EXPLAINED, _MAX_IF_POORLY, _MAX_CONFIDENCE)
+    return np.asarray(np.minimum(1 / (1 + np.exp(-logit)), most), np.float32)
 
 
 def features(

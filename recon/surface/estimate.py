@@ -16,6 +16,7 @@ from faintfield.recon.surface.evidence import DepthEvidence, Explained, Halves
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
 from faintfield.recon.surface.goodness import explained_share
 from faintfield.recon.surface.held_out import Prediction, predicted, seen_of, squared_errors
+from faintfield.recon.surface.lit import lit_samples
 from faintfield.recon.surface.paths import lowest, sum_over_paths
 from faintfield.recon.surface.pinhole_views import PinholeViews
 
@@ -100,6 +101,8 @@ def estimate_surface(
     index, costs = next_depths(final, final.explained(candidates[best]))
     sure = confidence(index, costs, inverse_depths, explained_share(final, index))
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
+    # Beyond the ends, there may be a better depth
+    sure[(index <= 1) | (index >= len(inverse_depths) - 2) | ~lit_samples(views, depths)] = 0
     return SurfaceEstimate(depths, sure, best + 1, prediction)
 
 

@@ -151,7 +151,9 @@ class DepthEvidence:
             sums = self._sums(stack, inverse_depth, relief, tolerance)
             lights = [self._denoised(sum_e, count, _OF_DEPTH) for count, sum_e, _ in sums]
             own, matched = np.zeros_like(self.variance), np.zeros_like(self.variance)
-            for (count, sum_e, of_known), light, of_surface in zip(sums, reversed(lights), reversed(details), strict=True):
+            for (count, sum_e, of_known), light, of_surface in zip(
+                sums, reversed(lights), reversed(details), strict=True
+            ):
                 own += sum_e * light - np.float32(0.5) * count * light**2 - of_known
                 matched += count * detail(sum_e / np.maximum(count, 0.5), count, _DETAIL) * of_surface
             return [own, np.float32(0.5) * (own + matched)]

@@ -38,7 +38,5 @@ def explained_share(evidence: DepthEvidence, index: NDArray[np.floating]) -> NDA
         errors = squared_errors(evidence, known.operator.forward(light, half), half)
         excess[half] = np.where(seen_of(evidence, known, half), 0.5 * (errors - 1), 0)
     misfit = np.asarray(known.operator.adjoint(excess), np.float32)
-    e, x = (
-        np.maximum(gaussian(part, _WINDOW) * np.float32(4 * np.pi * _WINDOW**2), 0) for part in (explained, misfit)
-    )
+    e, x = (np.maximum(gaussian(part, _WINDOW) * np.float32(4 * np.pi * _WINDOW**2), 0) for part in (explained, misfit))
     return np.asarray((e + _CHANCE) / (e + x + _CHANCE), np.float32)
