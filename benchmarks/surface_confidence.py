@@ -30,6 +30,7 @@ from faintfield.recon.surface.sweep import equal_steps
 # Rounds of depth and light; every so many samples along each axis are used; weight of the prior.
 _ROUNDS, _STRIDE, _PRIOR = 4, 2, 1e-3
 
+# No coefficients
 _NOTHING = np.zeros(0)
 
 
@@ -55,7 +56,7 @@ def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[
 def fitted(
     sets: Sequence[tuple[NDArray[np.float64], NDArray[np.bool_]]], known: NDArray[np.float64] = _NOTHING
 ) -> NDArray[np.float64]:
-    """Return the coefficients (feature,) after those known under which sets are most likely, all sets counting alike."""
+    """Return the coefficients (feature,) after those known that make sets most likely, all sets counting alike."""
     x = np.concatenate([features for features, _ in sets])
     offset, x = x[:, : known.size] @ known, x[:, known.size :]
     sign = np.concatenate([2.0 * right - 1 for _, right in sets])

@@ -8,8 +8,8 @@ serves development only and stays out of .venv: make an environment for it alone
 `build/mitsuba/bin/pip install mitsuba numpy scipy tifffile`) and call its Python. Nothing of faintfield is imported.
 
 The scenes are `room`, `desk` and `hills`, and four whose depth cannot be known everywhere: most of `even` has no
-texture; `mirror` and the ball of `glass` show what is elsewhere, while the true depth is theirs; and `repeated` consists of
-squares that are all alike. A pane of glass has the depth of what shines through it.
+texture; `mirror` and the ball of `glass` show what is elsewhere, while the true depth is theirs; and `repeated`
+consists of squares that are all alike. A pane of glass has the depth of what shines through it.
 """
 
 import argparse

@@ -25,7 +25,7 @@ _EXPLAINED = 0.5
 _APART_STEPS = 3.0
 
 # Coefficients of the logistic model, in the order of `features`: fitted by `python -m benchmarks.surface_confidence`.
-COEFFICIENTS = (-4.040, 1.082, 1.866, 0.941, 1.626)
+COEFFICIENTS = (-3.773, 1.015, 1.953, 0.814, 1.967)
 
 # No probability is stated above this: scenes contain what no model has.
 _MAX_CONFIDENCE = 0.95
@@ -68,8 +68,8 @@ def features(
 ) -> NDArray[np.float64]:
     """Return what the probability depends on (feature, row, column); the first is one everywhere.
 
-    In order: one; by how much alternatives cost more (logarithm); the distance to the next edge of something nearer; the
-    distance to the border of the picture; how much of the detail is explained (logarithm), if it is little.
+    In order: one; by how much alternatives cost more (logarithm); the distance to the next edge of something nearer;
+    the distance to the border of the picture; how much of the detail is explained (logarithm), if it is little.
     """
     q = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
     tolerance = RIGHT_WITHIN * q / (inverse_depths[1] - inverse_depths[0])

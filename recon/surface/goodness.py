@@ -17,10 +17,11 @@ _CHANCE = 100.0
 def explained_share(evidence: DepthEvidence, index: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return how much of the views' detail a surface explains, near each sample (row, column), between 0 and 1.
 
-    In a window, let E be by how much the detail of the light raises the log-likelihood, as the two halves of the views
-    agree on it, and X by how much the errors of one half, predicted by the light of the other, exceed those of the noise.
-    Returned is `(E + c) / (E + X + c)`, with c for what chance does to both. It is small where something shines, is seen
-    through or repeats itself, because no light of one surface then fits all views; and next to 1 where little is seen.
+    In a window, let E be by how much the detail of the light raises the log-likelihood, as far as the two halves of
+    the views agree on it, and X by how much the errors of one half, predicted by the light of the other, exceed those
+    of the noise. Returned is `(E + c) / (E + X + c)`, with c for what chance does to both. It is small where something
+    shines, is seen through or repeats itself, because no light of one surface then fits all views. It is near 1 where
+    little is seen at all.
 
     Parameters
     ----------
