@@ -42,6 +42,9 @@ _STEP_COSTS, _STEP_COSTS_AT_FIRST = (0.5, 4.0), (1.0, 10.0)
 _BEND, _REFINED, _STEPS = (0.05, 0.3), 3.0, 60
 _STAGES = (100.0, 50.0, 25.0, 12.0, 6.0, 3.0)
 
+# The highest confidence at the ends of the range, as a better depth may lie beyond, and where there is no light.
+_DOUBTFUL = 0.5
+
 
 @dataclass(frozen=True)
 class SurfaceEstimate:
@@ -101,8 +104,8 @@ def estimate_surface(
     index, costs = next_depths(final, final.explained(candidates[best]))
     sure = confidence(index, costs, inverse_depths, explained_share(final, index))
     depths = np.interp(index, np.arange(len(inverse_depths)), inverse_depths)
-    # Beyond the ends, there may be a better depth
-    sure[(index <= 1) | (index >= len(inverse_depths) - 2) | ~lit_samples(views, depths)] = 0
+    doubtful = (index <= 1) | (index >= len(inverse_depths) - 2) | ~lit_samples(views, depths)
+    sure[doubtful] = np.minimum(sure[doubtful], _DOUBTFUL)
     return SurfaceEstimate(depths, sure, best + 1, prediction)
 
 
