@@ -28,6 +28,9 @@ ROUNDING_DN2 = 1.0 / 12.0
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
+# Limits of parameters. Without dark signal nothing determines the gain, and the search would follow a ridge to infinity.
+_LIMITS = {"jitter_dn2": (0.0, np.inf), "log_gain": (np.log(1e-4), np.log(1e4))}
+
 _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
 
 
@@ -95,12 +98,12 @@ def _minimize(
     solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0})
     # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would push
     # what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
-    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in start]
+    limits = np.array([_LIMITS.get(name, (-np.inf, np.inf)) for name in start]) / units[:, None]
     # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
     # avoid that.
     for share in (1.0, 0.1, 0.01):
         first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
-        found = solver(x0=(first / units).tolist(), lbx=lower)
+        found = solver(x0=(first / units).tolist(), lbx=limits[:, 0], ubx=limits[:, 1])
         if solver.stats()["success"]:
             return np.array(found["x"]).ravel(), float(found["f"])
     raise PoorFit(
