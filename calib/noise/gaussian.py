@@ -18,9 +18,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from faintfield.calib.errors import PoorFit
-from faintfield.calib.noise.moments import FlatMoments, Moments
+from faintfield.calib.noise.moments import NO_EXCESS, Excess, FlatMoments, Moments
+from faintfield.calib.noise.response import BENDS, bend_log_prior, charge_dn, charge_slope, level_log_likelihood
 
 # Variance in DN² that rounding to whole DN adds.
 ROUNDING_DN2 = 1.0 / 12.0
@@ -28,7 +30,7 @@ ROUNDING_DN2 = 1.0 / 12.0
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
-# Limits of parameters. Without dark signal nothing determines the gain, and the search would follow a ridge to infinity.
+# Limits of parameters. Without dark signal nothing determines the gain, and the search would not end.
 _LIMITS = {"jitter_dn2": (0.0, np.inf), "log_gain": (np.log(1e-4), np.log(1e4))}
 
 _SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
@@ -42,16 +44,32 @@ class NoiseFit:
     ----------
     values : dict
         `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, if the series determine them,
-        `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, `nonlinearity_per_dn` κ.
+        `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, and κ₁, κ₂ … by the names in `response.BENDS`.
     covariance : array (parameter, parameter)
         Covariance in the order of `values`; zero for a jitter that is zero.
     log_likelihood : float
         Log-likelihood at the maximum, up to a constant.
+    sources : tuple of (array, int)
+        Derivative of the covariance by the logarithm of each scatter between series that was measured from them, with
+        its degrees of freedom.
     """
 
     values: dict[str, float]
     covariance: NDArray[np.float64]
     log_likelihood: float
+    sources: tuple[tuple[NDArray[np.float64], int], ...] = ()
+
+    def quantile(self, gradient: NDArray[np.float64]) -> float:
+        """Return the half width of a 95 % interval, in standard errors, of a linear combination of the parameters.
+
+        The scatter between series is known from few of them only. Student's t has Satterthwaite's degrees of freedom
+        (Biometrics Bulletin 2, 110, 1946), from the variance of the variance.
+        """
+        variance = float(gradient @ self.covariance @ gradient)
+        spread = sum(min(float(gradient @ c @ gradient), variance) ** 2 / freedom for c, freedom in self.sources)
+        if not spread > 1e-6 * variance**2:
+            return float(stats.norm.ppf(0.975))
+        return float(stats.t.ppf(0.975, variance**2 / spread))
 
     def standard_error(self, name: str) -> float:
         """Return the standard error of one parameter, infinite for one that was not fitted."""
@@ -61,34 +79,52 @@ class NoiseFit:
         return float(np.sqrt(self.covariance[index, index]))
 
 
-def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
+def fit_gaussian(moments: Moments, *, bends: int = 0) -> NoiseFit:
     """Maximize the marginal likelihood; the covariance is the inverse of the exact Hessian.
 
     Parameters
     ----------
     moments : Moments
         Sufficient statistics; some series must have two frames or more.
-    nonlinear : bool
-        Fit the nonlinearity κ of the response too, which requires flats at three light levels.
+    bends : int
+        Number of coefficients κ₁, κ₂ … of the response to fit, eq. (5), which only flats can show.
 
     Raises
     ------
     PoorFit
         IPOPT did not converge.
     """
-    start, scale = _start(moments, nonlinear)
+    start, scale = _start(moments, bends)
     units = np.array([*scale.values()])
     x = ca.SX.sym("x", len(start))
-    parameters = {name: x[i] * scale[name] for i, name in enumerate(start)}
-    objective = negative_log_likelihood(parameters, moments)
+    objective = negative_log_likelihood({name: x[i] * scale[name] for i, name in enumerate(start)}, moments)
     at, minimum = _minimize(objective, x, start, units)
-    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(start)])
+    values = dict(zip(start, (at * units).tolist(), strict=True))
+    return NoiseFit(values, covariance_at(values, moments, scale), -minimum)
+
+
+def covariance_at(
+    values: Mapping[str, float], moments: Moments, scale: Mapping[str, float] | None = None
+) -> NDArray[np.float64]:
+    """Return the inverse of the Hessian of −ln L at given parameters, in their order.
+
+    Parameters
+    ----------
+    values : mapping
+        Parameters at the maximum, or close to it.
+    moments : Moments
+        Sufficient statistics.
+    scale : mapping, optional
+        Size of a small change of each parameter; chosen from the series by default.
+    """
+    scale = scale or _start(moments, sum(name in values for name in BENDS))[1]
+    units = np.array([scale[name] for name in values])
+    x = ca.SX.sym("x", len(values))
+    objective = negative_log_likelihood({name: x[i] * units[i] for i, name in enumerate(values)}, moments)
+    at = np.array([*values.values()]) / units
+    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(values)])
     hessian = np.array(ca.Function("hessian", [x], [ca.hessian(objective, x)[0]])(at))
-    return NoiseFit(
-        values=dict(zip(start, (at * units).tolist(), strict=True)),
-        covariance=_inverse_on(hessian, free) * np.outer(units, units),
-        log_likelihood=-minimum,
-    )
+    return _inverse_on(hessian, free) * np.outer(units, units)
 
 
 def _minimize(
@@ -136,30 +172,40 @@ def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64
 
 
 def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) -> list[Any]:
-    """Return the pixel noise of each flat series, eq. (1) with a nonlinear response.
-
-    The charge behind a signal s is (s/g)(1 + κs), so that one more electron raises s by g/(1 + 2κs).
-    """
+    """Return the pixel noise of each flat series: eq. (1), with the local gain of the response, eq. (5)."""
     if not mean_dn.size:
         return []
     gain, read = _exp(values["log_gain"]), _exp(values["log_read_dn2"])
-    bend = values.get("nonlinearity_per_dn", 0.0)
     signals = [mean - values["offset_dn"] for mean in mean_dn]
-    return [(gain * s * (1 + bend * s) + read) / (1 + 2 * bend * s) ** 2 + ROUNDING_DN2 for s in signals]
+    return [(gain * charge_dn(values, s) + read) / charge_slope(values, s) ** 2 + ROUNDING_DN2 for s in signals]
 
 
 def flat_log_likelihood(
-    values: Mapping[str, Any], flats: FlatMoments, freedom: float
+    values: Mapping[str, Any], flats: FlatMoments, freedom: float, excess: Excess = NO_EXCESS
 ) -> tuple[Any, list[Any], list[float]]:
-    """Return ln L of the flats up to a constant, and ln v and half the degrees of freedom of each series."""
+    """Return ln L of the flats' noise up to a constant, and ln v and half the degrees of freedom of each series."""
     total, log_variances, half_freedom = 0.0, [], []
     for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
         weight = flats.evenness[index]
         degrees = (flats.frames[index] - 1) * freedom * weight
-        total -= _chi_squared(degrees, flats.within_dn2[index] * weight, v)
+        grown = excess.dispersion(degrees, flat=True)
+        total -= _chi_squared(degrees / grown, flats.within_dn2[index] * weight / grown, v)
         log_variances.append(ca.log(v))
-        half_freedom.append(0.5 * degrees)
+        half_freedom.append(0.5 * degrees / grown)
     return total, log_variances, half_freedom
+
+
+def level_variances_dn2(values: Mapping[str, Any], moments: Moments) -> list[Any]:
+    """Return the variance of the mean level of each flat series: pixel noise, jitter, drift and unsteady light."""
+    flats, excess = moments.flats, moments.excess
+    noise = flat_variances_dn2(values, flats.mean_dn)
+    jitter = values.get("jitter_dn2", 0.0)
+    return [
+        (jitter + v / moments.pixels) / flats.frames[j]
+        + excess.drift_dn2
+        + excess.light2 * (flats.mean_dn[j] - values["offset_dn"]) ** 2
+        for j, v in enumerate(noise)
+    ]
 
 
 def _exp(value: Any) -> Any:
@@ -174,8 +220,23 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
     for j, v in enumerate(dark_v):
         freedom = (darks.frames[j] - 1) * moments.freedom
-        total += _chi_squared(freedom, darks.within_dn2[j], v)
-    return total - flat_log_likelihood(values, moments.flats, moments.freedom)[0]
+        grown = moments.excess.dispersion(freedom, flat=False)
+        total += _chi_squared(freedom / grown, darks.within_dn2[j] / grown, v)
+    return total - _light(values, moments)
+
+
+def _light(values: Mapping[str, Any], moments: Moments) -> Any:
+    """Return ln L of the flats: of their noise, and of their levels where these tell the bend of the response."""
+    flats = moments.flats
+    total = flat_log_likelihood(values, flats, moments.freedom, moments.excess)[0]
+    if not any(name in values for name in BENDS):
+        return total
+    if np.isfinite(flats.bend_se):
+        total = total + bend_log_prior(values, flats.range_dn, flats.bend_se)
+    if not flats.light.groups.size:
+        return total
+    variances = level_variances_dn2(values, moments)
+    return total + level_log_likelihood(values, flats.light, flats.mean_dn, flats.exposure_s, variances)
 
 
 def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
@@ -188,10 +249,11 @@ def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any
     total, weight = 0.0, []
     for j, v in enumerate(dark_v):
         level = values["jitter_dn2"] + v / moments.pixels
-        weight.append(darks.frames[j] / level)
+        mean = level / darks.frames[j] + moments.excess.drift_dn2
+        weight.append(1 / mean)
         line = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * t[j]
         total += _chi_squared(darks.frames[j] - 1, darks.level_scatter_dn2[j], level)
-        total += _chi_squared(1.0, (darks.mean_dn[j] - line) ** 2, level / darks.frames[j])
+        total += _chi_squared(1.0, (darks.mean_dn[j] - line) ** 2, mean)
     w, wt, wtt = (sum(w * t[j] ** power for j, w in enumerate(weight)) for power in range(3))
     fitted = w * wtt - wt**2 if "dark_signal_dn_per_s" in values else w
     return total + 0.5 * ca.log(fitted)
@@ -232,7 +294,7 @@ def _quadratic(weight: list[Any], a: NDArray[np.float64], b: NDArray[np.float64]
     return ca.mtimes([left.T, ca.DM(scatter), right])
 
 
-def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[str, float]]:
+def _start(moments: Moments, bends: int) -> tuple[dict[str, float], dict[str, float]]:
     """Return initial values from simple moments, and the scale, of each parameter that the series determine."""
     darks, flats = moments.darks, moments.flats
     measured = darks.frames > 1
@@ -251,8 +313,9 @@ def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[st
         start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
     if flats.frames.size or repeated.size > 1:
         start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
-    if nonlinear:
-        start["nonlinearity_per_dn"], scale["nonlinearity_per_dn"] = 0.0, 1e-6
+    for power, name in enumerate(BENDS[:bends], 1):
+        brightest = float(flats.mean_dn.max()) - float(line[1])
+        start[name], scale[name] = 0.0, 0.01 / brightest**power
     return start, scale
 
 

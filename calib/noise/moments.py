@@ -9,11 +9,12 @@ levels and profiles takes R + C − 1 of the P degrees of freedom. Of the rest,
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.noise.response import Light, known_light
 from faintfield.calib.noise.statistics import Series
 
 
@@ -24,7 +25,7 @@ class DarkMoments:
     Attributes
     ----------
     exposure_s, frames : array (series,)
-        Exposure time t_j and number of frames n_j.
+        Exposure time t_j at the temperature of reference, and number of frames n_j.
     mean_dn : array (series,)
         Mean over frames and pixels.
     within_dn2 : array (series,)
@@ -54,12 +55,53 @@ class FlatMoments:
     evenness : array (series,)
         ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
         noisier than others.
+    exposure_s, level_scatter_dn2 : array (series,)
+        As for the darks.
+    light : Light
+        What is known of their light.
+    range_dn, bend_se : float
+        Signal at the end of the range, and the standard error of the bend there before it is measured.
     """
 
     frames: NDArray[np.float64]
     mean_dn: NDArray[np.float64]
     within_dn2: NDArray[np.float64]
     evenness: NDArray[np.float64]
+    exposure_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    light: Light = field(default_factory=lambda: known_light([]))
+    level_scatter_dn2: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    range_dn: float = np.inf
+    bend_se: float = np.inf
+
+
+@dataclass(frozen=True)
+class Excess:
+    """Scatter that the model of the pixels does not explain; see `calib.noise.goodness`.
+
+    Attributes
+    ----------
+    darks, flats : float
+        Squared deviations of variances over blocks of pixels, over those of normal noise.
+    variance2 : float
+        Relative variance of a series' noise about the model.
+    drift_dn2 : float
+        Variance of the level of a series of darks about the straight line.
+    light2 : float
+        Relative variance of the level of a series of flats about the response.
+    """
+
+    darks: float = 1.0
+    flats: float = 1.0
+    variance2: float = 0.0
+    drift_dn2: float = 0.0
+    light2: float = 0.0
+
+    def dispersion(self, freedom: float, *, flat: bool) -> float:
+        """Return the variance of a sum of squares over that of χ² with `freedom` degrees of freedom."""
+        return (self.flats if flat else self.darks) + 0.5 * freedom * self.variance2
+
+
+NO_EXCESS = Excess()
 
 
 @dataclass(frozen=True)
@@ -70,6 +112,7 @@ class Moments:
     freedom: float
     darks: DarkMoments
     flats: FlatMoments
+    excess: Excess = NO_EXCESS
 
 
 def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]) -> Moments:
@@ -90,7 +133,7 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
         pixels=pixels,
         freedom=max(pixels - rows - columns + 1.0, 1.0),
         darks=DarkMoments(
-            exposure_s=np.array([series.conditions.exposure_s for series in darks]),
+            exposure_s=np.array([series.conditions.dark_time_s for series in darks]),
             frames=np.array([series.frames for series in darks], np.float64),
             mean_dn=np.array([_mean_dn(series, used) for series in darks]),
             within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in darks]),
@@ -102,6 +145,9 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
             mean_dn=np.array([_mean_dn(series, used) for series in flats]),
             within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in flats]),
             evenness=np.array([_evenness(series.mean_dn[used] - dark_dn[used]) for series in flats]),
+            exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
+            light=known_light(flats),
+            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in flats]),
         ),
     )
 

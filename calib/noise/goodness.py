@@ -1,0 +1,292 @@
+"""How well the series follow the model, and the scatter that intervals must grow by.
+
+Three kinds of scatter are measured from what the fit leaves, each as the variance with which the squares of the
+residuals are as large as their degrees of freedom (Mandel and Paule, Analytical Chemistry 42, 1194, 1970): that of a
+series' noise about the model, of the darks' levels about their straight line, and of the flats' levels about the
+response. A fourth is that of the noise over blocks of pixels, which is wider than χ² where noise has long tails.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from faintfield.calib.noise.gaussian import (
+    NoiseFit,
+    covariance_at,
+    dark_variances_dn2,
+    fit_gaussian,
+    flat_variances_dn2,
+    level_variances_dn2,
+)
+from faintfield.calib.noise.moments import Excess, Moments
+from faintfield.calib.noise.response import charge_dn, charge_slope, grown_variance, scatter_of_levels
+from faintfield.calib.noise.statistics import Series
+
+type Array = NDArray[np.float64]
+
+# Blocks of pixels along each side of a frame.
+_BLOCKS = 8
+
+# Blocks scatter more than chance allows below this probability.
+_MAX_CHANCE = 0.05
+
+# Rounds of fits in which the scatter is measured, and its relative change at which they end.
+_MAX_ROUNDS, _SETTLED = 5, 0.02
+
+# Parameters that the noise of series determines: read noise and gain.
+_NOISE_PARAMETERS = 2
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Deviance of one grouping of a series' noise, and its degrees of freedom."""
+
+    deviance: float
+    freedom: int
+
+
+@dataclass(frozen=True)
+class SeriesGoodness:
+    """How well one series follows the model.
+
+    Attributes
+    ----------
+    series : Series
+        The series.
+    noise_excess, noise_se : float, optional
+        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
+    level_residual_dn : float, optional
+        Level minus that of the model; None where the light of a flat is not known.
+    blocks, rows, columns, frames : Scatter, optional
+        Scatter of the noise over blocks of pixels, rows, columns and frames.
+    """
+
+    series: Series
+    noise_excess: float | None
+    noise_se: float | None
+    level_residual_dn: float | None
+    blocks: Scatter | None = None
+    rows: Scatter | None = None
+    columns: Scatter | None = None
+    frames: Scatter | None = None
+
+
+def noise_freedom(moments: Moments) -> tuple[Array, Array]:
+    """Return the degrees of freedom of the noise of each dark and each flat series."""
+    darks, flats = moments.darks, moments.flats
+    return (darks.frames - 1) * moments.freedom, (flats.frames - 1) * moments.freedom * flats.evenness
+
+
+def block_scatter(
+    series: Series, expected_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int
+) -> tuple[Array, Array]:
+    """Return the noise of rows × columns blocks over the expected one, and the degrees of freedom of each.
+
+    Both are arrays (block,); blocks with fewer than two pixels in use are left out.
+    """
+    row = np.arange(used.shape[0]) * rows // used.shape[0]
+    column = np.arange(used.shape[1]) * columns // used.shape[1]
+    block = (row[:, None] * columns + column)[used]
+    size = rows * columns
+    count = np.bincount(block, minlength=size)
+    measured = np.bincount(block, series.within_dn2[used], size)
+    expected = np.bincount(block, np.broadcast_to(expected_dn2, used.shape)[used], size)
+    share = max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
+    enough = count > 1
+    freedom = (series.frames - 1) * count[enough] * share
+    return measured[enough] / (expected[enough] * (series.frames - 1) * share), np.asarray(freedom, float)
+
+
+def _dispersion(series: Sequence[Series], noise_dn2: Sequence[Array | float], used: NDArray[np.bool_]) -> float:
+    """Return how much wider than χ² the noise of blocks scatters, at least 1.
+
+    What the blocks of all series have in common is a difference between pixels, not chance, and is taken out.
+    """
+    several = [(one, v) for one, v in zip(series, noise_dn2, strict=True) if one.frames > 1]
+    if len(several) < 2:
+        return 1.0
+    ratios, freedoms = zip(*(block_scatter(one, v, used, _BLOCKS, _BLOCKS) for one, v in several), strict=True)
+    ratio, weight = np.array(ratios), np.array(freedoms) / 2
+    ratio = ratio / np.average(ratio, axis=1, weights=weight[0])[:, None]
+    rest = ratio - np.average(ratio, axis=0, weights=weight[:, 0])
+    freedom = (ratio.shape[0] - 1) * (ratio.shape[1] - 1)
+    deviance = float(np.sum(weight * rest**2))
+    return deviance / freedom if stats.chi2.sf(deviance, freedom) < _MAX_CHANCE else 1.0
+
+
+def flat_noise_map(fit: NoiseFit, one: Series) -> Array:
+    """Return the noise that the model expects of each pixel (row, column) of a flat, from its own mean."""
+    mean = np.maximum(one.mean_dn, fit.values["offset_dn"])
+    grid = np.linspace(float(mean.min()), float(mean.max()) + 1e-6, 64)
+    return np.asarray(np.interp(mean, grid, flat_variances_dn2(fit.values, grid)))
+
+
+def measure_excess(
+    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
+) -> tuple[Excess, tuple[int, int, int]]:
+    """Return the scatter beyond the model, and the degrees of freedom of `variance2`, `drift_dn2` and `light2`."""
+    dark_noise = dark_variances_dn2(fit.values, moments.darks.exposure_s)
+    excess = Excess(
+        darks=_dispersion(darks, dark_noise, used),
+        flats=_dispersion(flats, [flat_noise_map(fit, one) for one in flats], used),
+    )
+    variance2, freedom = _noise_scatter(fit, moments, excess)
+    drift_dn2, drift_freedom = _drift(fit, moments)
+    light = moments.flats.light
+    bends = sum(name.startswith("nonlinearity") for name in fit.values)
+    light2, light_freedom = 0.0, light.freedom - bends
+    if light.groups.size:
+        signal = _light_signal(fit, moments)
+        slope = charge_slope(fit.values, signal)
+        still = replace(moments, excess=replace(excess, drift_dn2=drift_dn2))
+        variance = np.array(level_variances_dn2(fit.values, still), float) * slope**2
+        light2, _ = scatter_of_levels(light, signal, variance, bends)
+    found = replace(excess, variance2=variance2, drift_dn2=drift_dn2, light2=light2)
+    return found, (freedom, drift_freedom, light_freedom)
+
+
+def _light_signal(fit: NoiseFit, moments: Moments) -> Array:
+    """Return the signal of each flat series that is due to light."""
+    dark = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * moments.flats.exposure_s
+    return np.asarray(moments.flats.mean_dn - dark)
+
+
+def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[float, int]:
+    """Return the relative variance of the series' noise about the model, and its degrees of freedom."""
+    dark_freedom, flat_freedom = noise_freedom(moments)
+    darks, flats = moments.darks, moments.flats
+    models = dark_variances_dn2(fit.values, darks.exposure_s), flat_variances_dn2(fit.values, flats.mean_dn)
+    ratio = np.concatenate([
+        darks.within_dn2 / np.maximum((darks.frames - 1) * moments.freedom, 1) / np.array(models[0], float),
+        flats.within_dn2 / np.maximum((flats.frames - 1) * moments.freedom, 1) / np.array(models[1], float),
+    ])  # fmt: skip
+    freedom = np.concatenate([dark_freedom, flat_freedom])
+    chance = 2 * np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
+    measured = freedom > 0
+    residual2, chance = (ratio[measured] - 1) ** 2, chance[measured] / freedom[measured]
+    left = int(measured.sum()) - _NOISE_PARAMETERS
+    return grown_variance(lambda more: float(np.sum(residual2 / (chance + more))), left), left
+
+
+def _drift(fit: NoiseFit, moments: Moments) -> tuple[float, int]:
+    """Return the variance of the dark levels about their straight line, and its degrees of freedom."""
+    darks, t = moments.darks, moments.darks.exposure_s
+    noise = np.array(dark_variances_dn2(fit.values, t), float) / moments.pixels
+    chance = (fit.values.get("jitter_dn2", 0.0) + noise) / darks.frames
+    left = t.size - min(np.unique(t).size, 2)
+
+    def deviance(more: float) -> float:
+        weight = 1 / np.sqrt(chance + more)
+        design = np.stack([np.ones_like(t), t], axis=1)[:, : min(np.unique(t).size, 2)]
+        line = design @ np.linalg.lstsq(design * weight[:, None], darks.mean_dn * weight)[0]
+        return float(np.sum(((darks.mean_dn - line) * weight) ** 2))
+
+    return grown_variance(deviance, left), left
+
+
+def fit_with_excess(
+    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_], bends: int
+) -> tuple[NoiseFit, Moments]:
+    """Fit, measure the scatter that the fit leaves, and fit again with it until it settles.
+
+    Returns
+    -------
+    NoiseFit
+        With the degrees of freedom of each kind of scatter.
+    Moments
+        With the scatter.
+    """
+    fit, freedoms = fit_gaussian(moments, bends=bends), (0, 0, 0)
+    for _ in range(_MAX_ROUNDS):
+        excess, freedoms = measure_excess(fit, moments, darks, flats, used)
+        settled = _alike(excess, moments.excess)
+        moments = replace(moments, excess=excess)
+        if settled:
+            break
+        fit = fit_gaussian(moments, bends=bends)
+    return replace(fit, sources=_sources(fit, moments, freedoms)), moments
+
+
+def _alike(one: Excess, other: Excess) -> bool:
+    """Return whether all parts of two scatters are alike."""
+    names = ("darks", "flats", "variance2", "drift_dn2", "light2")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    return all(abs(a - b) <= _SETTLED * max(a, b) for a, b in pairs)
+
+
+def _sources(
+    fit: NoiseFit, moments: Moments, freedoms: tuple[int, int, int]
+) -> tuple[tuple[NDArray[np.float64], int], ...]:
+    """Return how the covariance grows with the logarithm of each kind of scatter, with its degrees of freedom."""
+    found = []
+    for name, freedom in zip(("variance2", "drift_dn2", "light2"), freedoms, strict=True):
+        value = getattr(moments.excess, name)
+        if value > 0 and freedom > 0:
+            grown = replace(moments, excess=replace(moments.excess, **{name: 1.1 * value}))
+            found.append(((covariance_at(fit.values, grown) - fit.covariance) / 0.1, freedom))
+    return tuple(found)
+
+
+def series_goodness(
+    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
+) -> tuple[SeriesGoodness, ...]:
+    """Return the goodness of fit of each series, darks first."""
+    t = moments.darks.exposure_s
+    line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * t
+    residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
+    residuals += _light_residuals(fit, moments)
+    models: list[float | Array] = [*dark_variances_dn2(fit.values, t)]
+    noise = [*models, *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
+    maps = [*models, *(flat_noise_map(fit, one) for one in flats)]
+    freedom = np.concatenate(noise_freedom(moments))
+    within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
+    found = []
+    for j, one in enumerate((*darks, *flats)):
+        if one.frames < 2:
+            found.append(SeriesGoodness(one, None, None, residuals[j]))
+            continue
+        excess = float(within[j] / ((one.frames - 1) * moments.freedom * noise[j])) - 1
+        rows, columns = used.shape
+        blocks, by_row, by_column = (
+            _scatter(one, maps[j], used, *shape) for shape in ((_BLOCKS, _BLOCKS), (rows, 1), (1, columns))
+        )
+        se = float(np.sqrt(2 / max(freedom[j], 1.0)))
+        found.append(
+            SeriesGoodness(
+                one, excess, se, residuals[j], blocks, by_row, by_column, _frame_scatter(one, float(noise[j]))
+            )
+        )
+    return tuple(found)
+
+
+def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
+    """Return the level of each flat minus that of the response; None where the light is not known."""
+    light, signal = moments.flats.light, _light_signal(fit, moments)
+    found: list[float | None] = [None] * signal.size
+    slope = charge_slope(fit.values, signal)
+    for group in light.groups:
+        members = np.flatnonzero(light.group == group)
+        charge, amount = charge_dn(fit.values, signal[members]), light.amount[members]
+        weight = 1 / np.array(level_variances_dn2(fit.values, moments), float)[members]
+        factor = float(weight * amount @ charge / (weight * amount @ amount))
+        for j, rest in zip(members.tolist(), charge - factor * amount, strict=True):
+            found[j] = float(rest / np.broadcast_to(slope, signal.shape)[j])
+    return found
+
+
+def _scatter(one: Series, noise_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int) -> Scatter:
+    """Return the scatter of a series' noise over blocks about its own mean."""
+    ratio, freedom = block_scatter(one, noise_dn2, used, rows, columns)
+    mean = np.average(ratio, weights=freedom)
+    return Scatter(float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2)), ratio.size - 1)
+
+
+def _frame_scatter(one: Series, noise_dn2: float) -> Scatter:
+    """Return the scatter of the variance of frames over their pixels, which noise and fixed pattern make."""
+    pixels = float((~one.suspect).sum())
+    pattern_dn2 = max(float(one.spreads_dn2.mean()) - noise_dn2, 0.0)
+    chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / pixels
+    return Scatter(float(one.spreads_dn2.var() * one.frames / chance), one.frames - 1)
