@@ -21,7 +21,7 @@ from faintfield.calib.noise.outliers import outlier
 # the shot noise of a hot pixel would otherwise spread along its row.
 _SUSPECT_SIGMA = 8.0
 
-# A dark has seen light if brighter than its series by the first multiple of the noise, or by the second if not by chance.
+# A dark has seen light if brighter than its series by the first multiple of the noise, or by the second beyond chance.
 _CERTAIN_LEAK, _MIN_LEAK = 5.0, 0.25
 
 # A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
@@ -220,8 +220,7 @@ class SeriesSums:
         ValueError
             No frame was given.
         """
-        frames = len(self._frames)
-        if not frames:
+        if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
         mean = self._pattern / frames
         within = np.maximum(self._squares - frames * mean**2, 0.0)

@@ -39,7 +39,7 @@ def test_a_series_up_to_saturation_gives_gain_and_read_noise_of_a_camera_that_be
     assert found.fit.saturation.limit == "ADC"
     assert found.saturation_dn == 4095
     assert sum(one.left_out is not None for one in found.fit.series) == 5
-    light_e = np.linspace(0.02, 1.1, 50)[2:43] * camera.full_e
+    light_e = np.linspace(0.02, 1.1, 50)[2:44] * camera.full_e
     signal = 0.1 * light_e * (1 + camera.bend * light_e / camera.full_e)
     line = np.polyval(np.polyfit(light_e, signal, 1, w=1 / signal), light_e)
     assert found.fit.linearity_error.value == pytest.approx(np.mean(np.abs(signal / line - 1)), rel=0.02)
