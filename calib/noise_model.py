@@ -1,5 +1,6 @@
 """Noise model of a sensor, which converts digital numbers to electrons with known statistics."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,8 +15,58 @@ type Map = float | NDArray[np.floating]
 
 
 @dataclass(frozen=True)
+class BentResponse:
+    """A response that bends: the charge behind a signal s is `s (1 + κ₁ s + κ₂ s² + …) / gain`.
+
+    Below zero, and beyond the brightest light that was measured, it goes on straight.
+
+    Parameters
+    ----------
+    bends_per_dn : tuple of Map
+        κ₁ in 1/DN, κ₂ in 1/DN² and so on.
+    up_to_dn : Map
+        Signal up to which the bend was measured.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, the range is not positive, or the charge does not grow with the signal.
+    """
+
+    bends_per_dn: tuple[Map, ...]
+    up_to_dn: Map
+
+    def __post_init__(self) -> None:
+        _require("up_to_dn", self.up_to_dn, at_least=1 / _MAX_NUMBER)
+        for bend in self.bends_per_dn:
+            _require("bends_per_dn", bend, at_least=-_MAX_NUMBER)
+        if not min(float(np.min(self._slope(share * self.up_to_dn))) for share in np.linspace(0, 1, 33)) > 0:
+            raise ValueError(f"bends_per_dn {self.bends_per_dn}: the charge must grow with the signal")
+
+    def charge_dn(self, signal_dn: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the charge behind a signal (row, column), times the gain at zero signal."""
+        within = np.clip(np.asarray(signal_dn, float), 0.0, self.up_to_dn)
+        factor = 1.0 + sum(bend * within**power for power, bend in enumerate(self.bends_per_dn, 1))
+        return np.asarray(within * factor + (signal_dn - within) * self._slope(within))
+
+    def slope(self, signal_dn: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return the gain at zero signal over that at the signals (row, column)."""
+        return np.asarray(self._slope(np.clip(np.asarray(signal_dn, float), 0.0, self.up_to_dn)))
+
+    def _slope(self, within: Any) -> Any:
+        """Return the derivative of the charge within the range."""
+        return 1.0 + sum((power + 1) * bend * within**power for power, bend in enumerate(self.bends_per_dn, 1))
+
+    def part(self, of: Callable[[NDArray[Any]], NDArray[Any]]) -> "BentResponse":
+        """Return the response of a part of the pixels, which `of` takes from a map."""
+        bends = tuple(of(np.asarray(bend)) if np.ndim(bend) == 2 else bend for bend in self.bends_per_dn)
+        up_to = of(np.asarray(self.up_to_dn)) if np.ndim(self.up_to_dn) == 2 else self.up_to_dn
+        return BentResponse(bends, up_to)
+
+
+@dataclass(frozen=True)
 class NoiseModel:
-    """A linear sensor: `dn = offset + gain · (Poisson(η Φ t + D t) + N(0, σ²))`, rounded to whole DN.
+    """A sensor: `dn = offset + gain · (Poisson(η Φ t + D t) + N(0, σ²))`, rounded to whole DN, linear unless stated.
 
     Eq. (6) of Stern, Aloni and Javidi adds the same variances: `η Φ t + D t + σ²`.
 
@@ -24,7 +75,7 @@ class NoiseModel:
     offset_dn : Map
         Mean of a dark frame of zero exposure, in DN.
     gain_dn_per_e : Map
-        DN per electron.
+        DN per electron; at zero signal where the response bends.
     read_noise_e : Map
         σ, standard deviation of the read noise, in electrons.
     dark_current_e_per_s : Map
@@ -33,6 +84,8 @@ class NoiseModel:
         η, electrons per photon; None if unknown.
     saturation_dn : float
         Value from which pixels are saturated.
+    response : BentResponse, optional
+        How the response bends; None for a linear sensor.
 
     Raises
     ------
@@ -47,6 +100,7 @@ class NoiseModel:
     dark_current_e_per_s: Map = 0.0
     quantum_efficiency: float | None = None
     saturation_dn: float = np.inf
+    response: BentResponse | None = None
 
     def __post_init__(self) -> None:
         _require("offset_dn", self.offset_dn, at_least=-_MAX_NUMBER)
@@ -61,8 +115,20 @@ class NoiseModel:
     def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
         """Return a frame (row, column) in electrons; read noise can make them negative."""
         electrons: NDArray[np.float32] = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
+        if self.response is not None:
+            electrons = self.response.charge_dn(electrons).astype(np.float32)
         electrons /= np.asarray(self.gain_dn_per_e, np.float32)
         return electrons
+
+    def local_gain_dn_per_e(self, frame_dn: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the DN that one more electron adds to each pixel of a frame (row, column)."""
+        gain = np.broadcast_to(np.asarray(self.gain_dn_per_e, float), np.shape(frame_dn))
+        return gain.copy() if self.response is None else gain / self.response.slope(frame_dn - self.offset_dn)
+
+    def variance_dn2(self, frame_dn: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the variance that noise and rounding give to each pixel of a frame (row, column) of means."""
+        charge = np.maximum(self.electrons(frame_dn).astype(float), 0.0)
+        return np.asarray((charge + self.read_noise_e**2) * self.local_gain_dn_per_e(frame_dn) ** 2 + 1.0 / 12.0)
 
     def saturated(self, frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
         """Return the saturated pixels of a frame (row, column)."""

@@ -4,11 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.signal import fftconvolve
 
-from faintfield.calib.noise.diagnostics import check_series, frame_warnings, level_warning, noise_warning
+from faintfield.calib.noise.diagnostics import (
+    check_series,
+    frame_warnings,
+    level_warning,
+    noise_warning,
+    saturation_warnings,
+    scatter_warnings,
+)
 from faintfield.calib.noise.estimates import estimate_all
 from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
+from faintfield.calib.noise.goodness import series_goodness
 from faintfield.calib.noise.marginal import mass_function
 from faintfield.calib.noise.pixels import (
     PixelLevels,
@@ -20,11 +29,17 @@ from faintfield.calib.noise.pixels import (
     shrunk_variance_ratio,
     variance_ratio,
 )
+from faintfield.calib.noise.response import BENDS, charge_dn, charge_slope
 from faintfield.calib.noise.result import Estimate, Histogram, NoiseCalibration, NoiseMaps, TransferPoint
+from faintfield.calib.noise.saturation import Saturation, find_saturation
 from faintfield.calib.noise.statistics import Series
+from faintfield.calib.noise_model import BentResponse
 
 # Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
 _MAX_POISSON_CHARGE_E = 200.0
+
+# A response counts as straight if a bend as large as the fitted one comes about by chance with this probability.
+_MAX_STRAIGHT = 1e-3
 
 
 def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseCalibration:
@@ -45,25 +60,33 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         No exposure has two frames, a light level has one, or the frames are too small.
     CopiedFrame
         Two frames are identical.
+    SaturatedFlat
+        There are flats, and all of them are saturated.
     PoorFit
         The likelihood has no maximum.
     """
     darks = [one for one in series if one.conditions.kind == "dark"]
     flats = [one for one in series if one.conditions.kind == "flat"]
-    check_series(darks, flats)
+    check_series(darks, [])
+    saturation = find_saturation(darks, flats, saturation_dn)
+    # Frames that are saturated all over are identical, which is no fault of theirs.
+    check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
-    return _result(*_fit_without_noisy(darks, flats, hot), hot, saturation_dn)
+    end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
+    return _result(*_fit_without_noisy(darks, saturation.kept, hot, end_dn), hot, saturation, end_dn)
 
 
 def _result(
-    fitted: SeriesFit, noisy: NDArray[np.bool_], hot: NDArray[np.bool_], saturation_dn: float
+    fitted: SeriesFit, noisy: NDArray[np.bool_], hot: NDArray[np.bool_], saturation: Saturation, saturation_dn: float
 ) -> NoiseCalibration:
     """Return the numbers, maps and warnings that follow from a fit."""
     usable, points = ~hot & ~noisy, _points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
     levels = _levels(fitted, hot)
     response = _response(fitted, levels, usable)
-    estimates, covariance = estimate_all(fitted, response, levels_hold=level is None, noise_holds=noise is None)
+    estimates, covariance = estimate_all(
+        fitted, response, saturation, levels_hold=level is None, noise_holds=noise is None
+    )
     dead = response.dead if response else np.zeros_like(hot)
     return NoiseCalibration(
         estimates=estimates,
@@ -77,19 +100,27 @@ def _result(
         points=points,
         histograms=_histograms(fitted, usable),
         saturation_dn=saturation_dn,
-        warnings=(*frame_warnings(fitted), *filter(None, (level, noise))),
+        saturation=saturation,
+        response=_bent_response(fitted),
+        goodness=series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats, fitted.used),
+        warnings=(
+            *frame_warnings(fitted),
+            *saturation_warnings(saturation),
+            *filter(None, (level, noise)),
+            *scatter_warnings(fitted),
+        ),
     )
 
 
 def _fit_without_noisy(
-    darks: Sequence[Series], flats: Sequence[Series], hot: NDArray[np.bool_]
+    darks: Sequence[Series], flats: Sequence[Series], hot: NDArray[np.bool_], saturation_dn: float
 ) -> tuple[SeriesFit, NDArray[np.bool_]]:
     """Return the fit without hot and noisy pixels, and the noisy ones (row, column)."""
-    fitted = fit_series(darks, flats, ~hot)
+    fitted = fit_series(darks, flats, ~hot, saturation_dn)
     if fitted.likelihood is NoiseLikelihood.CENSORED:  # variances of values that are cut off tell nothing
         return fitted, np.zeros_like(hot)
     noisy = noisy_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
-    return (fit_series(darks, flats, ~hot & ~noisy) if noisy.any() else fitted), noisy
+    return (fit_series(darks, flats, ~hot & ~noisy, saturation_dn) if noisy.any() else fitted), noisy
 
 
 def _levels(fitted: SeriesFit, hot: NDArray[np.bool_]) -> PixelLevels:
@@ -126,11 +157,29 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_])
     """Return the photo response, None without flats."""
     if not fitted.flats:
         return None
-    signals = [
-        one.mean_dn - levels.offset_dn - levels.dark_signal_dn_per_s * one.conditions.exposure_s for one in fitted.flats
-    ]
-    noise = [v / one.frames for v, one in zip(fitted.flat_noise_dn2, fitted.flats, strict=True)]
+    values, signals, noise = fitted.fit.values, [], []
+    for v, one in zip(fitted.flat_noise_dn2, fitted.flats, strict=True):
+        signal = one.mean_dn - levels.offset_dn
+        signals.append(charge_dn(values, signal) - levels.dark_signal_dn_per_s * one.conditions.dark_time_s)
+        noise.append(v / one.frames * float(charge_slope(values, np.mean(signal)) ** 2))
     return measure_response(signals, noise, usable)
+
+
+def _bent_response(fitted: SeriesFit) -> BentResponse | None:
+    """Return the bend of the response if the flats show it significantly, None otherwise."""
+    names = [name for name in fitted.fit.values if name in BENDS]
+    if fitted.bend is None or fitted.bend.values.keys() != fitted.fit.values.keys() or not names:
+        return None
+    order = list(fitted.fit.values)
+    at = [order.index(name) for name in names]
+    bends = np.array([fitted.fit.values[name] for name in names])
+    brightest = float(fitted.moments.flats.mean_dn.max() - fitted.fit.values["offset_dn"])
+    scale = brightest ** np.arange(1, len(names) + 1)
+    covariance = fitted.fit.covariance[np.ix_(at, at)] * np.outer(scale, scale)
+    deviance = float(bends * scale @ np.linalg.solve(covariance, bends * scale))
+    if stats.chi2.sf(deviance, len(names)) > _MAX_STRAIGHT:
+        return None
+    return BentResponse(tuple(bends.tolist()), brightest)
 
 
 def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram, ...]:

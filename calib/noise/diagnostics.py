@@ -7,7 +7,9 @@ from scipy import stats
 
 from faintfield.calib.errors import CopiedFrame, NotIdentifiable, TooFewFrames
 from faintfield.calib.noise.fitting import NoiseLikelihood, SeriesFit
+from faintfield.calib.noise.response import UNKNOWN_BEND_SE
 from faintfield.calib.noise.result import TransferPoint
+from faintfield.calib.noise.saturation import Saturation
 from faintfield.calib.noise.statistics import Series
 
 # Smallest frames, in pixels and in rows or columns; fewer leave the spreads over pixels to chance.
@@ -16,6 +18,9 @@ _MIN_PIXELS, _MIN_SIDE_PX = 256, 8
 # The series contradict the model if a departure has at most this probability, or exceeds this many standard errors, and
 # is more than this fraction: less does not matter.
 _MAX_PROBABILITY, _MIN_SIGMAS, _NEGLIGIBLE_FRACTION = 1e-4, 6.0, 0.02
+
+# Scatter between series that is named in a warning: of noise and light as a fraction, of levels over the read noise.
+_NOTABLE_FRACTION, _NOTABLE_DRIFT = 0.005, 0.1
 
 
 def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
@@ -71,6 +76,46 @@ def frame_warnings(fitted: SeriesFit) -> list[str]:
         warnings.append(
             "values are cut off at the black level: offset and dark current are given for the sensor, not per pixel; "
             "raise the camera's black offset if it has one"
+        )
+    return warnings
+
+
+def saturation_warnings(saturation: Saturation) -> list[str]:
+    """Return a warning that names the flats that are left out."""
+    if not saturation.left_out:
+        return []
+    first, why = saturation.left_out[0]
+    return [
+        f"{len(saturation.left_out)} series of flats are left out, beginning with the {first.conditions}; "
+        f"{first.names[0]}: {why}"
+    ]
+
+
+def scatter_warnings(fitted: SeriesFit) -> list[str]:
+    """Return warnings about scatter between series by which intervals have grown, and about light that is not known."""
+    excess, warnings = fitted.moments.excess, []
+    read_dn = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"]))
+    noise, drift, light = (float(np.sqrt(it)) for it in (excess.variance2, excess.drift_dn2, excess.light2))
+    if noise > _NOTABLE_FRACTION:
+        warnings.append(
+            f"the noise of the series scatters by {noise:.1%} in variance about the model beyond chance; the intervals "
+            "have grown by it: the noise of the camera changed, or the light was not steady"
+        )
+    if drift > _NOTABLE_DRIFT * read_dn:
+        warnings.append(
+            f"the dark level drifts by {drift:.2g} DN from series to series; the intervals have grown by it: let the "
+            "camera settle and record the exposures in turn"
+        )
+    if light > _NOTABLE_FRACTION:
+        warnings.append(
+            f"the levels of the flats scatter by {light:.1%} about the response; the intervals have grown by it: let "
+            "the lamp settle, or measure its light with each flat"
+        )
+    if fitted.flats and fitted.light_unknown:
+        warnings.append(
+            f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
+            f"intervals allow for {2 * UNKNOWN_BEND_SE:.0%} at the end of the range: state the photons of at least 3 "
+            "light levels, or record 3 exposures under one light"
         )
     return warnings
 

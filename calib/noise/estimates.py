@@ -11,10 +11,15 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
+from faintfield.calib.noise.gaussian import dark_variances_dn2, main_quantities
+from faintfield.calib.noise.intervals import interval, root
+from faintfield.calib.noise.light_estimates import of_light, why_noise_denies
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import Moments
 from faintfield.calib.noise.pixels import Response, quantum_efficiency
+from faintfield.calib.noise.response import charge_dn
 from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.saturation import Saturation
 from faintfield.calib.noise.statistics import Series
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
@@ -26,13 +31,12 @@ _ONE_REPEATED = (
     "only one exposure has more than one dark, so that the growth of the noise cannot be seen; record at least 2 darks "
     "each of 2 exposures, better 10 each of 4 up to 60 s"
 )
-_NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 _NO_PHOTONS = "no flat states its photons per pixel (`photons` in noise.toml, or `photons_per_s` in rig.toml)"
 _NO_FLATS = "there are no flats; record at least 2, evenly lit, at half of saturation"
 
 
 def estimate_all(
-    fitted: SeriesFit, response: Response | None, *, levels_hold: bool, noise_holds: bool
+    fitted: SeriesFit, response: Response | None, saturation: Saturation, *, levels_hold: bool, noise_holds: bool
 ) -> tuple[dict[str, Estimate], tuple[tuple[str, ...], NDArray[np.float64]]]:
     """Return all quantities, and the covariance of offset, gain, read noise and dark current.
 
@@ -42,12 +46,16 @@ def estimate_all(
         Fit and series.
     response : Response, optional
         Photo response; None without flats.
+    saturation : Saturation
+        Where the sensor saturates.
     levels_hold, noise_holds : bool
         The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """
     fit, darks = fitted.fit, fitted.darks
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
-    why_no_gain = _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
+    why_no_gain = why_noise_denies(fitted) or _why_no_gain(
+        fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds
+    )
     why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
         "offset_dn": None,
@@ -59,7 +67,8 @@ def estimate_all(
     gain = estimates["gain_dn_per_e"]
     estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
     estimates |= _shared_noise(fitted, quantile) | _profiles(fit, darks, quantile)
-    return estimates | _from_flats(fitted, gain, response, quantile), covariance
+    estimates |= _from_flats(fitted, gain, response, quantile)
+    return estimates | of_light(fitted, saturation, gain, estimates["quantum_efficiency"]), covariance
 
 
 def _in_electrons(
@@ -73,8 +82,8 @@ def _in_electrons(
     estimates = {name: Estimate(None, why=why) for name, why in whys.items()}
     for index, name in enumerate(known):
         se, positive = float(np.sqrt(covariance[index, index])), name in ("gain_dn_per_e", "read_noise_e")
-        quantile = gain_quantile if positive else levels_quantile
-        estimates[name] = _interval(quantities[name][0], se, quantile, positive=positive)
+        quantile = max(gain_quantile if positive else levels_quantile, fit.quantile(jacobian[index]))
+        estimates[name] = interval(quantities[name][0], se, quantile, positive=positive)
     return estimates, (known, covariance)
 
 
@@ -141,51 +150,35 @@ def _why_no_current(
     return None
 
 
-def _interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
-    """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
-    if positive:
-        factor = float(np.exp(quantile * se / value))
-        return Estimate(value, se, (value / factor, value * factor))
-    return Estimate(value, se, (value - quantile * se, value + quantile * se))
-
-
-def _root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
-    """Return the root of a variance, times a scale; no value if the variance is significantly negative."""
-    if not se:
-        return Estimate(None, why=_NO_SPREAD)
-    if variance + quantile * se <= 0:
-        return Estimate(
-            None,
-            why=f"there is less scatter than the pixels' noise alone makes (by {-variance / se:.2g} standard errors), "
-            "so that a spread would be hidden: pickup whose phase turns from frame to frame does that; record more "
-            "frames, away from what may disturb them",
-        )
-    low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
-    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))
-
-
 def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
     """Return the quantities that need no gain."""
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
-    read = _interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), quantile, positive=True)
+    half = max(quantile, fit.quantile(_unit(fit, "log_read_dn2")))
+    read = interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), half, positive=True)
     signal = Estimate(None, why=_ONE_EXPOSURE)
     if "dark_signal_dn_per_s" in fit.values:
         se = fit.standard_error("dark_signal_dn_per_s")
-        signal = _interval(fit.values["dark_signal_dn_per_s"], se, levels_quantile)
+        half = max(levels_quantile, fit.quantile(_unit(fit, "dark_signal_dn_per_s")))
+        signal = interval(fit.values["dark_signal_dn_per_s"], se, half)
     return {"read_noise_dn": read, "dark_signal_dn_per_s": signal}
+
+
+def _unit(fit: NoiseFit, name: str) -> NDArray[np.float64]:
+    """Return the gradient of one parameter."""
+    return np.array([1.0 if it == name else 0.0 for it in fit.values])
 
 
 def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
     """Return the spreads over the pixels: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
-    spreads = {"dsnu_dn": _root(dsnu2, se, quantile)}
+    spreads = {"dsnu_dn": root(dsnu2, se, quantile)}
     if gain.value is None:
         return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
-    spreads["dsnu_e"] = _root(dsnu2, se, quantile, 1 / gain.value)
+    spreads["dsnu_e"] = root(dsnu2, se, quantile, 1 / gain.value)
     spreads["dcnu_e_per_s"] = Estimate(None, why=_why_no_growth(fitted.moments))
     if (dcnu2 := fit.values.get("dcnu_dn2_per_s2")) is not None:
-        spreads["dcnu_e_per_s"] = _root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), quantile, 1 / gain.value)
+        spreads["dcnu_e_per_s"] = root(dcnu2, fit.standard_error("dcnu_dn2_per_s2"), quantile, 1 / gain.value)
     return spreads
 
 
@@ -202,13 +195,13 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
     def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
         excess = float(np.average(np.array(variances) - noise / along, weights=freedom))
         se = float(np.average(variances, weights=freedom) * np.sqrt(2 / (freedom.sum() * across)))
-        return _root(excess, se, quantile)
+        return root(excess, se, quantile)
 
     # A jitter fitted as zero has no standard error: use the scatter of the levels that is expected without jitter.
     chance = float(np.average(noise, weights=freedom) / pixels * np.sqrt(2 / freedom.sum()))
     jitter_se = fit.standard_error("jitter_dn2") or chance
     return {
-        "frame_jitter_dn": _root(fit.values["jitter_dn2"], jitter_se, quantile),
+        "frame_jitter_dn": root(fit.values["jitter_dn2"], jitter_se, quantile),
         "row_noise_dn": shared([one.row_noise_dn2 for one in darks], columns, rows),
         "column_noise_dn": shared([one.column_noise_dn2 for one in darks], rows, columns),
     }
@@ -222,7 +215,7 @@ def _profiles(fit: NoiseFit, darks: Sequence[Series], quantile: float) -> dict[s
 
     def pattern(profile: NDArray[np.float64], along: int, shared_dn2: float) -> Estimate:
         chance = (max(float(noise) / along, shared_dn2) / dark.frames) + fit.values["dsnu_dn2"] / along
-        return _root(float(profile.var()) - chance, float(profile.var()) * np.sqrt(2 / profile.size), quantile)
+        return root(float(profile.var()) - chance, float(profile.var()) * np.sqrt(2 / profile.size), quantile)
 
     return {
         "dsnu_row_dn": pattern(dark.row_dn, columns, dark.row_noise_dn2),
@@ -234,18 +227,19 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
     """Return the quantities that only flats determine."""
     prnu = Estimate(None, why=_NO_FLATS)
     if response is not None:
-        prnu = _interval(response.prnu, response.prnu_se, quantile)
+        prnu = interval(response.prnu, response.prnu_se, quantile)
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
     if (bend := fitted.bend) is not None:
         se = bend.standard_error("nonlinearity_per_dn")
-        nonlinearity = _interval(bend.values["nonlinearity_per_dn"], se, quantile)
+        half = max(quantile, bend.quantile(_unit(bend, "nonlinearity_per_dn")))
+        nonlinearity = interval(bend.values["nonlinearity_per_dn"], se, half)
     efficiency = Estimate(None, why=_NO_PHOTONS)
     if gain.value is not None:
         means_dn = fitted.moments.flats.mean_dn
         charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]
         found = quantum_efficiency(fitted.flats, charges, fitted.fit.standard_error("log_gain"))
         if found is not None:
-            efficiency = _interval(*found, quantile, positive=True)
+            efficiency = interval(*found, quantile, positive=True)
     elif fitted.flats:
         efficiency = Estimate(None, why=gain.why)
     return {"prnu": prnu, "nonlinearity_per_dn": nonlinearity, "quantum_efficiency": efficiency}
@@ -254,7 +248,6 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
 def _light_e(fit: NoiseFit, flat: Series, mean_dn: float) -> float:
     """Return the electrons per pixel from light in a flat series."""
     values = fit.values
-    signal = mean_dn - values["offset_dn"]
-    charge_dn = signal * (1 + values.get("nonlinearity_per_dn", 0.0) * signal)
-    dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.exposure_s
-    return float((charge_dn - dark_dn) / np.exp(values["log_gain"]))
+    charge = charge_dn(values, mean_dn - values["offset_dn"])
+    dark_dn = values.get("dark_signal_dn_per_s", 0.0) * flat.conditions.dark_time_s
+    return float((charge - dark_dn) / np.exp(values["log_gain"]))

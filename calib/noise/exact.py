@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import PoorFit
-from faintfield.calib.noise.gaussian import NoiseFit, flat_log_likelihood
+from faintfield.calib.noise.gaussian import flat_log_likelihood
 from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
-from faintfield.calib.noise.moments import FlatMoments
+from faintfield.calib.noise.maximum import NoiseFit
+from faintfield.calib.noise.moments import Moments
 
 type Array = NDArray[np.float64]
 
@@ -35,8 +36,16 @@ _MIN_GAIN, _MIN_STEP_LENGTH = 1e-3, 1e-4
 _TRIED_DCNU, _MIN_RISE = (0.08, 0.3), 4.0
 
 
+@dataclass(frozen=True)
+class Bent:
+    """The bend of the response: its coefficients, and their covariance."""
+
+    values: dict[str, float]
+    covariance: Array
+
+
 def fit_exact(
-    counts: Counts, start: dict[str, float], flats: FlatMoments, freedom: float, *, exact: bool, try_spread: bool
+    counts: Counts, start: dict[str, float], moments: Moments, bent: Bent, *, exact: bool, try_spread: bool
 ) -> NoiseFit:
     """Maximize the likelihood (4), times that of the flats' photon transfer if there are flats.
 
@@ -48,10 +57,10 @@ def fit_exact(
         Dark values.
     start : dict
         Initial values of `PARAMETERS`; they also decide the grids.
-    flats : FlatMoments
-        Flat series, possibly none.
-    freedom : float
-        Degrees of freedom of a flat frame's pixels.
+    moments : Moments
+        Statistics of the flat series, if there are any, with the scatter of their noise.
+    bent : Bent
+        Response of the flats, which darks do not reach.
     exact : bool
         Use the Poisson sum, eq. (2), rather than the censored normal law, eq. (3).
     try_spread : bool
@@ -72,20 +81,28 @@ def fit_exact(
         darks = MarginalLikelihood(counts, start, exact=exact, spread=spread)
 
         def evaluate(x: Array) -> tuple[float, Array, Array]:
-            dark, flat = darks.evaluate(x), _flat_part(x, flats, freedom)
+            dark, flat = darks.evaluate(x), _flat_part(x, moments, bent)
             return dark[0] + flat[0], dark[1] + flat[1], dark[2] + flat[2]
 
         return evaluate
 
     even = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
     if not try_spread:
-        return even.fit()
+        return _with_bend(even.fit(), bent)
     spread = objective(spread=True)
     tried = [np.where(_IS_DCNU, dcnu, even.x) for dcnu in _TRIED_DCNU]
     rises = [spread(x)[0] - even.log_likelihood for x in tried]
     if max(rises) < _MIN_RISE:
-        return even.fit()
-    return _maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit()
+        return _with_bend(even.fit(), bent)
+    return _with_bend(_maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit(), bent)
+
+
+def _with_bend(fit: NoiseFit, bent: Bent) -> NoiseFit:
+    """Return a fit with the bend of the response among its values."""
+    size = len(fit.values)
+    covariance = np.zeros((size + len(bent.values),) * 2)
+    covariance[:size, :size], covariance[size:, size:] = fit.covariance, bent.covariance
+    return NoiseFit(fit.values | bent.values, covariance, fit.log_likelihood)
 
 
 @dataclass(frozen=True)
@@ -153,16 +170,34 @@ def _inverse(information: Array) -> Array:
     return np.asarray(np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale))
 
 
-def _flat_part(x: Array, flats: FlatMoments, freedom: float) -> tuple[float, Array, Array]:
-    """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`."""
-    size = len(PARAMETERS)
+def _flat_part(x: Array, moments: Moments, bent: Bent) -> tuple[float, Array, Array]:
+    """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`, the bend integrated out.
+
+    Its normal law times a likelihood that is normal near its coefficients leaves ½ gᵀ M g, with the gradient g by the
+    coefficients, and M the inverse of both their informations (Laplace).
+    """
+    size, flats = len(PARAMETERS), moments.flats
     if not flats.frames.size:
         return 0.0, np.zeros(size), np.zeros((size, size))
-    s = ca.SX.sym("s", size)
-    log_likelihood, log_variances, half_freedom = flat_log_likelihood(
-        {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}, flats, freedom
-    )
-    slopes = ca.jacobian(ca.vertcat(*log_variances), s)
-    outputs = [log_likelihood, ca.gradient(log_likelihood, s), slopes]
-    value, gradient, by_series = (np.array(part) for part in ca.Function("flats", [s], outputs)(x))
-    return float(value[0, 0]), gradient.ravel(), (by_series.T * np.array(half_freedom)) @ by_series
+    s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bent.values))
+    values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}
+    units = np.sqrt(np.diag(bent.covariance))
+    values |= {name: bent.values[name] + b[k] * units[k] for k, name in enumerate(bent.values)}
+    log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, flats, moments.freedom, moments.excess)
+    logs = ca.vertcat(*log_variances)
+    by_bend, weight = ca.jacobian(logs, b), ca.diag(ca.DM(half_freedom))
+    if bent.values:
+        prior = ca.DM(np.linalg.pinv(bent.covariance / np.outer(units, units)))
+        precision = prior + by_bend.T @ weight @ by_bend
+        slope = ca.gradient(log_likelihood, b)
+        log_likelihood = log_likelihood + 0.5 * slope.T @ ca.solve(precision, slope)
+    else:
+        precision = ca.SX(0, 0)
+    outputs = [log_likelihood, ca.gradient(log_likelihood, s), ca.jacobian(logs, s), by_bend, precision]
+    found = ca.Function("flats", [s, b], outputs)(x, np.zeros(len(bent.values)))
+    value, gradient, by_series, bends, inverse = (np.array(part) for part in found)
+    information = (by_series.T * np.array(half_freedom)) @ by_series
+    if bent.values:
+        cross = (by_series.T * np.array(half_freedom)) @ bends
+        information -= cross @ np.linalg.solve(inverse, cross.T)
+    return float(value[0, 0]), gradient.ravel(), information

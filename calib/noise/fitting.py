@@ -5,18 +5,26 @@ a third), and with read noise below an electron it ignores the information in si
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.exact import fit_exact
-from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, fit_gaussian, flat_variances_dn2
+from faintfield.calib.noise.exact import Bent, fit_exact
+from faintfield.calib.noise.gaussian import dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.marginal import Counts
-from faintfield.calib.noise.moments import Moments, gather_moments
+from faintfield.calib.noise.maximum import NoiseFit
+from faintfield.calib.noise.moments import Moments, gather_moments, rounding_error
+from faintfield.calib.noise.response import (
+    BENDS,
+    MEASURED_BEND_SE,
+    UNKNOWN_BEND_SE,
+    bend_range_dn,
+    choose_bends,
+)
+from faintfield.calib.noise.scatter import fit_with_excess
+from faintfield.calib.noise.starts import censored_start, gaussian_start
 from faintfield.calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
@@ -31,6 +39,10 @@ _MAX_FRACTION_AT_FLOOR = 2e-3
 
 # Largest range of the values of a series, in DN; for wider tables of masses the Gaussian is good enough.
 MAX_TABLE_WIDTH_DN = 2000
+
+
+# Largest scatter of the levels of flats about the response, as a fraction; a worse light tells nothing about it.
+MAX_LIGHT_ERROR = 0.05
 
 
 class NoiseLikelihood(StrEnum):
@@ -56,7 +68,9 @@ class SeriesFit:
     fit : NoiseFit
         Its maximum.
     bend : NoiseFit, optional
-        Fit with a nonlinear response; None unless there are flats of three levels.
+        Fit that tells the bend of the response; None unless there are flats of three levels.
+    used : array (row, column), bool
+        Pixels in use.
     """
 
     darks: Sequence[Series]
@@ -65,6 +79,7 @@ class SeriesFit:
     likelihood: NoiseLikelihood
     fit: NoiseFit
     bend: NoiseFit | None
+    used: NDArray[np.bool_]
 
     @property
     def dark_noise_dn2(self) -> list[float]:
@@ -77,12 +92,19 @@ class SeriesFit:
         return flat_variances_dn2(self.fit.values, self.moments.flats.mean_dn)
 
     @property
+    def light_unknown(self) -> bool:
+        """Whether nothing but an allowance stands for the bend of the response."""
+        return self.moments.flats.bend_se == UNKNOWN_BEND_SE
+
+    @property
     def profiles_dn2(self) -> float:
         """Variance that the fixed patterns of rows and columns add to the offsets of the pixels."""
         return float(self.darks[0].row_dn.var() + self.darks[0].column_dn.var())
 
 
-def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_]) -> SeriesFit:
+def fit_series(
+    darks: Sequence[Series], flats: Sequence[Series], usable: NDArray[np.bool_], saturation_dn: float = np.inf
+) -> SeriesFit:
     """Fit with the simplest likelihood that the frames allow.
 
     Parameters
@@ -91,6 +113,8 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
         At least one dark series.
     usable : array (row, column), bool
         Pixels in use.
+    saturation_dn : float
+        End of the range, to which the size of a bend refers.
 
     Raises
     ------
@@ -98,34 +122,85 @@ def fit_series(darks: Sequence[Series], flats: Sequence[Series], usable: NDArray
         The likelihood has no maximum, or too many values are cut off at the black level to start.
     """
     suspect = np.any([one.suspect for one in darks], axis=0)
-    moments = gather_moments(darks, flats, usable & ~suspect)
-    fit, bend = _fit_gaussian(moments)
+    used = usable & ~suspect
+    fit, bend, moments = _fit_gaussian(gather_moments(darks, flats, used), darks, flats, used, saturation_dn)
     # Among values cut off at the floor the highest look suspect; leaving them out would bias the fit.
     counts = collect_counts(darks, usable)
-    likelihood = choose_likelihood(counts, fit, _shared_noise_dn2(darks, fit))
+    # The likelihood of single values has no part for what pixels share, be it of a frame or of a series.
+    likelihood = choose_likelihood(counts, fit, _shared_noise_dn2(darks, fit) + moments.excess.drift_dn2)
+    gaussian = fit
     if likelihood is not NoiseLikelihood.GAUSSIAN:
         exact = likelihood is NoiseLikelihood.EXACT
         if exact:
-            counts = collect_counts(darks, usable & ~suspect)
-        start = _gaussian_start(fit) if exact else _censored_start(counts)
+            counts = collect_counts(darks, used)
+        start = gaussian_start(fit) if exact else censored_start(counts)
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
-        fit = fit_exact(counts, start, moments.flats, moments.freedom, exact=exact, try_spread=spread)
-        bend = None
-    return SeriesFit(darks, flats, moments, likelihood, fit, bend)
+        fit = fit_exact(counts, start, moments, bent_by(gaussian), exact=exact, try_spread=spread)
+        if exact:
+            fit = grown_like(gaussian, fit)
+    if flats or likelihood is NoiseLikelihood.GAUSSIAN:
+        fit = with_rounding(fit, max(rounding_error(one, used) for one in darks))
+    return SeriesFit(darks, flats, moments, likelihood, fit, bend, used)
 
 
-def _fit_gaussian(moments: Moments) -> tuple[NoiseFit, NoiseFit | None]:
-    """Return the fit, and the fit with a nonlinear response if flats have three levels.
+def with_rounding(fit: NoiseFit, error: float) -> NoiseFit:
+    """Return a fit with the relative error that rounding may make of the noise of all darks, and so of the gain."""
+    at = list(fit.values).index("log_read_dn2")
+    concerns = np.array([name in ("log_read_dn2", "log_gain") for name in fit.values])
+    follows = np.where(concerns, fit.covariance[at] / fit.covariance[at, at], 0.0)
+    return replace(fit, covariance=fit.covariance + error**2 * np.outer(follows, follows))
 
-    The first is the second if the nonlinearity is significant.
+
+def _fit_gaussian(
+    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_], saturation_dn: float
+) -> tuple[NoiseFit, NoiseFit | None, Moments]:
+    """Return the fit, a fit that tells the bend of the response if there is one, and the scatter beyond both.
+
+    With known light both are the same. Otherwise three levels tell a bend by their noise alone; it is taken if it is
+    significant. If not, a bend of the usual size may be there and widens the interval of the gain.
     """
-    straight = fit_gaussian(moments)
-    if np.unique(np.round(moments.flats.mean_dn, -1)).size < 3:
-        return straight, None
-    bent = fit_gaussian(moments, nonlinear=True)
-    significant = abs(bent.values["nonlinearity_per_dn"]) > 3 * bent.standard_error("nonlinearity_per_dn")
-    return (bent if significant else straight), bent
+    if not flats:
+        fit, moments = fit_with_excess(moments, darks, flats, used, 0)
+        return fit, None, moments
+    offset_dn = float(moments.darks.mean_dn.min())
+    signal = moments.flats.mean_dn - offset_dn
+    range_dn = bend_range_dn(float(signal.max()), saturation_dn - offset_dn)
+    light = moments.flats.light
+    chance = moments.flats.within_dn2 / np.maximum(moments.flats.frames - 1, 1) / moments.freedom
+    level_dn2 = (chance / moments.pixels + moments.darks.level_scatter_dn2.mean()) / moments.flats.frames
+    bends = choose_bends(light, signal, level_dn2)
+    measured = replace(moments, flats=replace(moments.flats, range_dn=range_dn, bend_se=MEASURED_BEND_SE))
+    if bends:
+        fit, grown = fit_with_excess(measured, darks, flats, used, bends)
+        if grown.excess.light2 < MAX_LIGHT_ERROR**2:
+            return fit, fit, grown
+    dark = replace(light, group=np.full(light.group.shape, -1))
+    unknown = replace(measured.flats, light=dark)
+    free = None
+    if np.unique(np.round(moments.flats.mean_dn, -1)).size >= 3:
+        free, grown = fit_with_excess(replace(measured, flats=unknown), darks, flats, used, 1)
+        if abs(free.values["nonlinearity_per_dn"]) > 3 * free.standard_error("nonlinearity_per_dn"):
+            return free, free, grown
+    usual = replace(moments, flats=replace(unknown, bend_se=UNKNOWN_BEND_SE))
+    fit, grown = fit_with_excess(usual, darks, flats, used, 1)
+    return fit, free, grown
+
+
+def grown_like(gaussian: NoiseFit, fit: NoiseFit) -> NoiseFit:
+    """Return a fit of single values, its errors grown by the factors by which scatter grows those of the Gaussian."""
+    before, after = np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance)
+    known = list(gaussian.values)
+    factor = {name: max(after[i] / before[i], 1.0) if before[i] > 0 else 1.0 for i, name in enumerate(known)}
+    grow = np.sqrt([factor.get(name, 1.0) for name in fit.values])
+    return replace(fit, covariance=fit.covariance * np.outer(grow, grow))
+
+
+def bent_by(gaussian: NoiseFit) -> Bent:
+    """Return the bend of the response in a Gaussian fit."""
+    at = [index for index, name in enumerate(gaussian.values) if name in BENDS]
+    values = {name: gaussian.values[name] for name in gaussian.values if name in BENDS}
+    return Bent(values, gaussian.covariance[np.ix_(at, at)])
 
 
 def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
@@ -177,65 +252,3 @@ def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> 
     if read_dn < _MIN_GAUSSIAN_READ_DN or (telling and read_e < _MIN_GAUSSIAN_READ_E):
         return NoiseLikelihood.EXACT
     return NoiseLikelihood.GAUSSIAN
-
-
-def _gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
-    """Return initial values for the exact likelihood from the Gaussian fit."""
-    values = gaussian.values
-    signal = max(values["dark_signal_dn_per_s"], 1e-6)
-    return {
-        "log_gain": values["log_gain"],
-        "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
-        "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
-        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
-        "offset_dn": values["offset_dn"],
-        "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
-    }
-
-
-def _censored_start(counts: Counts) -> dict[str, float]:
-    """Return initial values for the censored likelihood from quantiles above the floor.
-
-    Raises
-    ------
-    NotIdentifiable
-        There are no two exposures at which a twentieth of the values is above the black level.
-    """
-    exposure, centre, spread2 = [], [], []
-    for t, values in zip(counts.exposure_s, counts.values_dn, strict=True):
-        normal = _normal_above(values, counts.floor_dn or 0)
-        if normal is not None:
-            exposure.append(t)
-            centre.append(normal[0])
-            spread2.append(normal[1])
-    if len(set(exposure)) < 2:
-        raise NotIdentifiable(
-            f"the darks are cut off at the black level: of {len(counts.exposure_s)} exposures {len(exposure)} have a "
-            "twentieth of their values above it, 2 are needed; raise the camera's black offset and record them again"
-        )
-    slope, offset = np.polyfit(exposure, centre, 1)
-    slope = max(float(slope), 1e-6)
-    excess, both = np.polyfit(exposure, spread2, 1)
-    gain = float(np.clip(excess / slope, 0.05, 50.0))
-    read2 = max(0.7 * float(both), 0.1)
-    return {
-        "log_gain": float(np.log(gain)),
-        "log_read_e": 0.5 * float(np.log(read2)) - float(np.log(gain)),
-        "log_dark_e_per_s": float(np.log(slope / gain)),
-        "dcnu": 0.05,
-        "offset_dn": float(offset),
-        "log_dsnu_dn": 0.5 * float(np.log(max(0.3 * float(both), 0.1))),
-    }
-
-
-def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
-    """Return mean and variance of the normal law through two quantiles above the floor, None with too few values."""
-    hidden = float((values == floor_dn).mean())
-    if hidden > 0.95:
-        return None
-    low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
-    # Half a DN of dither smooths the steps of the rounding.
-    dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
-    below, above = np.quantile(dithered, [low, high])
-    sigma = float((above - below) / (ndtri(high) - ndtri(low)))
-    return float(below - sigma * ndtri(low)), sigma**2

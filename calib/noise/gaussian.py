@@ -1,4 +1,4 @@
-"""The marginal Gaussian likelihood of dark and flat frames, fitted with casadi and IPOPT.
+"""The marginal Gaussian likelihood of dark and flat frames, as expressions for casadi.
 
 The model of a dark pixel i in frame k of series j is `dn = o_i + d_i t_j + jitter_k + noise`, the noise of variance
 
@@ -12,101 +12,17 @@ only; `calib.noise.moments` gives the distribution of each.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.errors import PoorFit
-from faintfield.calib.noise.moments import FlatMoments, Moments
+from faintfield.calib.noise.moments import NO_EXCESS, Excess, FlatMoments, Moments
+from faintfield.calib.noise.response import BENDS, bend_log_prior, charge_dn, charge_slope, level_log_likelihood
 
 # Variance in DN² that rounding to whole DN adds.
 ROUNDING_DN2 = 1.0 / 12.0
-
-# IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
-_QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
-
-_SPREADS = ("dsnu_dn2", "dcnu_dn2_per_s2")
-
-
-@dataclass(frozen=True)
-class NoiseFit:
-    """Maximum-likelihood parameters of a sensor and their covariance.
-
-    Attributes
-    ----------
-    values : dict
-        `offset_dn` μ, `log_read_dn2` ln r, `dsnu_dn2` s², `jitter_dn2` τ², and, if the series determine them,
-        `dark_signal_dn_per_s` d, `dcnu_dn2_per_s2` q², `log_gain` ln g, `nonlinearity_per_dn` κ.
-    covariance : array (parameter, parameter)
-        Covariance in the order of `values`; zero for a jitter that is zero.
-    log_likelihood : float
-        Log-likelihood at the maximum, up to a constant.
-    """
-
-    values: dict[str, float]
-    covariance: NDArray[np.float64]
-    log_likelihood: float
-
-    def standard_error(self, name: str) -> float:
-        """Return the standard error of one parameter, infinite for one that was not fitted."""
-        if name not in self.values:
-            return float("inf")
-        index = list(self.values).index(name)
-        return float(np.sqrt(self.covariance[index, index]))
-
-
-def fit_gaussian(moments: Moments, *, nonlinear: bool = False) -> NoiseFit:
-    """Maximize the marginal likelihood; the covariance is the inverse of the exact Hessian.
-
-    Parameters
-    ----------
-    moments : Moments
-        Sufficient statistics; some series must have two frames or more.
-    nonlinear : bool
-        Fit the nonlinearity κ of the response too, which requires flats at three light levels.
-
-    Raises
-    ------
-    PoorFit
-        IPOPT did not converge.
-    """
-    start, scale = _start(moments, nonlinear)
-    units = np.array([*scale.values()])
-    x = ca.SX.sym("x", len(start))
-    parameters = {name: x[i] * scale[name] for i, name in enumerate(start)}
-    objective = negative_log_likelihood(parameters, moments)
-    at, minimum = _minimize(objective, x, start, units)
-    free = np.array([name != "jitter_dn2" or at[i] > 1e-6 for i, name in enumerate(start)])
-    hessian = np.array(ca.Function("hessian", [x], [ca.hessian(objective, x)[0]])(at))
-    return NoiseFit(
-        values=dict(zip(start, (at * units).tolist(), strict=True)),
-        covariance=_inverse_on(hessian, free) * np.outer(units, units),
-        log_likelihood=-minimum,
-    )
-
-
-def _minimize(
-    objective: Any, x: Any, start: Mapping[str, float], units: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
-    """Return the minimum of an expression in `x`, in `units`, and the value there."""
-    solver = ca.nlpsol("fit", "ipopt", {"x": x, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0})
-    # The spreads over pixels may be negative, as unbiased differences of variances can be. A bound at zero would push
-    # what contradicts it (pickup whose phase turns from frame to frame, for example) into the read noise.
-    lower = [0.0 if name == "jitter_dn2" else -np.inf for name in start]
-    # The first step from the spreads that the frames suggest may overshoot to a variance of zero; smaller spreads
-    # avoid that.
-    for share in (1.0, 0.1, 0.01):
-        first = [value * (share if name in _SPREADS else 1.0) for name, value in start.items()]
-        found = solver(x0=(first / units).tolist(), lbx=lower)
-        if solver.stats()["success"]:
-            return np.array(found["x"]).ravel(), float(found["f"])
-    raise PoorFit(
-        f"the noise likelihood has no maximum: IPOPT stopped with {solver.stats()['return_status']} after "
-        f"{solver.stats()['iter_count']} iterations; check that the darks were taken with the lens covered"
-    )
 
 
 def main_quantities(values: Mapping[str, float]) -> dict[str, tuple[float, dict[str, float]]]:
@@ -133,30 +49,41 @@ def dark_variances_dn2(values: Mapping[str, Any], exposure_s: NDArray[np.float64
 
 
 def flat_variances_dn2(values: Mapping[str, Any], mean_dn: NDArray[np.float64]) -> list[Any]:
-    """Return the pixel noise of each flat series, eq. (1) with a nonlinear response.
-
-    The charge behind a signal s is (s/g)(1 + κs), so that one more electron raises s by g/(1 + 2κs).
-    """
+    """Return the pixel noise of each flat series: eq. (1), with the local gain of the response, eq. (5)."""
     if not mean_dn.size:
         return []
     gain, read = _exp(values["log_gain"]), _exp(values["log_read_dn2"])
-    bend = values.get("nonlinearity_per_dn", 0.0)
     signals = [mean - values["offset_dn"] for mean in mean_dn]
-    return [(gain * s * (1 + bend * s) + read) / (1 + 2 * bend * s) ** 2 + ROUNDING_DN2 for s in signals]
+    return [(gain * charge_dn(values, s) + read) / charge_slope(values, s) ** 2 + ROUNDING_DN2 for s in signals]
 
 
 def flat_log_likelihood(
-    values: Mapping[str, Any], flats: FlatMoments, freedom: float
+    values: Mapping[str, Any], flats: FlatMoments, freedom: float, excess: Excess = NO_EXCESS
 ) -> tuple[Any, list[Any], list[float]]:
-    """Return ln L of the flats up to a constant, and ln v and half the degrees of freedom of each series."""
+    """Return ln L of the flats' noise up to a constant, and ln v and half the degrees of freedom of each series."""
     total, log_variances, half_freedom = 0.0, [], []
     for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
         weight = flats.evenness[index]
         degrees = (flats.frames[index] - 1) * freedom * weight
-        total -= _chi_squared(degrees, flats.within_dn2[index] * weight, v)
+        rounding2 = 0.0 if flats.rounding2 is None else flats.rounding2[index]
+        grown = excess.dispersion(degrees, rounding2, flat=True)
+        total -= _chi_squared(degrees / grown, flats.within_dn2[index] * weight / grown, v)
         log_variances.append(ca.log(v))
-        half_freedom.append(0.5 * degrees)
+        half_freedom.append(0.5 * degrees / grown)
     return total, log_variances, half_freedom
+
+
+def level_variances_dn2(values: Mapping[str, Any], moments: Moments) -> list[Any]:
+    """Return the variance of the mean level of each flat series: pixel noise, jitter, drift and unsteady light."""
+    flats, excess = moments.flats, moments.excess
+    noise = flat_variances_dn2(values, flats.mean_dn)
+    jitter = values.get("jitter_dn2", 0.0)
+    return [
+        (jitter + v / moments.pixels) / flats.frames[j]
+        + excess.drift_dn2
+        + excess.light2 * (flats.mean_dn[j] - values["offset_dn"]) ** 2
+        for j, v in enumerate(noise)
+    ]
 
 
 def _exp(value: Any) -> Any:
@@ -171,8 +98,24 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
     for j, v in enumerate(dark_v):
         freedom = (darks.frames[j] - 1) * moments.freedom
-        total += _chi_squared(freedom, darks.within_dn2[j], v)
-    return total - flat_log_likelihood(values, moments.flats, moments.freedom)[0]
+        rounding2 = 0.0 if darks.rounding2 is None else darks.rounding2[j]
+        grown = moments.excess.dispersion(freedom, rounding2, flat=False)
+        total += _chi_squared(freedom / grown, darks.within_dn2[j] / grown, v)
+    return total - _light(values, moments)
+
+
+def _light(values: Mapping[str, Any], moments: Moments) -> Any:
+    """Return ln L of the flats: of their noise, and of their levels where these tell the bend of the response."""
+    flats = moments.flats
+    total = flat_log_likelihood(values, flats, moments.freedom, moments.excess)[0]
+    if not any(name in values for name in BENDS):
+        return total
+    if np.isfinite(flats.bend_se):
+        total = total + bend_log_prior(values, flats.range_dn, flats.bend_se)
+    if not flats.light.groups.size:
+        return total
+    variances = level_variances_dn2(values, moments)
+    return total + level_log_likelihood(values, flats.light, flats.mean_dn, flats.exposure_s, variances)
 
 
 def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any:
@@ -185,10 +128,11 @@ def _line(values: Mapping[str, Any], dark_v: list[Any], moments: Moments) -> Any
     total, weight = 0.0, []
     for j, v in enumerate(dark_v):
         level = values["jitter_dn2"] + v / moments.pixels
-        weight.append(darks.frames[j] / level)
+        mean = level / darks.frames[j] + moments.excess.drift_dn2
+        weight.append(1 / mean)
         line = values["offset_dn"] + values.get("dark_signal_dn_per_s", 0.0) * t[j]
         total += _chi_squared(darks.frames[j] - 1, darks.level_scatter_dn2[j], level)
-        total += _chi_squared(1.0, (darks.mean_dn[j] - line) ** 2, level / darks.frames[j])
+        total += _chi_squared(1.0, (darks.mean_dn[j] - line) ** 2, mean)
     w, wt, wtt = (sum(w * t[j] ** power for j, w in enumerate(weight)) for power in range(3))
     fitted = w * wtt - wt**2 if "dark_signal_dn_per_s" in values else w
     return total + 0.5 * ca.log(fitted)
@@ -227,50 +171,3 @@ def _quadratic(weight: list[Any], a: NDArray[np.float64], b: NDArray[np.float64]
     left = ca.vertcat(*[w * a[j] for j, w in enumerate(weight)])
     right = ca.vertcat(*[w * b[j] for j, w in enumerate(weight)])
     return ca.mtimes([left.T, ca.DM(scatter), right])
-
-
-def _start(moments: Moments, nonlinear: bool) -> tuple[dict[str, float], dict[str, float]]:
-    """Return initial values from simple moments, and the scale, of each parameter that the series determine."""
-    darks, flats = moments.darks, moments.flats
-    measured = darks.frames > 1
-    variance = darks.within_dn2[measured] / ((darks.frames[measured] - 1) * moments.freedom)
-    read = max(float(variance.min()) - ROUNDING_DN2, 1e-3)
-    exposures, repeated = np.unique(darks.exposure_s), np.unique(darks.exposure_s[measured])
-    line = np.polyfit(darks.exposure_s, darks.mean_dn, 1) if exposures.size > 1 else (0.0, darks.mean_dn.mean())
-    # No smaller than any jitter that the levels can show; from far below the search would take long.
-    jitter = float(darks.level_scatter_dn2.sum() / max((darks.frames - 1).sum(), 1)) + read / moments.pixels
-    start = {"offset_dn": float(line[1]), "log_read_dn2": float(np.log(read)), "dsnu_dn2": read, "jitter_dn2": jitter}
-    scale = {"offset_dn": 1.0, "log_read_dn2": 1.0, "dsnu_dn2": read, "jitter_dn2": jitter}
-    if exposures.size > 1:
-        longest = float(exposures[-1])
-        start["dark_signal_dn_per_s"], scale["dark_signal_dn_per_s"] = float(line[0]), 1 / longest
-    if repeated.size > 1:
-        start["dcnu_dn2_per_s2"], scale["dcnu_dn2_per_s2"] = 0.01 * read / longest**2, read / longest**2
-    if flats.frames.size or repeated.size > 1:
-        start["log_gain"], scale["log_gain"] = float(np.log(_start_gain(moments, read, float(line[0])))), 1.0
-    if nonlinear:
-        start["nonlinearity_per_dn"], scale["nonlinearity_per_dn"] = 0.0, 1e-6
-    return start, scale
-
-
-def _start_gain(moments: Moments, read_dn2: float, slope_dn_per_s: float) -> float:
-    """Return an initial gain: excess variance over signal, from the brightest flat or the longest dark."""
-    darks, flats = moments.darks, moments.flats
-    if flats.frames.size:
-        k = int(flats.mean_dn.argmax())
-        excess = flats.within_dn2[k] / ((flats.frames[k] - 1) * moments.freedom) - read_dn2
-        signal = flats.mean_dn[k] - darks.mean_dn.min()
-    else:
-        k = int((darks.exposure_s * (darks.frames > 1)).argmax())
-        excess = darks.within_dn2[k] / max((darks.frames[k] - 1) * moments.freedom, 1) - read_dn2
-        signal = slope_dn_per_s * darks.exposure_s[k]
-    return float(np.clip(excess / signal if signal > 0 else 1.0, 1e-2, 1e2))
-
-
-def _inverse_on(hessian: NDArray[np.float64], free: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return the inverse of the Hessian over the free parameters, with a huge variance in undetermined directions."""
-    covariance = np.zeros_like(hessian)
-    values, vectors = np.linalg.eigh(hessian[np.ix_(free, free)])
-    inverse = np.where(values > 1e-9, 1.0 / np.maximum(values, 1e-9), 1e12)
-    covariance[np.ix_(free, free)] = (vectors * inverse) @ vectors.T
-    return covariance

@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise_model import Map, NoiseModel
+from faintfield.calib.noise.goodness import SeriesGoodness
+from faintfield.calib.noise.saturation import Saturation
+from faintfield.calib.noise_model import BentResponse, Map, NoiseModel
 
 # Quantities without which there is no noise model.
 _REQUIRED = ("offset_dn", "gain_dn_per_e", "read_noise_e")
@@ -107,7 +109,8 @@ class NoiseCalibration:
     estimates : dict of Estimate
         `offset_dn, gain_dn_per_e, read_noise_e, read_noise_dn, dark_current_e_per_s, dark_signal_dn_per_s, dsnu_e,
         dsnu_dn, dsnu_row_dn, dsnu_column_dn, dcnu_e_per_s, frame_jitter_dn, row_noise_dn, column_noise_dn, prnu,
-        quantum_efficiency, nonlinearity_per_dn`.
+        quantum_efficiency, nonlinearity_per_dn, linearity_error, saturation_e, noise_error, drift_dn, light_error,
+        lamp_flicker`.
     covariance : tuple (names, array)
         Covariance of those of offset, gain, read noise and dark current that have values.
     likelihood : str
@@ -123,7 +126,13 @@ class NoiseCalibration:
     histograms : tuple of Histogram
         Values of the shortest and the longest darks with their prediction; empty if the gain is unknown.
     saturation_dn : float
-        Value from which a pixel is saturated.
+        Value from which a pixel is saturated, as stated or found.
+    saturation : Saturation
+        Where the flats saturate, and which of them are left out.
+    response : BentResponse, optional
+        Bend of the response where the flats show one.
+    goodness : tuple of SeriesGoodness
+        How well each series that was used follows the model.
     warnings : tuple of str
         Problems of the frames.
     """
@@ -139,6 +148,9 @@ class NoiseCalibration:
     points: tuple[TransferPoint, ...]
     histograms: tuple[Histogram, ...]
     saturation_dn: float
+    saturation: Saturation
+    response: BentResponse | None
+    goodness: tuple[SeriesGoodness, ...]
     warnings: tuple[str, ...]
 
     def noise_model(self, *, per_pixel: bool = True) -> NoiseModel:
@@ -165,4 +177,5 @@ class NoiseCalibration:
             **fields,
             quantum_efficiency=None if efficiency is None else min(efficiency, 1.0),
             saturation_dn=self.saturation_dn,
+            response=self.response,
         )

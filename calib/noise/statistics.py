@@ -8,28 +8,24 @@ level and banding would count as pixel noise.
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
-from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
+from faintfield.calib.errors import BadFrame, LightLeak
+from faintfield.calib.noise.outliers import outlier
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
 _SUSPECT_SIGMA = 8.0
 
-# A dark has seen light if it is brighter than its series by the first multiple of the pixel noise, or by the second one
-# if jitter of the black level does that with less than this probability.
-_CERTAIN_LEAK, _MIN_LEAK, _MAX_CHANCE = 5.0, 0.25, 1e-7
+# A dark has seen light if brighter than its series by the first multiple of the noise, or by the second beyond chance.
+_CERTAIN_LEAK, _MIN_LEAK = 5.0, 0.25
 
 # A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
 _CERTAIN_EXCESS, _MIN_EXCESS = 1.0, 0.2
-
-# Largest share, and number, of a flat's pixels on its highest value; beyond, the flat is saturated.
-_MAX_SATURATED_FRACTION, _MAX_SATURATED_PX = 1e-3, 10
 
 # Pixels whose values are kept for histograms and for the likelihood of single values.
 SAMPLE_PX = 65_536
@@ -49,12 +45,20 @@ class Conditions:
         Index of the light level of a flat; 0 for darks.
     photons : float, optional
         Mean photons per pixel and exposure, if measured by a radiometer.
+    dark_factor : float
+        Dark current at the temperature of the frames over that at the temperature of reference.
     """
 
     kind: Literal["dark", "flat"]
     exposure_s: float
     level: int = 0
     photons: float | None = None
+    dark_factor: float = 1.0
+
+    @property
+    def dark_time_s(self) -> float:
+        """Exposure in which the sensor would collect the same dark charge at the temperature of reference."""
+        return self.exposure_s * self.dark_factor
 
     def __str__(self) -> str:
         light = f" at level {self.level}" if self.kind == "flat" else ""
@@ -89,6 +93,12 @@ class Series:
         Values of the pixels `sample_index(shape)`.
     floor_dn : int
         Lowest value of all frames.
+    spreads_dn2 : array (frame,)
+        Variance over each frame's pixels, level and profiles subtracted.
+    top_dn : float
+        Highest value of all frames, or the stated end of the range if it was reached.
+    at_top, below_top, counted : int
+        Number of values of regular pixels at `top_dn` or above, one below it, and of all; flats only.
     """
 
     conditions: Conditions
@@ -104,6 +114,11 @@ class Series:
     suspect: NDArray[np.bool_]
     sample_dn: NDArray[np.int32]
     floor_dn: int
+    spreads_dn2: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    top_dn: float = 0.0
+    at_top: int = 0
+    below_top: int = 0
+    counted: int = 0
 
     @property
     def frames(self) -> int:
@@ -114,6 +129,12 @@ class Series:
     def mean_dn(self) -> NDArray[np.float64]:
         """Mean over the frames (row, column), with level and profiles."""
         return self.pattern_dn + self.row_dn[:, None] + self.column_dn[None, :] + self.levels_dn.mean()
+
+    def clipped_share(self, ceiling_dn: float) -> float:
+        """Return the share of the regular pixels' values at the end of the range."""
+        if self.top_dn < ceiling_dn:
+            return 0.0
+        return (self.at_top + (self.below_top if self.top_dn - 1 >= ceiling_dn else 0)) / max(self.counted, 1)
 
 
 class SeriesSums:
@@ -133,19 +154,16 @@ class SeriesSums:
         # Of each frame: its name, hash and sample, the mean level, rows and columns, and the spread of the rest
         self._frames: list[tuple[Any, ...]] = []
         self._floor_dn = np.iinfo(np.int64).max
+        self._top_dn, self._at_top, self._below_top = -np.inf, 0, 0
 
     def add(self, name: str, frame_dn: NDArray[Any]) -> None:
         """Add one frame.
 
         Raises
         ------
-        SaturatedFlat
-            More than 0.1 % of a flat's pixels are at the end of the range.
         ValueError
             The frame differs in size from earlier ones.
         """
-        if self.conditions.kind == "flat":
-            _check_range(name, frame_dn, self.saturation_dn)
         if not self._frames:
             self._begin(frame_dn)
         if frame_dn.shape != self._suspect.shape:
@@ -153,6 +171,8 @@ class SeriesSums:
         digest = hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest()
         sample = frame_dn.ravel()[self._sampled].astype(np.int32)
         self._floor_dn = min(self._floor_dn, int(frame_dn.min()))
+        if self.conditions.kind == "flat":
+            self._count_top(frame_dn[self._regular])
         self._frames.append((name, digest, sample, *self._add_residual(frame_dn.astype(np.float64))))
 
     def _begin(self, first_dn: NDArray[Any]) -> None:
@@ -180,6 +200,16 @@ class SeriesSums:
         self._squares += residual_dn
         return level, rows, columns, residual_dn.mean(where=self._regular)
 
+    def _count_top(self, values_dn: NDArray[Any]) -> None:
+        """Count the values at the highest one so far, and one below it; the stated end of the range is the highest."""
+        top = max(self._top_dn, min(float(values_dn.max()), self.saturation_dn))
+        at, below = int((values_dn >= top).sum()), int((values_dn == top - 1).sum())
+        if top == self._top_dn:
+            at, below = at + self._at_top, below + self._below_top
+        elif top == self._top_dn + 1:
+            below += self._at_top
+        self._top_dn, self._at_top, self._below_top = top, at, below
+
     def series(self) -> Series:
         """Return the statistics of the frames so far.
 
@@ -190,8 +220,7 @@ class SeriesSums:
         ValueError
             No frame was given.
         """
-        frames = len(self._frames)
-        if not frames:
+        if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
         mean = self._pattern / frames
         within = np.maximum(self._squares - frames * mean**2, 0.0)
@@ -211,6 +240,11 @@ class SeriesSums:
             suspect=self._suspect,
             sample_dn=np.array(samples),
             floor_dn=self._floor_dn,
+            spreads_dn2=spreads_dn2,
+            top_dn=self._top_dn,
+            at_top=self._at_top,
+            below_top=self._below_top,
+            counted=frames * int(self._regular.sum()) if self.conditions.kind == "flat" else 0,
         )
         _check_alike(series, spreads_dn2)
         return series
@@ -246,49 +280,21 @@ def robust_sigma(values: NDArray[Any]) -> float:
     return float(1.4826 * np.median(np.abs(values - np.median(values))))
 
 
-def _check_range(name: str, frame_dn: NDArray[Any], saturation_dn: float) -> None:
-    """Check that a flat does not reach the end of the range, whether `saturation_dn` states it or not."""
-    ceiling = min(float(frame_dn.max()), saturation_dn)
-    at_end, next_below = int((frame_dn >= ceiling).sum()), int((frame_dn == ceiling - 1).sum())
-    if at_end > max(_MAX_SATURATED_FRACTION * frame_dn.size, _MAX_SATURATED_PX, next_below):
-        raise SaturatedFlat(
-            f"{name}: {at_end / frame_dn.size:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range "
-            f"(at most {_MAX_SATURATED_FRACTION:.1%} may); shorten the exposure or dim the light"
-        )
-
-
 def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
     """Check that no dark is brighter, or has another pattern, than the others of its series."""
     if series.conditions.kind != "dark" or series.frames < 2:
         return
     noise_dn = float(np.sqrt(np.median(series.within_dn2) / (series.frames - 1)))
-    worst, excess_dn = _outlier(series.levels_dn, _MIN_LEAK * noise_dn, _CERTAIN_LEAK * noise_dn)
+    worst, excess_dn = outlier(series.levels_dn, _MIN_LEAK * noise_dn, _CERTAIN_LEAK * noise_dn)
     if excess_dn > 0:
         raise LightLeak(
             f"{series.names[worst]}: mean {series.levels_dn[worst]:.1f} DN, {excess_dn:.1f} DN above the other "
             f"{series.conditions} (their pixels are {noise_dn:.1f} DN rms noisy): light leaked in; cover the lens and "
             "record it again, or leave it out"
         )
-    odd, excess = _outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
+    odd, excess = outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
     if excess > 0:
         raise BadFrame(
             f"{series.names[odd]}: its pixels spread {np.sqrt(1 + excess):.2f} times as far as in the other "
             f"{series.conditions}: light leaked in or the readout failed; record it again, or leave it out"
         )
-
-
-def _outlier(values: NDArray[np.float64], min_excess: float, certain_excess: float) -> tuple[int, float]:
-    """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
-
-    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
-    from the scatter of the others, is below `_MAX_CHANCE`.
-    """
-    largest = int(values.argmax())
-    others = np.delete(values, largest)
-    excess = float(values[largest] - others.mean())
-    if excess > certain_excess:
-        return largest, excess
-    if excess < min_excess or others.size < 2:
-        return largest, 0.0
-    t = excess / max(float(others.std(ddof=1)) * np.sqrt(1 + 1 / others.size), 1e-12)
-    return largest, excess if stats.t.sf(t, others.size - 1) < _MAX_CHANCE else 0.0

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
+from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise import Conditions, measure_series
-from faintfield.calib.noise.statistics import _MAX_CHANCE, _outlier
+from faintfield.calib.noise.outliers import MAX_CHANCE, outlier
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 DARK = Conditions("dark", 1.0)
@@ -72,12 +72,17 @@ def test_with_two_frames_only_a_large_leak_is_named() -> None:
         measure_series([frames[0], ("bright", expose(chip, 1.0, rng, photons=100.0))], DARK)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_saturated_flat_is_named(stated: bool) -> None:
-    chip, rng = specimen(5)
-    flat = np.minimum(expose(chip, 1.0, rng, photons=4000.0), 4095)
-    with pytest.raises(SaturatedFlat, match=r"flat_7: .* stand at 4095 DN"):
-        measure_series([("flat_7", flat)], FLAT, 4095 if stated else np.inf)
+@pytest.mark.parametrize("stated", [4000.0, 4095.0, np.inf])
+def test_values_at_the_top_are_counted_over_all_frames(stated: float) -> None:
+    rng = np.random.default_rng(5)
+    stack = np.minimum(np.rint(rng.normal(4060, 30, (5, 32, 32))), 4095).astype(np.uint16)
+    series = measure_series(((str(k), frame) for k, frame in enumerate(stack)), FLAT, stated)
+    top = min(4095.0, stated)
+    assert series.top_dn == top
+    assert series.at_top == (stack >= top).sum()
+    assert series.below_top == (stack == top - 1).sum()
+    assert series.clipped_share(top) == pytest.approx((stack >= top).mean())
+    assert series.clipped_share(top + 1) == 0.0
 
 
 def test_frames_of_another_size_are_refused() -> None:
@@ -94,12 +99,12 @@ def test_a_value_is_odd_whose_distance_from_the_others_is_no_chance_by_students_
     others = np.array([-1.2, 0.3, 1.4, -0.5, 0.2, -0.9, 0.7])
     others -= others.mean()
     # A new value differs from the mean of n others by σ √(1 + 1/n)
-    just = stats.t.isf(_MAX_CHANCE, 6) * others.std(ddof=1) * np.sqrt(1 + 1 / 7)
+    just = stats.t.isf(MAX_CHANCE, 6) * others.std(ddof=1) * np.sqrt(1 + 1 / 7)
     for factor, odd in ((0.98, False), (1.02, True)):
         values = np.insert(others, 3, factor * just)
-        index, excess = _outlier(values, 0.1, 1e9)
+        index, excess = outlier(values, 0.1, 1e9)
         assert index == 3
         assert excess == pytest.approx(factor * just if odd else 0.0)
-    assert _outlier(np.insert(others, 0, 1.02 * just), 1.03 * just, 1e9) == (0, 0.0), "too little to matter"
-    assert _outlier(np.insert(others, 0, 0.9 * just), 0.1, 0.8 * just)[1] == pytest.approx(0.9 * just), "certain"
-    assert _outlier(np.array([0.0, 5.0]), 0.1, 10.0) == (1, 0.0), "one other value has no scatter"
+    assert outlier(np.insert(others, 0, 1.02 * just), 1.03 * just, 1e9) == (0, 0.0), "too little to matter"
+    assert outlier(np.insert(others, 0, 0.9 * just), 0.1, 0.8 * just)[1] == pytest.approx(0.9 * just), "certain"
+    assert outlier(np.array([0.0, 5.0]), 0.1, 10.0) == (1, 0.0), "one other value has no scatter"

@@ -1,0 +1,33 @@
+"""Estimates with intervals from a value and its standard error."""
+
+import numpy as np
+
+from faintfield.calib.noise.result import Estimate
+
+_NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
+
+# Largest exponent of an interval's end over its value; nothing beyond is of use.
+_MAX_EXPONENT = 50.0
+
+
+def interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
+    """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
+    if positive:
+        factor = float(np.exp(min(quantile * se / value, _MAX_EXPONENT)))
+        return Estimate(value, se, (value / factor, value * factor))
+    return Estimate(value, se, (value - quantile * se, value + quantile * se))
+
+
+def root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
+    """Return the root of a variance, times a scale; no value if the variance is significantly negative."""
+    if not se:
+        return Estimate(None, why=_NO_SPREAD)
+    if variance + quantile * se <= 0:
+        return Estimate(
+            None,
+            why=f"there is less scatter than the pixels' noise alone makes (by {-variance / se:.2g} standard errors), "
+            "so that a spread would be hidden: pickup whose phase turns from frame to frame does that; record more "
+            "frames, away from what may disturb them",
+        )
+    low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
+    return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))

@@ -1,0 +1,150 @@
+"""What the flats say of saturation and response, and how far the series scatter about the model."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from faintfield.calib.noise.drift import lamp_flicker2
+from faintfield.calib.noise.fitting import SeriesFit
+from faintfield.calib.noise.gaussian import level_variances_dn2
+from faintfield.calib.noise.goodness import series_goodness
+from faintfield.calib.noise.intervals import root
+from faintfield.calib.noise.response import BENDS, FittedLevels, charge_dn
+from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.saturation import Saturation
+
+# Largest scatter of the noise of series about the model, and largest departure of one, as fractions of the variance.
+MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
+
+# Draws of the response from its covariance, for the error of the linearity error.
+_DRAWS = 200
+
+_NO_LIGHT = (
+    "the light of the flats is not known: state the photons of at least 3 light levels over a factor of 2, or record 3 "
+    "exposures under one light"
+)
+
+
+def why_noise_denies(fitted: SeriesFit) -> str | None:
+    """Return why the noise of the series denies the model, None if it does not; only with flats."""
+    if not fitted.flats:
+        return None
+    series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats, fitted.used)
+    for one in series:
+        # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
+        if one.noise_excess is None or one.noise_se is None or one.series.conditions.kind == "dark":
+            continue
+        if abs(one.noise_excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * one.noise_se):
+            return (
+                f"the noise of the {one.series.conditions} is {one.noise_excess:+.1%} off the model's in variance "
+                f"({abs(one.noise_excess) / one.noise_se:.0f} standard errors); record it again or leave it out"
+            )
+    scatter = float(np.sqrt(fitted.moments.excess.variance2))
+    if scatter > MAX_NOISE_ERROR:
+        return (
+            f"the noise of the series scatters by {scatter:.1%} in variance about the model (limit "
+            f"{MAX_NOISE_ERROR:.0%}): "
+            "the noise of the camera changed, or the response is not that of one sensor; record all series in one go"
+        )
+    return None
+
+
+def of_light(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate) -> dict[str, Estimate]:
+    """Return linearity error, saturation capacity and the scatter between series."""
+    excess, quantile = fitted.moments.excess, float(stats.norm.ppf(0.975))
+    flicker = lamp_flicker2(fitted.fit, fitted.moments)
+    return {
+        "linearity_error": _linearity(fitted, saturation),
+        "saturation_e": _capacity(fitted, saturation, gain, efficiency),
+        "noise_error": Estimate(float(np.sqrt(excess.variance2))),
+        "drift_dn": Estimate(float(np.sqrt(excess.drift_dn2))),
+        "light_error": Estimate(float(np.sqrt(excess.light2)))
+        if _knows_light(fitted)
+        else Estimate(None, why=_NO_LIGHT),
+        "lamp_flicker": root(*flicker, quantile) if flicker else Estimate(None, why="there are no flats"),
+    }
+
+
+def _light_error(fitted: SeriesFit) -> Estimate:
+    """Return the relative scatter of the flats' levels about the response."""
+    if not _knows_light(fitted):
+        return Estimate(None, why=_NO_LIGHT)
+    return Estimate(float(np.sqrt(fitted.moments.excess.light2)))
+
+
+def _knows_light(fitted: SeriesFit) -> bool:
+    """Return whether the levels of the flats tell the response."""
+    return bool(fitted.bend is not None and fitted.moments.flats.light.groups.size)
+
+
+def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
+    """Return EMVA 1288's linearity error of the fitted response, over the levels that were used."""
+    fit = fitted.bend
+    if fit is None or not _knows_light(fitted):
+        return Estimate(None, why=_NO_LIGHT if fitted.flats else "there are no flats")
+    offset = fit.values["offset_dn"]
+    dark = fit.values.get("dark_signal_dn_per_s", 0.0) * fitted.moments.flats.exposure_s
+    signal = fitted.moments.flats.mean_dn - offset - dark
+    full = float(signal.max()) if saturation.level_dn is None else saturation.level_dn - offset
+    variance = np.array(level_variances_dn2(fit.values, fitted.moments), float)
+    levels = FittedLevels(fitted.moments.flats.light, signal, variance, full)
+    value = levels.linearity(fit.values)
+    if value is None:
+        return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
+    names = [name for name in fit.values if name in BENDS]
+    at = [list(fit.values).index(name) for name in names]
+    covariance, bends = fit.covariance[np.ix_(at, at)], np.array([fit.values[name] for name in names])
+    drawn = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
+    errors = np.array([levels.linearity(dict(zip(names, draw.tolist(), strict=True))) or 0.0 for draw in drawn])
+    se = float(np.sqrt(np.mean((errors - value) ** 2)))
+    gradient = np.zeros(len(fit.values))
+    gradient[at] = _slopes(levels, names, bends, covariance)
+    half = fit.quantile(gradient) * se
+    straight = stats.chi2.sf(float(bends @ np.linalg.pinv(covariance) @ bends), len(names)) > 0.05
+    return Estimate(value, se, (0.0 if straight else max(value - half, 0.0), value + half))
+
+
+def _slopes(
+    levels: FittedLevels, names: list[str], bends: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the derivatives of the linearity error by the bends, over a tenth of their errors."""
+    found = []
+    for index, step in enumerate(0.1 * np.sqrt(np.diag(covariance))):
+        ends = [bends + sign * step * np.eye(len(names))[index] for sign in (-1, 1)]
+        low, high = (levels.linearity(dict(zip(names, end.tolist(), strict=True))) or 0.0 for end in ends)
+        found.append((high - low) / max(2 * step, 1e-300))
+    return np.array(found)
+
+
+def _capacity(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficiency: Estimate) -> Estimate:
+    """Return the saturation capacity μ_e.sat in electrons.
+
+    A full well takes its charge from the light of the series where it begins, as EMVA 1288 does; the response is not
+    known as far as that.
+    """
+    if saturation.level_dn is None or saturation.interval_dn is None:
+        return Estimate(None, why="no series of flats reaches saturation; record light levels up to it")
+    if gain.value is None or gain.se is None:
+        return Estimate(None, why=gain.why)
+    values = fitted.fit.values
+    if saturation.limit == "full well":
+        return _full_well(saturation, efficiency)
+    ends = (saturation.level_dn, *saturation.interval_dn)
+    charges = [float(charge_dn(values, level - values["offset_dn"])) / gain.value for level in ends]
+    relative = 1.96 * gain.se / gain.value
+    low, high = charges[1] * (1 - relative), charges[2] * (1 + relative)
+    return Estimate(charges[0], (high - low) / 3.92, (low, high))
+
+
+def _full_well(saturation: Saturation, efficiency: Estimate) -> Estimate:
+    """Return the capacity from the photons of the noisiest series and its neighbours."""
+    flats = sorted((*saturation.kept, *(one for one, _ in saturation.left_out)), key=lambda one: one.levels_dn.mean())
+    means = [float(one.levels_dn.mean()) for one in flats]
+    at = int(np.argmin(np.abs(np.array(means) - (saturation.level_dn or 0.0))))
+    photons = [flats[k].conditions.photons for k in (at, max(at - 1, 0), min(at + 1, len(flats) - 1))]
+    if efficiency.value is None or efficiency.se is None or not all(photons):
+        return Estimate(None, why="the charge of a full well follows from its photons, which are not stated")
+    charges = [efficiency.value * float(number or 0.0) for number in photons]
+    relative = 1.96 * efficiency.se / efficiency.value
+    low, high = charges[1] * (1 - relative), charges[2] * (1 + relative)
+    return Estimate(charges[0], (high - low) / 3.92, (low, high))
