@@ -1,8 +1,8 @@
-"""How often the intervals of the noise calibration hold: `python -m benchmarks.noise_coverage [case ...] [--repeats N]`.
+"""How often the intervals of the noise hold: `python -m benchmarks.noise_coverage [case ...] [--repeats N]`.
 
-Sensors that bend, saturate, drift, flicker and scatter are simulated here, apart from `calib`. Every repeat draws frames
-afresh and goes through the whole calibration. An interval holds if the truth is inside; a quantity without a value
-counts on its own. The intervals of a quantity should hold 93 to 97 % of the time, or there should be none.
+Sensors that bend, saturate, drift, flicker and scatter are simulated here, apart from `calib`. Every repeat draws
+frames afresh and goes through the whole calibration. An interval holds if the truth is inside; quantities without a
+value count on their own. The intervals of a quantity should hold 93 to 97 % of the time, or there should be none.
 """
 
 import argparse
@@ -64,7 +64,7 @@ def expose(
     flips = pixels["telegraph"] * (rng.random(camera.shape) < 0.3) * 8 * camera.read_noise_e
     electrons = np.minimum(mean_e + more * noise_e, pixels["well_e"]) + flips
     dn = pixels["offset_dn"] + camera.mean_dn(electrons) + shift_dn + camera.jitter_dn * rng.standard_normal()
-    return np.clip(np.rint(dn), 0, camera.highest_dn).astype(np.uint16)
+    return np.asarray(np.clip(np.rint(dn), 0, camera.highest_dn), np.uint16)
 
 
 def make_pixels(camera: Camera, rng: np.random.Generator) -> dict[str, Array]:
@@ -93,7 +93,7 @@ class Session:
 
 def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[Series]:
     """Take and reduce all series."""
-    pixels, series = make_pixels(camera, rng), []
+    pixels, series = make_pixels(camera, rng), list[Series]()
 
     def take(conditions: Conditions, frames: int, charge_e: float, dark_e: float) -> Series:
         shift = camera.drift_dn * rng.standard_normal()
@@ -105,8 +105,8 @@ def record(camera: Camera, session: Session, rng: np.random.Generator) -> list[S
             taken.append((f"{conditions} {k}", expose(camera, pixels, charge, shift, more, rng)))
         return measure_series(taken, conditions, camera.highest_dn)
 
-    for t in session.dark_s:
-        series.append(take(Conditions("dark", t), session.dark_frames, 0.0, camera.dark_current_e_per_s * t))
+    current = camera.dark_current_e_per_s
+    series += [take(Conditions("dark", t), session.dark_frames, 0.0, current * t) for t in session.dark_s]
     for level, charge in enumerate(session.charges_e):
         photons = charge / 0.5 if session.photons else None
         series.append(take(Conditions("flat", 0.01, level, photons), session.flat_frames, charge, 0.2))
@@ -182,9 +182,9 @@ CASES: dict[str, tuple[Camera, Session]] = {
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", choices=[*CASES, []], default=list(CASES))
+    parser.add_argument("cases", nargs="*", choices=[*CASES, []], default=[])
     parser.add_argument("--repeats", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1000)
     arguments = parser.parse_args()
-    for chosen in arguments.cases:
+    for chosen in arguments.cases or CASES:
         study(chosen, *CASES[chosen], arguments.repeats, arguments.seed)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from faintfield.calib.noise.gaussian import NoiseFit, flat_variances_dn2
+from faintfield.calib.noise.gaussian import flat_variances_dn2
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import Moments
 
 

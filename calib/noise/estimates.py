@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import NoiseFit, dark_variances_dn2, main_quantities
+from faintfield.calib.noise.gaussian import dark_variances_dn2, main_quantities
 from faintfield.calib.noise.intervals import interval, root
 from faintfield.calib.noise.light_estimates import of_light, why_noise_denies
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import Moments
 from faintfield.calib.noise.pixels import Response, quantum_efficiency
 from faintfield.calib.noise.response import charge_dn

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import PoorFit
-from faintfield.calib.noise.gaussian import NoiseFit, flat_log_likelihood
+from faintfield.calib.noise.gaussian import flat_log_likelihood
 from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import Moments
 
 type Array = NDArray[np.float64]
@@ -37,10 +38,10 @@ _TRIED_DCNU, _MIN_RISE = (0.08, 0.3), 4.0
 
 @dataclass(frozen=True)
 class Bent:
-    """The bend of the response, and the relative variance of the gain that is due to its error."""
+    """The bend of the response: its coefficients, and their covariance."""
 
     values: dict[str, float]
-    gain_variance: float
+    covariance: Array
 
 
 def fit_exact(
@@ -97,13 +98,10 @@ def fit_exact(
 
 
 def _with_bend(fit: NoiseFit, bent: Bent) -> NoiseFit:
-    """Return a fit with the bend of the response among its values, and the error that it adds to the gain."""
+    """Return a fit with the bend of the response among its values."""
     size = len(fit.values)
     covariance = np.zeros((size + len(bent.values),) * 2)
-    covariance[:size, :size] = fit.covariance
-    at = list(fit.values).index("log_gain")
-    # A gain that is off moves whatever was measured in DN by as much in electrons, which its own error covers.
-    covariance[at, at] += bent.gain_variance
+    covariance[:size, :size], covariance[size:, size:] = fit.covariance, bent.covariance
     return NoiseFit(fit.values | bent.values, covariance, fit.log_likelihood)
 
 
@@ -173,14 +171,33 @@ def _inverse(information: Array) -> Array:
 
 
 def _flat_part(x: Array, moments: Moments, bent: Bent) -> tuple[float, Array, Array]:
-    """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`."""
+    """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`, the bend integrated out.
+
+    Its normal law times a likelihood that is normal near its coefficients leaves ½ gᵀ M g, with the gradient g by the
+    coefficients, and M the inverse of both their informations (Laplace).
+    """
     size, flats = len(PARAMETERS), moments.flats
     if not flats.frames.size:
         return 0.0, np.zeros(size), np.zeros((size, size))
-    s = ca.SX.sym("s", size)
-    values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4], **bent.values}
+    s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bent.values))
+    values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}
+    units = np.sqrt(np.diag(bent.covariance))
+    values |= {name: bent.values[name] + b[k] * units[k] for k, name in enumerate(bent.values)}
     log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, flats, moments.freedom, moments.excess)
-    slopes = ca.jacobian(ca.vertcat(*log_variances), s)
-    outputs = [log_likelihood, ca.gradient(log_likelihood, s), slopes]
-    value, gradient, by_series = (np.array(part) for part in ca.Function("flats", [s], outputs)(x))
-    return float(value[0, 0]), gradient.ravel(), (by_series.T * np.array(half_freedom)) @ by_series
+    logs = ca.vertcat(*log_variances)
+    by_bend, weight = ca.jacobian(logs, b), ca.diag(ca.DM(half_freedom))
+    if bent.values:
+        prior = ca.DM(np.linalg.pinv(bent.covariance / np.outer(units, units)))
+        precision = prior + by_bend.T @ weight @ by_bend
+        slope = ca.gradient(log_likelihood, b)
+        log_likelihood = log_likelihood + 0.5 * slope.T @ ca.solve(precision, slope)
+    else:
+        precision = ca.SX(0, 0)
+    outputs = [log_likelihood, ca.gradient(log_likelihood, s), ca.jacobian(logs, s), by_bend, precision]
+    found = ca.Function("flats", [s, b], outputs)(x, np.zeros(len(bent.values)))
+    value, gradient, by_series, bends, inverse = (np.array(part) for part in found)
+    information = (by_series.T * np.array(half_freedom)) @ by_series
+    if bent.values:
+        cross = (by_series.T * np.array(half_freedom)) @ bends
+        information -= cross @ np.linalg.solve(inverse, cross.T)
+    return float(value[0, 0]), gradient.ravel(), information

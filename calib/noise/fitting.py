@@ -14,10 +14,11 @@ from scipy.special import ndtri
 
 from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.noise.exact import Bent, fit_exact
-from faintfield.calib.noise.gaussian import NoiseFit, covariance_at, dark_variances_dn2, flat_variances_dn2
+from faintfield.calib.noise.gaussian import dark_variances_dn2, flat_variances_dn2
 from faintfield.calib.noise.goodness import fit_with_excess
 from faintfield.calib.noise.marginal import Counts
-from faintfield.calib.noise.moments import Excess, Moments, gather_moments
+from faintfield.calib.noise.maximum import NoiseFit
+from faintfield.calib.noise.moments import Moments, gather_moments
 from faintfield.calib.noise.response import (
     BENDS,
     MEASURED_BEND_SE,
@@ -137,7 +138,7 @@ def fit_series(
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments, bent_by(gaussian), exact=exact, try_spread=spread)
         if exact:
-            fit = grown_like(gaussian, fit, moments)
+            fit = grown_like(gaussian, fit)
     return SeriesFit(darks, flats, moments, likelihood, fit, bend, used)
 
 
@@ -176,10 +177,9 @@ def _fit_gaussian(
     return fit, free, grown
 
 
-def grown_like(gaussian: NoiseFit, fit: NoiseFit, moments: Moments) -> NoiseFit:
+def grown_like(gaussian: NoiseFit, fit: NoiseFit) -> NoiseFit:
     """Return a fit of single values, its errors grown by the factors by which scatter grows those of the Gaussian."""
-    plain = covariance_at(gaussian.values, replace(moments, excess=Excess()))
-    before, after = np.diag(plain), np.diag(gaussian.covariance)
+    before, after = np.diag(gaussian.plain_covariance), np.diag(gaussian.covariance)
     known = list(gaussian.values)
     factor = {name: max(after[i] / before[i], 1.0) if before[i] > 0 else 1.0 for i, name in enumerate(known)}
     grow = np.sqrt([factor.get(name, 1.0) for name in fit.values])
@@ -187,17 +187,10 @@ def grown_like(gaussian: NoiseFit, fit: NoiseFit, moments: Moments) -> NoiseFit:
 
 
 def bent_by(gaussian: NoiseFit) -> Bent:
-    """Return the bend of the response in a Gaussian fit, and the relative variance of the gain that is due to it."""
-    names = [name for name in gaussian.values if name in BENDS]
-    order = list(gaussian.values)
-    fixed = [order.index(name) for name in order if name not in names]
-    variance = 0.0
-    if names and "log_gain" in order:
-        precision = np.linalg.pinv(gaussian.covariance)
-        alone = np.linalg.pinv(precision[np.ix_(fixed, fixed)])
-        at = fixed.index(order.index("log_gain"))
-        variance = max(gaussian.standard_error("log_gain") ** 2 - float(alone[at, at]), 0.0)
-    return Bent({name: gaussian.values[name] for name in names}, variance)
+    """Return the bend of the response in a Gaussian fit."""
+    at = [index for index, name in enumerate(gaussian.values) if name in BENDS]
+    values = {name: gaussian.values[name] for name in gaussian.values if name in BENDS}
+    return Bent(values, gaussian.covariance[np.ix_(at, at)])
 
 
 def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:

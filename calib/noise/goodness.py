@@ -13,15 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.gaussian import (
-    NoiseFit,
-    covariance_at,
-    dark_variances_dn2,
-    fit_gaussian,
-    flat_variances_dn2,
-    level_variances_dn2,
-)
-from faintfield.calib.noise.moments import Excess, Moments
+from faintfield.calib.noise.gaussian import ROUNDING_DN2, dark_variances_dn2, flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.maximum import GaussianProblem, NoiseFit
+from faintfield.calib.noise.moments import NO_EXCESS, Excess, Moments
 from faintfield.calib.noise.response import charge_dn, charge_slope, grown_variance, scatter_of_levels
 from faintfield.calib.noise.statistics import Series
 
@@ -36,8 +30,13 @@ _MAX_CHANCE = 0.05
 # Rounds of fits in which the scatter is measured, and its relative change at which they end.
 _MAX_ROUNDS, _SETTLED = 5, 0.02
 
-# Parameters that the noise of series determines: read noise and gain.
-_NOISE_PARAMETERS = 2
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of an excess variance: degrees of freedom, and its share in the variance that it is part of."""
+
+    freedom: int
+    share: float
 
 
 @dataclass(frozen=True)
@@ -126,26 +125,32 @@ def flat_noise_map(fit: NoiseFit, one: Series) -> Array:
 
 def measure_excess(
     fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
-) -> tuple[Excess, tuple[int, int, int]]:
-    """Return the scatter beyond the model, and the degrees of freedom of `variance2`, `drift_dn2` and `light2`."""
+) -> tuple[Excess, dict[str, Known]]:
+    """Return the scatter beyond the model, and for `variance2`, `drift_dn2` and `light2` what is known of each."""
     dark_noise = dark_variances_dn2(fit.values, moments.darks.exposure_s)
     excess = Excess(
         darks=_dispersion(darks, dark_noise, used),
         flats=_dispersion(flats, [flat_noise_map(fit, one) for one in flats], used),
     )
-    variance2, freedom = _noise_scatter(fit, moments, excess)
-    drift_dn2, drift_freedom = _drift(fit, moments)
+    variance2, noise_known = _noise_scatter(fit, moments, excess)
+    drift_dn2, drift_known = _drift(fit, moments)
     light = moments.flats.light
     bends = sum(name.startswith("nonlinearity") for name in fit.values)
-    light2, light_freedom = 0.0, light.freedom - bends
+    light2, light_known = 0.0, Known(0, 1.0)
     if light.groups.size:
         signal = _light_signal(fit, moments)
         slope = charge_slope(fit.values, signal)
         still = replace(moments, excess=replace(excess, drift_dn2=drift_dn2))
         variance = np.array(level_variances_dn2(fit.values, still), float) * slope**2
         light2, _ = scatter_of_levels(light, signal, variance, bends)
+        light_known = Known(light.freedom - bends, _share(variance / signal**2, light2))
     found = replace(excess, variance2=variance2, drift_dn2=drift_dn2, light2=light2)
-    return found, (freedom, drift_freedom, light_freedom)
+    return found, {"variance2": noise_known, "drift_dn2": drift_known, "light2": light_known}
+
+
+def _share(chance: Array, excess: float) -> float:
+    """Return the share of an excess variance in what it makes of the variances that chance has."""
+    return excess / (excess + 1 / float(np.mean(1 / chance))) if excess else 1.0
 
 
 def _light_signal(fit: NoiseFit, moments: Moments) -> Array:
@@ -154,25 +159,41 @@ def _light_signal(fit: NoiseFit, moments: Moments) -> Array:
     return np.asarray(moments.flats.mean_dn - dark)
 
 
-def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[float, int]:
-    """Return the relative variance of the series' noise about the model, and its degrees of freedom."""
-    dark_freedom, flat_freedom = noise_freedom(moments)
-    darks, flats = moments.darks, moments.flats
-    models = dark_variances_dn2(fit.values, darks.exposure_s), flat_variances_dn2(fit.values, flats.mean_dn)
-    ratio = np.concatenate([
-        darks.within_dn2 / np.maximum((darks.frames - 1) * moments.freedom, 1) / np.array(models[0], float),
-        flats.within_dn2 / np.maximum((flats.frames - 1) * moments.freedom, 1) / np.array(models[1], float),
+def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[float, Known]:
+    """Return the relative variance of the series' noise about the model, and what is known of it.
+
+    Read noise and gain are fitted to the noise of the series alone: the scatter of the pixels' means may contradict it,
+    as pickup does whose phase turns, which is no scatter between series.
+    """
+    values, darks, flats = fit.values, moments.darks, moments.flats
+    noise = np.array([*dark_variances_dn2(values, darks.exposure_s), *flat_variances_dn2(values, flats.mean_dn)], float)
+    signal = flats.mean_dn - values["offset_dn"]
+    slope = np.broadcast_to(charge_slope(values, signal), signal.shape)
+    dark = max(values.get("dark_signal_dn_per_s", 0.0), 0.0) * darks.exposure_s
+    design = np.concatenate([
+        np.stack([np.ones_like(dark), dark], axis=1),
+        np.stack([1 / slope**2, charge_dn(values, signal) / slope**2], axis=1),
     ])  # fmt: skip
-    freedom = np.concatenate([dark_freedom, flat_freedom])
-    chance = 2 * np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
-    measured = freedom > 0
-    residual2, chance = (ratio[measured] - 1) ** 2, chance[measured] / freedom[measured]
-    left = int(measured.sum()) - _NOISE_PARAMETERS
-    return grown_variance(lambda more: float(np.sum(residual2 / (chance + more))), left), left
+    frames = np.concatenate([darks.frames, flats.frames])
+    measured = np.concatenate([darks.within_dn2, flats.within_dn2]) / np.maximum(frames - 1, 1) / moments.freedom
+    freedom = np.concatenate(noise_freedom(moments))
+    wider = np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
+    use = freedom > 0
+    chance = 2 * wider[use] / freedom[use]
+    target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
+    left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
+
+    def deviance(more: float) -> float:
+        root = np.sqrt(chance + more)
+        rest = target - columns @ np.linalg.lstsq(columns / root[:, None], target / root)[0]
+        return float(np.sum((rest / root) ** 2))
+
+    found = grown_variance(deviance, left)
+    return found, Known(left, _share(chance, found))
 
 
-def _drift(fit: NoiseFit, moments: Moments) -> tuple[float, int]:
-    """Return the variance of the dark levels about their straight line, and its degrees of freedom."""
+def _drift(fit: NoiseFit, moments: Moments) -> tuple[float, Known]:
+    """Return the variance of the dark levels about their straight line, and what is known of it."""
     darks, t = moments.darks, moments.darks.exposure_s
     noise = np.array(dark_variances_dn2(fit.values, t), float) / moments.pixels
     chance = (fit.values.get("jitter_dn2", 0.0) + noise) / darks.frames
@@ -184,7 +205,8 @@ def _drift(fit: NoiseFit, moments: Moments) -> tuple[float, int]:
         line = design @ np.linalg.lstsq(design * weight[:, None], darks.mean_dn * weight)[0]
         return float(np.sum(((darks.mean_dn - line) * weight) ** 2))
 
-    return grown_variance(deviance, left), left
+    found = grown_variance(deviance, left)
+    return found, Known(left, _share(chance, found))
 
 
 def fit_with_excess(
@@ -195,19 +217,28 @@ def fit_with_excess(
     Returns
     -------
     NoiseFit
-        With the degrees of freedom of each kind of scatter.
+        With the degrees of freedom of each kind of scatter, and the covariance without any.
     Moments
         With the scatter.
     """
-    fit, freedoms = fit_gaussian(moments, bends=bends), (0, 0, 0)
+    problem = GaussianProblem(moments, bends)
+    fit, known = problem.fit(NO_EXCESS), dict[str, Known]()
     for _ in range(_MAX_ROUNDS):
-        excess, freedoms = measure_excess(fit, moments, darks, flats, used)
+        excess, known = measure_excess(fit, moments, darks, flats, used)
         settled = _alike(excess, moments.excess)
         moments = replace(moments, excess=excess)
         if settled:
             break
-        fit = fit_gaussian(moments, bends=bends)
-    return replace(fit, sources=_sources(fit, moments, freedoms)), moments
+        fit = problem.fit(excess, fit.values)
+    sources = []
+    for name, it in known.items():
+        if (value := getattr(moments.excess, name)) > 0 and it.freedom > 0:
+            grown = replace(moments.excess, **{name: 1.1 * value})
+            # Residuals tell the whole of these variances, not only the excess.
+            change = (problem.covariance(fit.values, grown) - fit.covariance) / (0.1 * it.share)
+            sources.append((change, it.freedom))
+    plain = problem.covariance(fit.values, NO_EXCESS)
+    return replace(fit, sources=tuple(sources), plain_covariance=plain), moments
 
 
 def _alike(one: Excess, other: Excess) -> bool:
@@ -215,19 +246,6 @@ def _alike(one: Excess, other: Excess) -> bool:
     names = ("darks", "flats", "variance2", "drift_dn2", "light2")
     pairs = [(getattr(one, name), getattr(other, name)) for name in names]
     return all(abs(a - b) <= _SETTLED * max(a, b) for a, b in pairs)
-
-
-def _sources(
-    fit: NoiseFit, moments: Moments, freedoms: tuple[int, int, int]
-) -> tuple[tuple[NDArray[np.float64], int], ...]:
-    """Return how the covariance grows with the logarithm of each kind of scatter, with its degrees of freedom."""
-    found = []
-    for name, freedom in zip(("variance2", "drift_dn2", "light2"), freedoms, strict=True):
-        value = getattr(moments.excess, name)
-        if value > 0 and freedom > 0:
-            grown = replace(moments, excess=replace(moments.excess, **{name: 1.1 * value}))
-            found.append(((covariance_at(fit.values, grown) - fit.covariance) / 0.1, freedom))
-    return tuple(found)
 
 
 def series_goodness(

@@ -195,12 +195,12 @@ def measure_response(
     noise = float(np.sum(noise_dn2)) / mean**2 / np.maximum(vignetting, 1e-6)
     spread2 = max(float(pixel.var(where=usable)) - float(noise.mean(where=usable)), 0.0)
     kept = spread2 / (spread2 + noise)
-    total2 = spread2 + float(noise.mean(where=usable))
+    error2 = (spread2 + float(noise.mean(where=usable))) * np.sqrt(2 / usable.sum())
     return Response(
         relative=vignetting * (1 + np.where(usable, kept * pixel, 0.0)),
         vignetting=vignetting,
         prnu=float(np.sqrt(spread2)),
-        prnu_se=float(total2 * np.sqrt(2 / usable.sum()) / max(2 * np.sqrt(spread2), 1e-9)),
+        prnu_se=float(np.sqrt(spread2 + error2) - np.sqrt(spread2)),
         dead=dead,
     )
 

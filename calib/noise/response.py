@@ -9,7 +9,7 @@ state their photons, or differ in exposure under one light, the charge is propor
 a factor R. Their mean levels then show the bend directly, and the photon transfer the gain.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,14 +29,17 @@ BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"
 # where nothing does. The second is the model error of an unbent sensor: 95 % of cameras bend by less than twice that.
 MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.01
 
-# Largest share of the range that counts beyond the brightest flat: a container of 16 bits may hold 12.
-_RANGE_OVER_BRIGHTEST = 2.0
+# Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
+_RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
 
 # A light must span this factor to show a bend; so many levels beyond the scales of the light give 1, 2, 3 coefficients.
 _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7)
 
 # A further coefficient is fitted if the levels scatter less with it by an F test of this probability.
 _MAX_CHANCE = 0.01
+
+# Residuals are chance alone if those of a good model are larger with this probability.
+_USUAL_CHANCE = 0.3
 
 # Range of the linearity error as fractions of saturation, and the fewest levels in it; EMVA 1288 release 4.0.
 LINEARITY_RANGE, _MIN_LINEARITY_LEVELS = (0.05, 0.95), 3
@@ -103,7 +106,7 @@ def known_light(flats: Sequence[Series]) -> Light:
 
 def bend_range_dn(brightest_dn: float, saturation_dn: float) -> float:
     """Return the signal that the size of a bend refers to: the end of the range, near the brightest flat at most."""
-    return float(min(saturation_dn, _RANGE_OVER_BRIGHTEST * brightest_dn))
+    return float(min(saturation_dn, max(_RANGE_OVER_BRIGHTEST * brightest_dn, _MIN_RANGE_DN)))
 
 
 def level_design(light: Light, signal_dn: Array, bends: int) -> Array:
@@ -134,9 +137,9 @@ def scatter_of_levels(light: Light, signal_dn: Array, variance_dn2: Array, bends
     return grown_variance(deviance, design.shape[0] - design.shape[1]), deviance(0.0)
 
 
-def grown_variance(deviance: Any, freedom: float, start: float = 1e-12) -> float:
-    """Return the excess variance at which a falling deviance equals its degrees of freedom; 0 if it is no larger."""
-    if freedom < 1 or deviance(0.0) <= freedom:
+def grown_variance(deviance: Callable[[float], float], freedom: float, start: float = 1e-12) -> float:
+    """Return the excess variance at which a falling deviance equals its degrees of freedom; 0 if chance makes it."""
+    if freedom < 1 or stats.chi2.sf(deviance(0.0), freedom) > _USUAL_CHANCE:
         return 0.0
     low, high = 0.0, start
     while deviance(high) > freedom:
@@ -203,8 +206,10 @@ def signal_of_charge(values: Mapping[str, float], charge: Array, range_dn: float
     """Return the signal of a charge K Q, the inverse of eq. (5), by Newton's steps within twice the range."""
     signal = np.array(charge, float)
     for _ in range(30):
-        slope = np.maximum(charge_slope(values, signal), 0.05)
-        signal = np.clip(signal - (charge_dn(values, signal) - charge) / slope, 0.0, 2 * range_dn)
+        step = (charge_dn(values, signal) - charge) / np.maximum(charge_slope(values, signal), 0.05)
+        signal = np.clip(signal - step, 0.0, 2 * range_dn)
+        if np.abs(step).max() < 1e-9 * range_dn:
+            break
     return signal
 
 

@@ -137,7 +137,7 @@ def _full_well(darks: Sequence[Series], flats: Sequence[Series], order: list[int
     left_out = tuple(
         (
             one,
-            f"its mean of {one.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well ({level[at]:.1f} DN)",
+            f"its mean of {one.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, {level[at]:.1f} DN",
         )
         for j, one in enumerate(flats)
         if j not in kept

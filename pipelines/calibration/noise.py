@@ -12,15 +12,12 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
+from faintfield.pipelines.calibration.noise_fit import fit_record
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.results.noise import (
-    CovarianceRecord,
-    Measured,
-    NoiseRecord,
-    PhaseRecord,
-)
+from faintfield.pipelines.formats.results.noise import CovarianceRecord, NoiseRecord, PhaseRecord, Quantities
+from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, temperature_notes
 from faintfield.rig.session.session import PLAN
 
@@ -84,11 +81,12 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     }
     temperature_c, warnings = temperature_notes(settings)
     warnings += [warning for calibration in phases for warning in calibration.warnings]
+    means = {name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates if _is_quantity(name)}
     return NoiseRecord(
-        **_records({name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates}),
+        **_records(means),
         covariance=_covariance(phases),
         likelihood=" / ".join(dict.fromkeys(str(c.likelihood) for c in phases)),
-        saturation_dn=readout.saturation_dn,
+        saturation_dn=_saturation(phases),
         size_px=readout.size_px,
         mosaic=readout.mosaic or UNSET,
         planes=records if readout.mosaic else UNSET,
@@ -97,6 +95,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         frames=settings.frame,
         warnings=list(dict.fromkeys(warnings)),
         provenance=provenance("noise", {}, _input_hashes(sensor.folder, settings)),
+        fit=UNSET if readout.mosaic else fit_record(phases[0]),
     )
 
 
@@ -147,7 +146,8 @@ def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRec
         colour=phase.colour,
         likelihood=str(calibration.likelihood),
         masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
-        **_records(calibration.estimates),
+        fit=fit_record(calibration),
+        **_records({name: it for name, it in calibration.estimates.items() if _is_quantity(name)}),
     )
 
 
@@ -177,6 +177,19 @@ def _mean(estimates: Sequence[Estimate]) -> Estimate:
 def _records(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     """Return the entries of estimates in noise.json."""
     return msgspec.convert(estimates, dict[str, Measured], from_attributes=True)
+
+
+def _is_quantity(name: str) -> bool:
+    """Return whether a quantity has a key of its own in noise.json."""
+    return name in Quantities.__struct_fields__
+
+
+def _saturation(phases: Sequence[NoiseCalibration]) -> Measured | float:
+    """Return the value from which a pixel is saturated: of the phase that saturates first."""
+    first = min(phases, key=lambda c: c.saturation_dn)
+    if first.saturation.limit == "full well":
+        return Measured(first.saturation_dn, ci95=first.saturation.interval_dn)
+    return first.saturation_dn
 
 
 def _covariance(calibrations: Sequence[NoiseCalibration]) -> CovarianceRecord:

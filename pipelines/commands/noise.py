@@ -5,7 +5,8 @@ from pathlib import Path
 from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MissingFile
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, Measured, NoiseRecord, write_noise
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
+from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
 from faintfield.pipelines.pages.noise_page import draw_page
 
@@ -63,7 +64,20 @@ def _inform_of(record: NoiseRecord) -> None:
         else:
             low, high = measured.ci95
             inform(f"  {label}: {measured.value:.5g} {unit} (95 %: {low:.5g} to {high:.5g})")
+    if record.fit:
+        _inform_of_fit(record.fit)
     counts = {kind: len(getattr(record, f"{kind}_pixels")) for kind in ("hot", "noisy", "dead")}
     inform("  pixels: " + ", ".join(f"{count} {kind}" for kind, count in counts.items()))
     for warning in record.warnings:
         inform(f"  warning: {warning}")
+
+
+def _inform_of_fit(fit: FitRecord) -> None:
+    """Print what the flats say of saturation and response, as far as they do."""
+    saturation, error = fit.saturation, fit.linearity_error
+    if saturation.level_dn is not None:
+        capacity = "" if fit.saturation_e.value is None else f", mu_e.sat {fit.saturation_e.value:.4g} e⁻"
+        inform(f"  saturation: {saturation.level_dn:.5g} DN ({saturation.limit}){capacity}")
+    if error.value is not None and error.ci95 is not None:
+        low, high = error.ci95
+        inform(f"  LE, linearity error: {error.value:.3%} (95 %: {low:.3%} to {high:.3%})")

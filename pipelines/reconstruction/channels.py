@@ -156,6 +156,8 @@ def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -
     """Return the noise model of a lattice; a raw frame has its own black level and saturation if none is stated."""
     values = {name: getattr(loaded.noise, name) for name in _NOISE_MAPS}
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
+    if loaded.noise.response is not None:
+        maps["response"] = loaded.noise.response.part(lattice.of)
     noise = replace(loaded.noise, **maps)
     if frame is None:
         return noise

@@ -12,7 +12,7 @@ from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.exchange.emva1288 import read_descriptor
 from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.results.noise import Measured
+from faintfield.pipelines.formats.results.noise_fit import Measured
 from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.calib.noise.darkroom import expose, specimen
 

@@ -13,13 +13,16 @@ import numpy as np
 from msgspec import UNSET, Struct, UnsetType
 from numpy.typing import NDArray
 
-from faintfield.calib.noise_model import NoiseModel
+from faintfield.calib.noise_model import BentResponse, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import exclusive, remove, sha256, write_record, write_whole, writing
+from faintfield.pipelines.formats.frames import at_phase
 from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
+from faintfield.pipelines.formats.results.noise_fit import FitRecord
+from faintfield.pipelines.formats.results.noise_fit import Measured as Measured
 
 NOISE_FILE, NOISE_MAPS = "noise.json", "noise_maps.npz"
 STANDARD = "EMVA 1288 release 4.0"
@@ -40,15 +43,6 @@ class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=
     temperature_c: float | None = None
     level: int = 0
     photons: float | None = None
-
-
-class Measured(Struct, frozen=True, omit_defaults=True):
-    """A measured number with its standard error and 95 % interval, or the reason why there is none."""
-
-    value: float | None
-    se: float | None = None
-    ci95: tuple[float, float] | None = None
-    why: str | None = None
 
 
 _NOT_STATED = Measured(None, why="not stated")
@@ -86,6 +80,7 @@ class PhaseRecord(Quantities, frozen=True):
     colour: str
     likelihood: str
     masked_black_dn: float | None
+    fit: FitRecord | UnsetType = UNSET
 
 
 class CovarianceRecord(Struct, frozen=True):
@@ -112,7 +107,8 @@ class _StandardQuantities(Quantities, frozen=True):
 class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     """`noise.json`: the sensor's quantities (the mean over phases where there is a mosaic) and how they were measured.
 
-    Pixels are (row, column). `mosaic` and `planes`, one entry per phase, are left out without colour filters.
+    Pixels are (row, column). `mosaic` and `planes`, one entry per phase, are left out without colour filters; with
+    them, each plane has its own `fit`. Older files have none.
     """
 
     covariance: CovarianceRecord = CovarianceRecord([], [])
@@ -130,6 +126,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     maps: str = NOISE_MAPS
     maps_sha256: str = ""
     provenance: Provenance[dict[str, object]] | None = None
+    fit: FitRecord | UnsetType = UNSET
 
 
 def read_noise(path: Path) -> NoiseRecord:
@@ -227,10 +224,29 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     stated = {name: it.value if isinstance(it, Measured) else it for name, it in stated.items()}
     known = {name: value for name, value in stated.items() if value is not None}
     try:
-        model = NoiseModel(**(values | maps), **known)
+        model = NoiseModel(**(values | maps), **known, response=_response(record, shape))
     except ValueError as failure:
         raise BadValue(f"{path}: it or its maps: {failure}; run `faintfield noise` again") from failure
     return FittedNoise(model, unusable, response, record.mosaic or None)
+
+
+def _response(record: NoiseRecord, shape: tuple[int, int]) -> BentResponse | None:
+    """Return the bend of the response, as maps (row, column) where there is a mosaic; None for a linear sensor."""
+    if record.fit and record.fit.response:
+        return BentResponse(tuple(record.fit.response.bends_per_dn), record.fit.response.up_to_dn)
+    planes = record.planes or []
+    bent = [plane.fit.response for plane in planes if plane.fit and plane.fit.response]
+    if not bent or not record.mosaic:
+        return None
+    period = len(record.mosaic), len(record.mosaic[0])
+    bends = [np.zeros(shape) for _ in range(max(len(one.bends_per_dn) for one in bent))]
+    up_to_dn = np.full(shape, max(one.up_to_dn for one in bent))
+    for plane in planes:
+        if plane.fit and plane.fit.response:
+            at_phase(up_to_dn, plane.phase, period)[...] = plane.fit.response.up_to_dn
+            for bend, value in zip(bends, plane.fit.response.bends_per_dn, strict=False):
+                at_phase(bend, plane.phase, period)[...] = value
+    return BentResponse(tuple(bends), up_to_dn)
 
 
 def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:

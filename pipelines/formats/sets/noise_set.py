@@ -1,5 +1,6 @@
 """The noise set: a folder of dark and flat frames with `noise.toml`, or those frames of a session."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -7,6 +8,7 @@ import msgspec
 import numpy as np
 
 from faintfield.calib.noise import Conditions
+from faintfield.calib.noise.drift import dark_factor
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
@@ -20,6 +22,9 @@ FILE_NAME = "noise.toml"
 # Largest number of photons per pixel; no pixel holds a thousandth of the electrons.
 _MAX_PHOTONS = 1e9
 
+# Range of temperatures, in kelvins, that counts as steady, and limits of those over which dark current doubles.
+_STEADY_K, _MIN_DOUBLING_K, _MAX_DOUBLING_K = 0.5, 2.0, 30.0
+
 
 class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The `[region]` table: pixels that see light and dark alike, as [first, end) of rows and columns."""
@@ -29,13 +34,18 @@ class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class NoiseSet(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """`noise.toml`; `saturation_dn`, `mosaic` and `region` state what the image files do not."""
+    """`noise.toml`; what follows the frames states what the image files do not.
+
+    With `dark_current_doubling_k`, the kelvins over which dark current doubles, the dark current is that at the mean
+    temperature of the frames.
+    """
 
     format: Literal[1]
     frame: list[NoiseFrame]
     saturation_dn: float | None = None
     mosaic: tuple[str, ...] | None = None
     region: Region | None = None
+    dark_current_doubling_k: float | None = None
 
 
 def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
@@ -62,6 +72,12 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
             raise BadValue(f"{path}: {frame.file} is named twice; remove one of the entries")
         seen.add(image)
         _check_numbers(path, frame)
+    doubling_k = settings.dark_current_doubling_k
+    if doubling_k is not None and not _MIN_DOUBLING_K <= doubling_k <= _MAX_DOUBLING_K:
+        raise BadValue(
+            f"{path}: dark_current_doubling_k = {doubling_k}; give the kelvins over which dark current doubles, "
+            f"{_MIN_DOUBLING_K:g} to {_MAX_DOUBLING_K:g}"
+        )
     mosaic = settings.mosaic
     if mosaic is not None and not sound_mosaic(mosaic):
         raise BadValue(
@@ -105,6 +121,7 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
         A frame's exposure is neither stated nor in its EXIF.
     """
     groups: dict[Conditions, list[Path]] = {}
+    warmth: dict[Conditions, list[float]] = {}
     for frame in settings.frame:
         path = folder / frame.file
         exposure_s = frame.exposure_s
@@ -119,7 +136,21 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
         level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)
         conditions = Conditions(frame.kind, float(f"{exposure_s:.6g}"), level, photons)
         groups.setdefault(conditions, []).append(path)
+        if frame.temperature_c is not None:
+            warmth.setdefault(conditions, []).append(frame.temperature_c)
+    groups = {_at_temperature(one, warmth, settings.dark_current_doubling_k): paths for one, paths in groups.items()}
     return dict(sorted(groups.items(), key=lambda item: (item[0].kind, item[0].exposure_s, item[0].level)))
+
+
+def _at_temperature(
+    conditions: Conditions, warmth: dict[Conditions, list[float]], doubling_k: float | None
+) -> Conditions:
+    """Return the conditions of a series with its dark current over that at the mean temperature of all frames."""
+    if doubling_k is None or conditions not in warmth:
+        return conditions
+    reference_c = float(np.mean([temperature for series in warmth.values() for temperature in series]))
+    factor = dark_factor(float(np.mean(warmth[conditions])), reference_c, doubling_k)
+    return replace(conditions, dark_factor=factor)
 
 
 def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list[str]]:
@@ -134,7 +165,12 @@ def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list
         )
     if not known:
         return None, warnings
-    if np.ptp(known) > 0.5:
+    if np.ptp(known) > _STEADY_K and settings.dark_current_doubling_k is not None:
+        warnings.append(
+            f"the temperature ran from {min(known):g} to {max(known):g} °C; dark current is taken to double every "
+            f"{settings.dark_current_doubling_k:g} K, and is that at {np.mean(known):.1f} °C"
+        )
+    elif np.ptp(known) > _STEADY_K:
         warnings.append(
             f"the temperature ran from {min(known):g} to {max(known):g} °C, which moves the dark current by "
             f"{10 * np.ptp(known):.0f} %; let the camera settle before recording"

@@ -9,16 +9,15 @@ from scipy import stats
 from faintfield.calib.noise import Conditions, measure_series
 from faintfield.calib.noise.estimates import (
     _in_electrons,
-    _interval,
     _levels_quantile,
     _light_e,
-    _root,
     _why_no_current,
     _why_no_gain,
 )
 from faintfield.calib.noise.fitting import NoiseLikelihood, choose_likelihood
-from faintfield.calib.noise.gaussian import NoiseFit
+from faintfield.calib.noise.intervals import interval, root
 from faintfield.calib.noise.marginal import Counts
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 from tests.calib.noise.darkroom import darks, specimen
 
@@ -40,15 +39,15 @@ def moments(*frames: float, exposure_s: tuple[float, ...] = (0.1, 10.0, 60.0)) -
 
 
 def test_intervals_are_symmetric_and_those_of_positive_quantities_on_a_logarithmic_scale() -> None:
-    plain = _interval(-2.0, 0.1, 1.96)
+    plain = interval(-2.0, 0.1, 1.96)
     assert (plain.value, plain.se) == (-2.0, 0.1)
     assert plain.ci95 == pytest.approx((-2.196, -1.804))
-    positive = _interval(2.0, 0.1, 1.96, positive=True)
+    positive = interval(2.0, 0.1, 1.96, positive=True)
     assert positive.ci95 == pytest.approx((2 * np.exp(-0.098), 2 * np.exp(0.098)))
 
 
-def test_the_root_of_a_variance_has_the_roots_of_the_ends_as_its_interval() -> None:
-    found = _root(4.0, 1.0, 1.96, 0.5)
+def test_the_root_of_a_variance_has_the_roots_of_the_ends_as_itsinterval() -> None:
+    found = root(4.0, 1.0, 1.96, 0.5)
     low, high = 0.5 * np.sqrt(4 - 1.96), 0.5 * np.sqrt(4 + 1.96)
     assert found.value == 1.0
     assert found.ci95 == pytest.approx((low, high))
@@ -56,13 +55,13 @@ def test_the_root_of_a_variance_has_the_roots_of_the_ends_as_its_interval() -> N
 
 
 def test_a_variance_below_zero_is_none_unless_chance_explains_it() -> None:
-    chance = _root(-1.0, 1.0, 1.96)
+    chance = root(-1.0, 1.0, 1.96)
     assert chance.value == 0.0
     assert chance.ci95 == pytest.approx((0.0, np.sqrt(0.96)))
-    hidden = _root(-2.0, 1.0, 1.96)
+    hidden = root(-2.0, 1.0, 1.96)
     assert hidden.value is None
     assert "by 2 standard errors" in str(hidden.why)
-    assert _root(0.5, 0.0, 1.96).value is None
+    assert root(0.5, 0.0, 1.96).value is None
 
 
 def test_levels_with_jitter_have_students_intervals_of_their_few_frames() -> None:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.gaussian import dark_variances_dn2, fit_gaussian, negative_log_likelihood
+from faintfield.calib.noise.gaussian import dark_variances_dn2, negative_log_likelihood
+from faintfield.calib.noise.maximum import fit_gaussian
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
 from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import measure_series
-from faintfield.calib.noise.exact import _flat_part, _Maximum
-from faintfield.calib.noise.gaussian import NoiseFit, main_quantities, negative_log_likelihood
+from faintfield.calib.noise.exact import Bent, _flat_part, _Maximum
+from faintfield.calib.noise.gaussian import main_quantities, negative_log_likelihood
 from faintfield.calib.noise.marginal import PARAMETERS
+from faintfield.calib.noise.maximum import NoiseFit
 from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
 from faintfield.calib.noise.pixels import quantum_efficiency
 from faintfield.calib.noise.statistics import Conditions, Series
@@ -39,6 +40,7 @@ FLATS = FlatMoments(
     within_dn2=np.array([9e6, 3e7]),
     evenness=np.array([0.95, 0.9]),
 )
+STRAIGHT = Bent({}, np.zeros((0, 0)))
 NO_FLATS = FlatMoments(*(np.zeros(0) for _ in range(4)))
 HERE = {
     "offset_dn": 100.0, "log_read_dn2": np.log(8.0), "dsnu_dn2": 7.0, "jitter_dn2": 0.1,
@@ -158,14 +160,14 @@ def test_the_flats_part_of_the_exact_likelihood_has_the_right_slopes_and_informa
         degrees = (FLATS.frames - 1) * 1000.0 * FLATS.evenness
         return np.array([-0.5 * np.sum(degrees * np.log(v) + FLATS.within_dn2 * FLATS.evenness / v), *np.log(v)])
 
-    value, gradient, information = _flat_part(at, FLATS, 1000.0)
+    value, gradient, information = _flat_part(at, Moments(1100.0, 1000.0, DARKS, FLATS), STRAIGHT)
     expected, derivative = by_hand(at), slopes(by_hand, at)
     assert value == pytest.approx(expected[0], rel=1e-12)
     np.testing.assert_allclose(gradient, derivative[0], rtol=1e-5, atol=1e-4)
     # The Fisher information of s² ~ v χ²_ν is ν/2 for ln v
     weights = 0.5 * (FLATS.frames - 1) * 1000.0 * FLATS.evenness
     np.testing.assert_allclose(information, derivative[1:].T @ np.diag(weights) @ derivative[1:], rtol=1e-5, atol=1e-6)
-    nothing = _flat_part(at, NO_FLATS, 1000.0)
+    nothing = _flat_part(at, Moments(1100.0, 1000.0, DARKS, NO_FLATS), STRAIGHT)
     assert nothing[0] == 0.0
     assert not nothing[1].any()
     assert nothing[2].shape == (6, 6)

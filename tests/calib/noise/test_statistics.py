@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from faintfield.calib.errors import BadFrame, LightLeak, SaturatedFlat
+from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise import Conditions, measure_series
 from faintfield.calib.noise.statistics import _MAX_CHANCE, _outlier
 from tests.calib.noise.darkroom import darks, expose, specimen
@@ -72,12 +72,17 @@ def test_with_two_frames_only_a_large_leak_is_named() -> None:
         measure_series([frames[0], ("bright", expose(chip, 1.0, rng, photons=100.0))], DARK)
 
 
-@pytest.mark.parametrize("stated", [True, False])
-def test_a_saturated_flat_is_named(stated: bool) -> None:
-    chip, rng = specimen(5)
-    flat = np.minimum(expose(chip, 1.0, rng, photons=4000.0), 4095)
-    with pytest.raises(SaturatedFlat, match=r"flat_7: .* stand at 4095 DN"):
-        measure_series([("flat_7", flat)], FLAT, 4095 if stated else np.inf)
+@pytest.mark.parametrize("stated", [4000.0, 4095.0, np.inf])
+def test_values_at_the_top_are_counted_over_all_frames(stated: float) -> None:
+    rng = np.random.default_rng(5)
+    stack = np.minimum(np.rint(rng.normal(4060, 30, (5, 32, 32))), 4095).astype(np.uint16)
+    series = measure_series(((str(k), frame) for k, frame in enumerate(stack)), FLAT, stated)
+    top = min(4095.0, stated)
+    assert series.top_dn == top
+    assert series.at_top == (stack >= top).sum()
+    assert series.below_top == (stack == top - 1).sum()
+    assert series.clipped_share(top) == pytest.approx((stack >= top).mean())
+    assert series.clipped_share(top + 1) == 0.0
 
 
 def test_frames_of_another_size_are_refused() -> None:

@@ -1,0 +1,63 @@
+"""The part of noise.json that tells how well the series fit: saturation, response, scatter and goodness."""
+
+from faintfield.calib.noise import Estimate, NoiseCalibration
+from faintfield.calib.noise.goodness import Scatter, SeriesGoodness
+from faintfield.calib.noise.statistics import Series
+from faintfield.pipelines.formats.results.noise_fit import (
+    FitRecord,
+    GoodnessRecord,
+    Measured,
+    ResponseRecord,
+    SaturationRecord,
+)
+
+
+def fit_record(calibration: NoiseCalibration) -> FitRecord:
+    """Return the record of saturation, response and scatter of one phase."""
+    estimates, saturation, response = calibration.estimates, calibration.saturation, calibration.response
+    bends = None
+    if response is not None:
+        bends = ResponseRecord([float(bend) for bend in response.bends_per_dn], float(response.up_to_dn))
+    series = [_goodness(one) for one in calibration.goodness]
+    series += [_left_out(one, why) for one, why in saturation.left_out]
+    names = ("saturation_e", "linearity_error", "noise_error", "drift_dn", "light_error", "lamp_flicker")
+    return FitRecord(
+        saturation=SaturationRecord(saturation.limit, saturation.level_dn, saturation.interval_dn),
+        response=bends,
+        series=series,
+        **{name: _measured(estimates[name]) for name in names},
+    )
+
+
+def _measured(estimate: Estimate) -> Measured:
+    """Return an estimate as the record has it."""
+    return Measured(estimate.value, estimate.se, estimate.ci95, estimate.why)
+
+
+def _left_out(one: Series, why: str) -> GoodnessRecord:
+    """Return the record of a series that was left out."""
+    is_of = one.conditions
+    return GoodnessRecord(is_of.kind, is_of.exposure_s, is_of.level, one.frames, left_out=why)
+
+
+def _goodness(one: SeriesGoodness) -> GoodnessRecord:
+    """Return the record of a series that was used."""
+    is_of = one.series.conditions
+    return GoodnessRecord(
+        is_of.kind,
+        is_of.exposure_s,
+        is_of.level,
+        one.series.frames,
+        noise_excess=one.noise_excess,
+        noise_se=one.noise_se,
+        level_residual_dn=one.level_residual_dn,
+        blocks=_per_freedom(one.blocks),
+        rows=_per_freedom(one.rows),
+        columns=_per_freedom(one.columns),
+        by_frame=_per_freedom(one.frames),
+    )
+
+
+def _per_freedom(scatter: Scatter | None) -> float | None:
+    """Return a deviance per degree of freedom, None without any."""
+    return scatter.deviance / scatter.freedom if scatter and scatter.freedom > 0 else None
