@@ -9,6 +9,7 @@ from which the others follow; each function says how. Errors are propagated to f
 the quantities follow from: gain and efficiency share most of their error, so that a ratio is known better than either.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -92,7 +93,7 @@ def propagate(formula: Callable[..., float], values: Array, covariance: Array) -
         if step > 0:
             ends = [formula(*(values + sign * step * np.eye(values.size)[index]).tolist()) for sign in (1, -1)]
             slopes[index] = (ends[0] - ends[1]) / (2 * step)
-    return formula(*values.tolist()), float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
+    return formula(*values.tolist()), math.sqrt(max(float(slopes @ covariance @ slopes), 0.0))
 
 
 def gather_inputs(
@@ -174,12 +175,12 @@ def derived_quantities(inputs: Inputs, exposure_s: float) -> dict[str, Estimate]
 
     return {
         "dark_noise_e": inputs.derive(dark, noise),
-        "responsivity_dn_per_photon": inputs.derive((gain, efficiency), lambda k, eta: k * eta),
+        "responsivity_dn_per_photon": inputs.derive((gain, efficiency), lambda gain, eta: float(gain * eta)),
         "threshold_e": inputs.derive((gain, *dark), lambda k, *d: threshold_e(k, noise(*d))),
         "threshold_photons": inputs.derive(
             (efficiency, gain, *dark), lambda eta, k, *d: threshold_e(k, noise(*d)) / eta
         ),
         "saturation_photons": inputs.derive((capacity, efficiency), lambda full, eta: full / eta),
-        "snr_max": inputs.derive((capacity,), lambda full: float(np.sqrt(full))),
+        "snr_max": inputs.derive((capacity,), math.sqrt),
         "dynamic_range": inputs.derive((capacity, gain, *dark), lambda full, k, *d: full / threshold_e(k, noise(*d))),
     }

@@ -104,9 +104,7 @@ def measure_emva(
     estimates = derived_quantities(inputs, exposure_s)
     estimates |= _dsnu(dark, calibration) | _prnu(bright, calibration)
     estimates["dark_current_doubling_k"] = _doubling(darks, temperature_c)
-    return EmvaMeasurement(
-        phase.name, calibration, tuple(phase.series), exposure_s, estimates, dark, bright
-    )
+    return EmvaMeasurement(phase.name, calibration, tuple(phase.series), exposure_s, estimates, dark, bright)
 
 
 def _exposure_s(calibration: NoiseCalibration) -> float:

@@ -1,4 +1,4 @@
-"""The part of `noise.json` that only the report by EMVA 1288 needs: figures of merit, and the parts of DSNU and PRNU."""
+"""The part of `noise.json` that the report by EMVA 1288 adds: figures of merit, and the parts of DSNU and PRNU."""
 
 from msgspec import Struct
 
