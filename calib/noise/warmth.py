@@ -54,7 +54,11 @@ def dark_current_doubling(level_dn: Array, exposure_s: Array, temperature_c: Arr
     matrix = design(per_k)
     current = float(np.linalg.lstsq(matrix, level)[0][2])
     jacobian = np.column_stack([matrix, current * matrix[:, 2] * np.log(2.0) * warmth])
-    variance = squares(per_k) / freedom * np.linalg.pinv(jacobian.T @ jacobian)[3, 3]
+    # Long exposures are noisier than short ones: each frame counts with its own residual (HC3 of MacKinnon and White)
+    inverse = np.linalg.pinv(jacobian)
+    leverage = np.minimum(np.sum(jacobian * inverse.T, axis=1), 0.99)
+    residual = (level - matrix @ np.linalg.lstsq(matrix, level)[0]) / (1 - leverage)
+    variance = float(np.sum((inverse[3] * residual) ** 2))
     doubling_k, relative = 1 / per_k, float(np.sqrt(variance)) / per_k
     inside = limits[0] * 1.001 < per_k < limits[1] * 0.999
     if current <= 0 or not inside or not relative <= _MAX_RELATIVE_SE:

@@ -114,7 +114,7 @@ def _charge_dn(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDA
 
 def _slope(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the growth of the signal with K times the charge, 1 without a bend."""
-    step = 1e-3 * max(float(np.abs(signal_dn).max()), 1.0)
+    step = 1e-3 * float(np.abs(signal_dn).max(initial=1.0))
     grown = _charge_dn(measured, signal_dn + step) - _charge_dn(measured, signal_dn - step)
     return np.asarray(2 * step / np.maximum(grown, 1e-9))
 
