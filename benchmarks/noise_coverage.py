@@ -130,15 +130,15 @@ def study(label: str, camera: Camera, session: Session, repeats: int, first_seed
     held: dict[str, list[bool]] = {name: [] for name in NAMES}
     widths: dict[str, list[float]] = {name: [] for name in NAMES}
     refused: dict[str, int] = {}
+    truths = [camera.gain_dn_per_e, camera.read_noise_e, camera.dark_current_e_per_s]
     for seed in range(first_seed, first_seed + repeats):
         try:
             result = calibrate(record(camera, session, np.random.default_rng(seed)), camera.highest_dn)
         except CalibrationError as failure:
             refused[type(failure).__name__] = refused.get(type(failure).__name__, 0) + 1
             continue
-        truths = [camera.gain_dn_per_e, camera.read_noise_e, camera.dark_current_e_per_s]
-        truths.append(true_linearity(camera, result) if session.photons else np.nan)
-        for name, truth in zip(NAMES, truths, strict=True):
+        bend = true_linearity(camera, result) if session.photons else np.nan
+        for name, truth in zip(NAMES, (*truths, bend), strict=True):
             found = result.estimates[name]
             if found.value is None or found.ci95 is None:
                 continue
@@ -146,7 +146,7 @@ def study(label: str, camera: Camera, session: Session, repeats: int, first_seed
             held[name].append(found.ci95[0] <= truth <= found.ci95[1])
             widths[name].append((found.ci95[1] - found.ci95[0]) / 2)
     print(f"{label}; {repeats} repeats{'; refused: ' + str(refused) if refused else ''}", flush=True)
-    for name, truth in zip(NAMES, (*truths[:3], 0.01), strict=True):
+    for name, truth in zip(NAMES, (*truths, 0.01), strict=True):
         if not errors[name]:
             print(f"  {name:22s} no value")
             continue

@@ -67,8 +67,10 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     """
     darks = [one for one in series if one.conditions.kind == "dark"]
     flats = [one for one in series if one.conditions.kind == "flat"]
-    check_series(darks, flats)
+    check_series(darks, [])
     saturation = find_saturation(darks, flats, saturation_dn)
+    # Frames that are saturated all over are identical, which is no fault of theirs.
+    check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
     end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
     return _result(*_fit_without_noisy(darks, saturation.kept, hot, end_dn), hot, saturation, end_dn)

@@ -24,6 +24,9 @@ _HOT_SIGMA = 5.0
 # Expected number of pixels per sensor that are noisy by chance alone.
 _NOISY_BY_CHANCE = 1e-2
 
+# Variances on the grid of the prior, and steps of expectation and maximization that find their weights.
+_GRID, _EM_STEPS = 80, 200
+
 # Response over that of the neighbourhood below which a pixel is dead.
 _MIN_RESPONSE = 0.5
 
@@ -133,19 +136,37 @@ def _information(darks: Sequence[Series], weights: Array, hot: NDArray[np.bool_]
 
 
 def shrunk_variance_ratio(ratio: Array, freedom: float, usable: NDArray[np.bool_]) -> Array:
-    """Return each pixel's variance over the model's, shrunk towards 1 by as much as its scatter is chance.
+    """Return each pixel's variance over the model's, shrunk towards those of other pixels as far as chance scatters it.
 
-    With ν degrees of freedom chance alone scatters a ratio with variance 2/ν. Any excess e is real, and corresponds to
-    a prior of ν₀ = 2/e degrees of freedom: the posterior mean is (ν₀ + ν ratio)/(ν₀ + ν) (Smyth, Stat. Appl. Genet.
-    Mol. Biol. 3, 3, 2004).
+    With ν degrees of freedom chance alone scatters a ratio r with variance 2 r²/ν. Any excess is real, and the result
+    is the posterior mean under the prior that the pixels themselves suggest: the distribution of variances on a grid
+    that makes their scatter the likeliest (Kiefer and Wolfowitz, Annals of Mathematical Statistics 27, 887, 1956).
+    Halves of a sensor that differ, and a few pixels that flicker, keep their own variance, where a prior of one centre
+    would pull them to a mean that no pixel has.
     """
     chance = 2 / max(freedom, 1.0)
     excess = float(ratio.var(where=usable)) - chance
     resolved = 3 * chance * np.sqrt(2 / usable.sum())
     if freedom < 1 or excess < resolved:
         return np.ones_like(ratio)
-    prior = 2 / excess
-    return np.asarray((prior + freedom * ratio) / (prior + freedom))
+    bins, weight = np.unique(_coarse(ratio[usable]), return_counts=True)
+    grid = np.geomspace(max(float(bins[0]), 1e-3), float(bins[-1]) * 1.05, _GRID)
+    # χ² density of each bin's ratio under each variance of the grid, up to a factor that all variances share.
+    logs = -0.5 * freedom * (np.log(grid) + bins[:, None] / grid)
+    likelihood = np.exp(logs - logs.max(1, keepdims=True))
+    prior = np.full(_GRID, 1 / _GRID)
+    for _ in range(_EM_STEPS):
+        posterior = likelihood * prior
+        posterior /= posterior.sum(1, keepdims=True)
+        prior = weight @ posterior / weight.sum()
+    posterior = likelihood * prior
+    mean = posterior @ grid / posterior.sum(1)
+    return np.asarray(np.interp(ratio, bins, mean))
+
+
+def _coarse(ratio: Array) -> Array:
+    """Return ratios rounded to 2 %, of which there are few different ones."""
+    return np.exp(np.round(np.log(np.maximum(ratio, 1e-3)) / 0.02) * 0.02)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def moments(*frames: float, exposure_s: tuple[float, ...] = (0.1, 10.0, 60.0)) -
     several = np.array(frames or (10.0, 10.0, 10.0))
     zeros = np.zeros(len(several))
     darks = DarkMoments(np.array(exposure_s), several, zeros, zeros, zeros, np.zeros((len(several), len(several))))
-    return Moments(3600.0, 3500.0, darks, FlatMoments(*(np.zeros(0) for _ in range(4))))
+    return Moments(3600.0, 3500.0, darks, FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0)))
 
 
 def test_intervals_are_symmetric_and_those_of_positive_quantities_on_a_logarithmic_scale() -> None:

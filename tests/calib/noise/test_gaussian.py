@@ -16,7 +16,7 @@ from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 EXPOSURES_S = (0.1, 1.0, 10.0, 60.0)
 TRUTH = {"gain_dn_per_e": 2.0, "read_noise_e": 12.0**0.5, "dark_current_e_per_s": 0.2}
-NO_FLATS = FlatMoments(*(np.empty(0) for _ in range(4)))
+NO_FLATS = FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
 
 
 def take_darks(chip: Chip, rng: np.random.Generator, frames: int = 10) -> list[Series]:

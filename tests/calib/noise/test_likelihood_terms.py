@@ -41,7 +41,7 @@ FLATS = FlatMoments(
     evenness=np.array([0.95, 0.9]),
 )
 STRAIGHT = Bent({}, np.zeros((0, 0)))
-NO_FLATS = FlatMoments(*(np.zeros(0) for _ in range(4)))
+NO_FLATS = FlatMoments(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
 HERE = {
     "offset_dn": 100.0, "log_read_dn2": np.log(8.0), "dsnu_dn2": 7.0, "jitter_dn2": 0.1,
     "dark_signal_dn_per_s": 0.4, "dcnu_dn2_per_s2": 0.003, "log_gain": np.log(2.0), "nonlinearity_per_dn": 2e-6,
