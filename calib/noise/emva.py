@@ -97,7 +97,11 @@ def propagate(formula: Callable[..., float], values: Array, covariance: Array) -
 
 
 def gather_inputs(
-    estimates: Mapping[str, Estimate], covariance: tuple[Sequence[str], Array], *, full_well: bool
+    estimates: Mapping[str, Estimate],
+    covariance: tuple[Sequence[str], Array],
+    *,
+    full_well: bool,
+    charge_error: float = 0.0,
 ) -> Inputs:
     """Return gain, read noise, dark current, efficiency and saturation capacity with their covariance.
 
@@ -112,6 +116,8 @@ def gather_inputs(
         Covariance of those of the first three that have values, possibly with others.
     full_well : bool
         What saturates is the full well, not the converter.
+    charge_error : float
+        Relative error of the charge of flats beside that of the gain: the bend of the response is not known exactly.
     """
     names = [name for name in ("gain_dn_per_e", "read_noise_e", "dark_current_e_per_s") if name in covariance[0]]
     derived = ("quantum_efficiency", "saturation_e") if "gain_dn_per_e" in names else ()
@@ -122,16 +128,19 @@ def gather_inputs(
     at = [list(covariance[0]).index(name) for name in known]
     part = np.asarray(covariance[1])[np.ix_(at, at)]
     formal = np.sqrt(np.diag(part))
-    # Errors of the known ones; then each of the others follows from one before it, and adds an error of its own.
     matrix = np.zeros((len(names), len(names)))
-    matrix[: len(known), : len(known)] = part * np.outer(errors[: len(known)], errors[: len(known)])
-    matrix[: len(known), : len(known)] /= np.maximum(np.outer(formal, formal), 1e-300)
+    widened = errors[: len(known)] / np.maximum(formal, 1e-300)
+    matrix[: len(known), : len(known)] = part * np.outer(widened, widened)
+    # Each of the others follows from one before it, and adds an error of its own
     for index in range(len(known), len(names)):
         from_efficiency = names[index] == "saturation_e" and full_well and "quantum_efficiency" in names
         source = names.index("quantum_efficiency") if from_efficiency else 0
         factor = (1 if from_efficiency else -1) * values[names[index]] / values[names[source]]
+        se, source_se = (estimates[names[at]].se or 0.0 for at in (index, source))
+        own = math.sqrt(max(se**2 - (factor * source_se) ** 2, 0.0)) * (errors[index] / se if se else 1.0)
+        own = math.hypot(own, 0.0 if from_efficiency else charge_error * values[names[index]])
         matrix[index, :index] = matrix[:index, index] = factor * matrix[source, :index]
-        matrix[index, index] = max(errors[index] ** 2, factor**2 * matrix[source, source])
+        matrix[index, index] = factor**2 * matrix[source, source] + own**2
     whys = {name: it.why or "" for name, it in estimates.items() if it.value is None}
     return Inputs(values, whys, matrix)
 

@@ -30,7 +30,7 @@ def dark_current_doubling(level_dn: Array, exposure_s: Array, temperature_c: Arr
     known = np.isfinite(temperature_c)
     level, t, warmth = level_dn[known], exposure_s[known], temperature_c[known]
     if not known.any():
-        return Estimate(None, why="no dark states its temperature (`temperature_c`)")
+        return Estimate(None, why="no dark states its temperature")
     if np.ptp(warmth) < _MIN_RANGE_K:
         return Estimate(
             None,

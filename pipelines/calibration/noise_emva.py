@@ -15,8 +15,8 @@ from faintfield.pipelines.calibration.noise_frames import MosaicPhase
 from faintfield.pipelines.formats.results.noise_emva import EmvaImageRecord, EmvaRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured
 
-# The bright image is the series nearest to this share of saturation.
-_BRIGHT_SHARE = 0.5
+# The bright image is the series of the most frames within so much of half of saturation, or else the nearest to it.
+_BRIGHT_SHARE, _BRIGHT_WITHIN = 0.5, 0.1
 
 _NO_PAIR = "no {} has two frames, without which the pattern of the pixels cannot be told from noise; record at least 16"
 
@@ -99,12 +99,27 @@ def measure_emva(
     exposure_s = _exposure_s(calibration)
     dark, bright = _dark_image(darks, calibration, exposure_s), _bright_image(darks, calibration)
     inputs = gather_inputs(
-        calibration.estimates, calibration.covariance, full_well=calibration.saturation.limit == "full well"
+        calibration.estimates,
+        calibration.covariance,
+        full_well=calibration.saturation.limit == "full well",
+        charge_error=_charge_error(calibration),
     )
     estimates = derived_quantities(inputs, exposure_s)
     estimates |= _dsnu(dark, calibration) | _prnu(bright, calibration)
     estimates["dark_current_doubling_k"] = _doubling(darks, temperature_c)
     return EmvaMeasurement(phase.name, calibration, tuple(phase.series), exposure_s, estimates, dark, bright)
+
+
+def _charge_error(calibration: NoiseCalibration) -> float:
+    """Return the relative error of the charge of a mean flat that the bend of the response leaves.
+
+    It is that of κ₁ at half of the brightest signal; further coefficients, which take part of it back, do not count.
+    """
+    se, kept = calibration.estimates["nonlinearity_per_dn"].se, calibration.saturation.kept
+    if se is None or not kept:
+        return 0.0
+    brightest = max(float(one.levels_dn.mean()) for one in kept) - (calibration.estimates["offset_dn"].value or 0.0)
+    return 0.5 * se * brightest
 
 
 def _exposure_s(calibration: NoiseCalibration) -> float:
@@ -113,13 +128,17 @@ def _exposure_s(calibration: NoiseCalibration) -> float:
     return exposures.pop() if len(exposures) == 1 else 0.0
 
 
-def _dark_image(darks: list[Series], calibration: NoiseCalibration, exposure_s: float) -> MeanImage | None:
-    """Return the mean of the darks nearest to an exposure."""
+def _dark_image(
+    darks: list[Series], calibration: NoiseCalibration, exposure_s: float, *, nearest: bool = False
+) -> MeanImage | None:
+    """Return the mean of the darks of the most frames, of several those nearest to an exposure; or the nearest ones."""
     used = ~calibration.maps.unusable
     several = [one for one in darks if one.frames > 1]
     if not several or not used.any():
         return None
-    dark = min(several, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
+    most = 0 if nearest else max(one.frames for one in several)
+    enough = [one for one in several if one.frames >= most]
+    dark = min(enough, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
     mean = dark.mean_dn
     offset = calibration.estimates["offset_dn"].value or 0.0
     return MeanImage(dark, mean, temporal_noise(dark, used), float(mean.mean(where=used)) - offset)
@@ -131,9 +150,13 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     several = [one for one in calibration.saturation.kept if one.frames > 1]
     if not several or not used.any():
         return None
-    wanted = offset + _BRIGHT_SHARE * (_end_dn(calibration) - offset)
-    flat = min(several, key=lambda one: abs(float(one.levels_dn.mean()) - wanted))
-    dark = _dark_image(darks, calibration, flat.conditions.exposure_s)
+    span = _end_dn(calibration) - offset
+
+    def off(one: Series) -> float:
+        return abs((float(one.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
+
+    flat = min(several, key=lambda one: (-one.frames, off(one)) if off(one) < _BRIGHT_WITHIN else (0, off(one)))
+    dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
     if dark is None:
         return None
     signal = flat.mean_dn - dark.values

@@ -14,7 +14,7 @@ MEASURED, MODEL, SECOND = "#0072b2", "#d55e00", "#009e73"
 
 _SIZE_IN = (5.6, 3.4)
 
-# Logarithmic axes over less than this factor have ticks between the powers of ten.
+# Logarithmic axes over less than this factor have even ticks, not powers of ten.
 _FINE_RANGE = 10.0
 
 
@@ -44,12 +44,10 @@ def drawn(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
 
 def _few_ticks(axes: "Axes") -> None:
     """Give logarithmic axes few ticks, with plain numbers: what takes time in a drawing is its ticks."""
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     axes.minorticks_off()
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         if axis.get_scale() == "log":
-            axis.set_major_locator(
-                LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < _FINE_RANGE * low else (1.0,))
-            )
+            axis.set_major_locator(MaxNLocator(6) if high < _FINE_RANGE * low else LogLocator())
             axis.set_major_formatter("{x:g}")

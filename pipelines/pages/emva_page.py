@@ -28,7 +28,7 @@ _TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
         "Temporal dark noise",
         (
             ("read_noise_e", "σ_d(0)", "at zero exposure", "e⁻", 1.0),
-            ("dark_noise_e", "σ_d", "at the exposure of the flats", "e⁻", 1.0),
+            ("dark_noise_e", "σ_d", "at the exposure stated above", "e⁻", 1.0),
             ("read_noise_dn", "K σ_d(0)", "at zero exposure, without rounding", "DN", 1.0),
         ),
     ),
@@ -150,6 +150,7 @@ def rounded(value: float, ends: tuple[float, float] | None) -> tuple[str, str]:
     if ends is None:
         return f"{value:.4g}".replace("-", "−"), ""
     half = (ends[1] - ends[0]) / 2
-    digits = int(np.clip(1 - np.floor(np.log10(half)), 0, 8)) if half > 0 else 3
+    scale = half if half > 0 else 1e-4 * abs(value) or 1.0
+    digits = int(np.clip(1 - np.floor(np.log10(scale)), 0, 8))
     low, at, high = (f"{number:.{digits}f}".replace("-", "−") for number in (ends[0], value, ends[1]))
     return at, f"{low} … {high}"

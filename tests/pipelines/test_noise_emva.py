@@ -138,3 +138,4 @@ def test_values_have_two_digits_of_their_interval() -> None:
     assert rounded(12.3456, (12.1, 12.6)) == ("12.35", "12.10 … 12.60")
     assert rounded(-1234.5, (-1300.0, -1150.0)) == ("−1234", "−1300 … −1150")
     assert rounded(3.0, None) == ("3", "")
+    assert rounded(0.05, (0.05, 0.05)) == ("0.0500000", "0.0500000 … 0.0500000")

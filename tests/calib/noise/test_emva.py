@@ -100,6 +100,24 @@ def test_propagated_errors_are_those_of_drawn_measurements() -> None:
         assert np.mean((drawn > ends[0]) & (drawn < ends[1])) == pytest.approx(0.95, abs=0.006)
 
 
+def test_errors_of_the_bend_do_not_cancel() -> None:
+    """An efficiency that has no error but that of the gain still rests on the bend of the response."""
+    relative = 0.01
+    known = {"gain_dn_per_e": estimate(GAIN, relative * GAIN), "read_noise_e": estimate(READ_E, 0.1)}
+    known |= {
+        "quantum_efficiency": estimate(EFFICIENCY, relative * EFFICIENCY),
+        "saturation_e": Estimate(None, why="x"),
+    }
+    known |= {"dark_current_e_per_s": Estimate(None, why="x")}
+    doubled = (GAIN * (1 - 4 * relative), GAIN * (1 + 4 * relative))
+    wider = {**known, "gain_dn_per_e": Estimate(GAIN, relative * GAIN, doubled)}
+    covariance = (["gain_dn_per_e", "read_noise_e"], np.diag([(relative * GAIN) ** 2, 0.1**2]))
+    for given in (known, wider):
+        inputs = gather_inputs(given, covariance, full_well=False, charge_error=1e-3)
+        found = derived_quantities(inputs, 0.0)["responsivity_dn_per_photon"]
+        assert found.se == pytest.approx(1e-3 * GAIN * EFFICIENCY, rel=1e-3)
+
+
 def test_intervals_wider_than_normal_ones_stay_so() -> None:
     wide = Estimate(READ_E, 0.1, (READ_E - 0.3, READ_E + 0.3))
     known = {name: Estimate(None, why="x") for name in ("dark_current_e_per_s", "quantum_efficiency", "saturation_e")}
