@@ -105,7 +105,8 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
     level = CHANCE / max(count, 1)
     judged = [_judged(it, level) for it in quantities]
     judged_maps = [_judged_map(it, probability, level) for it, probability in maps]
-    found = [it for it in (*judged, *judged_maps) if it.verdict == "changed"]
+    changed = [(it.plane, it.name) for it in judged if it.verdict == "changed"]
+    changed += [(it.plane, f"{it.name} map") for it in judged_maps if it.verdict == "changed"]
     return NoiseComparison(
         str(paths[0]),
         str(paths[1]),
@@ -114,7 +115,7 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
         judged,
         [_pixel_change(kind, *records) for kind in _KINDS],
         judged_maps,
-        [f"{it.plane}: {it.name}" if it.plane else it.name for it in found],
+        [f"{plane}: {name}" if plane else name for plane, name in changed],
         list(_notes(*records)),
     )
 

@@ -139,8 +139,9 @@ def test_what_is_missing_is_the_reason() -> None:
 
 
 def test_no_gain_leaves_nothing() -> None:
-    why = dict.fromkeys(("gain_dn_per_e", "read_noise_e", "quantum_efficiency", "saturation_e"), "no gain")
-    found = derived_quantities(inputs(**why), 0.0)
+    why = "no gain"
+    given = inputs(gain_dn_per_e=why, read_noise_e=why, quantum_efficiency=why, saturation_e=why)
+    found = derived_quantities(given, 0.0)
     assert {it.why for it in found.values()} == {"no gain"}
 
 
