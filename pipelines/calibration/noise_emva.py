@@ -86,8 +86,8 @@ class EmvaMeasurement:
         return EmvaRecord(
             dark_noise_exposure_s=self.exposure_s,
             **{name: Measured(it.value, it.se, it.ci95, it.why) for name, it in self.estimates.items()},
-            dark_image=self.dark and self.dark.record(),
-            bright_image=self.bright and self.bright.record(),
+            dark_image=self.dark.record() if self.dark else None,
+            bright_image=self.bright.record() if self.bright else None,
         )
 
 
@@ -160,12 +160,18 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     if dark is None:
         return None
     signal = flat.mean_dn - dark.values
+    signal_dn = float(signal.mean(where=used))
+    slope = 1.0
+    if calibration.response is not None:  # PRNU is that of the charge, which a bend of the response compresses
+        ends = calibration.response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
+        slope = float(ends[1] - ends[0]) / (0.02 * signal_dn)
+        signal = calibration.response.charge_dn(signal)
     mean = float(signal.mean(where=used))
     vignetting = calibration.maps.vignetting
     smooth = np.ones_like(signal) if vignetting is None else np.maximum(vignetting, 1e-3)
     noise = temporal_noise(flat, used) + dark.noise
-    weight = float((1 / smooth**2).mean(where=used)) / mean**2
-    return MeanImage(flat, signal / smooth / mean, noise.scaled(weight), mean)
+    weight = float((1 / smooth**2).mean(where=used)) * (slope / mean) ** 2
+    return MeanImage(flat, signal / smooth / mean, noise.scaled(weight), signal_dn)
 
 
 def _end_dn(calibration: NoiseCalibration) -> float:
