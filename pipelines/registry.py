@@ -39,7 +39,12 @@ IMPORTS = (
     "import mrcal cameras set --images images",
     "import emva1288 descriptor.txt noise",
 )
-EXPORTS = ("export colmap set sparse", "export mrcal set cameras", "export zarr sweep sweep.ome.zarr")
+EXPORTS = (
+    "export colmap set sparse",
+    "export mrcal set cameras",
+    "export zarr sweep sweep.ome.zarr",
+    "export emva1288 noise emva1288",
+)
 
 
 def register_commands(app: App) -> None:
@@ -53,7 +58,7 @@ def register_commands(app: App) -> None:
     files = Group("Other people's files", sort_key=5)
     for examples, words in (
         (IMPORTS, "Make a set of images and poses, or of frames, from other people's files."),
-        (EXPORTS, "Write lens and poses of a set, or planes, for other people's programs."),
+        (EXPORTS, "Write lens and poses of a set, planes, or dark and flat frames, for other people's programs."),
     ):
         verb = examples[0].split()[0]
         app.command(App(name=verb, help=words, group=files, help_epilogue=f"Example: faintfield {examples[0]}"))

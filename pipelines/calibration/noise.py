@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.calibration.noise_fit import fit_record
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
 from faintfield.pipelines.formats.files import sha256
@@ -50,12 +51,15 @@ class SensorCalibration:
         The layout of the frames.
     phases : list of NoiseCalibration
         One per phase of the mosaic, in the order of `readout.phases`.
+    emva : list of EmvaMeasurement
+        Likewise, what the report by EMVA 1288 shows.
     """
 
     folder: Path
     settings: NoiseSet
     readout: Readout
     phases: list[NoiseCalibration]
+    emva: list[EmvaMeasurement]
 
 
 def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
@@ -68,13 +72,15 @@ def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
     """
     readout = read_series(folder, settings)
     phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
-    return SensorCalibration(folder, settings, readout, phases)
+    warmth = {str(folder / frame.file): it for frame in settings.frame if (it := frame.temperature_c) is not None}
+    emva = [measure_emva(*of_phase, warmth) for of_phase in zip(readout.phases, phases, strict=True)]
+    return SensorCalibration(folder, settings, readout, phases, emva)
 
 
 def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     """Return the record of a calibration, without the hash of its maps."""
     readout, phases, settings = sensor.readout, sensor.phases, sensor.settings
-    records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, strict=True)]
+    records = [_phase_record(*of_phase) for of_phase in zip(readout.phases, phases, sensor.emva, strict=True)]
     bad_pixels: dict[str, Any] = {
         f"{kind}_pixels": np.argwhere(_interleave(readout, [getattr(c, kind) for c in phases], fill=False)).tolist()
         for kind in ("hot", "noisy", "dead")
@@ -96,6 +102,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         warnings=list(dict.fromkeys(warnings)),
         provenance=provenance("noise", {}, _input_hashes(sensor.folder, settings)),
         fit=UNSET if readout.mosaic else fit_record(phases[0]),
+        emva1288=UNSET if readout.mosaic else sensor.emva[0].record(),
     )
 
 
@@ -139,7 +146,7 @@ def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> 
     ]
 
 
-def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRecord:
+def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration, emva: EmvaMeasurement) -> PhaseRecord:
     """Return the entry of one phase in noise.json."""
     return PhaseRecord(
         phase=phase.phase,
@@ -147,6 +154,7 @@ def _phase_record(phase: MosaicPhase, calibration: NoiseCalibration) -> PhaseRec
         likelihood=str(calibration.likelihood),
         masked_black_dn=float(np.mean(phase.black_dn)) if phase.black_dn else None,
         fit=fit_record(calibration),
+        emva1288=emva.record(),
         **_records({name: it for name, it in calibration.estimates.items() if _is_quantity(name)}),
     )
 

@@ -1,13 +1,16 @@
 """`faintfield noise`: a sensor measured from dark and flat frames."""
 
 from pathlib import Path
+from typing import overload
 
 from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
+from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
 from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
+from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
 from faintfield.pipelines.pages.noise_page import draw_page
 
 _SHOWN = (
@@ -21,11 +24,18 @@ _SHOWN = (
 )
 
 
-def noise(folder: Path, /, *, out: Path | None = None) -> NoiseRecord:
+@overload
+def noise(folder: Path, /, *, out: Path | None = None) -> NoiseRecord: ...
+@overload
+def noise(*, compare: tuple[Path, Path]) -> NoiseComparison: ...
+def noise(
+    folder: Path | None = None, /, *, out: Path | None = None, compare: tuple[Path, Path] | None = None
+) -> NoiseRecord | NoiseComparison:
     """Measure offset, gain, read noise and dark current from dark frames, and flats if there are any.
 
-    Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel) and a page of
-    plots, noise_page.png.
+    Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel), a page of
+    plots, noise_page.png, and the report by EMVA 1288, emva1288_report.html. With --compare instead of FOLDER: tells
+    whether a camera has changed from one measurement to another, and writes nothing.
 
     Parameters
     ----------
@@ -33,7 +43,22 @@ def noise(folder: Path, /, *, out: Path | None = None) -> NoiseRecord:
         A session with dark frames, or a folder with noise.toml and the frames that it names.
     out
         Where to write; FOLDER itself if not given.
+    compare
+        Two results of this command, noise.json or their folders: the earlier and the later one.
     """
+    if compare is not None:
+        if folder is not None or out is not None:
+            raise WrongUsage("--compare takes two results and writes nothing; leave out FOLDER and --out")
+        comparison = compare_noise(*compare)
+        _inform_of_comparison(comparison)
+        return comparison
+    if folder is None:
+        raise WrongUsage("name a FOLDER with frames to measure, or two results with --compare A B")
+    return measure(folder, out)
+
+
+def measure(folder: Path, out: Path | None) -> NoiseRecord:
+    """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     folder, settings = load_noise_set(folder)
@@ -45,7 +70,9 @@ def noise(folder: Path, /, *, out: Path | None = None) -> NoiseRecord:
         )
         for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
     }
-    record = write_noise(out, noise_record(sensor), noise_maps(sensor), pages)
+    record = noise_record(sensor)
+    pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
+    record = write_noise(out, record, noise_maps(sensor), pages)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")
     return record
@@ -81,3 +108,38 @@ def _inform_of_fit(fit: FitRecord) -> None:
     if error.value is not None and error.ci95 is not None:
         low, high = error.ci95
         inform(f"  LE, linearity error: {error.value:.3%} (95 %: {low:.3%} to {high:.3%})")
+
+
+def _inform_of_comparison(found: NoiseComparison) -> None:
+    """Print a table of the quantities, and what is known of pixels and maps."""
+    inform(f"A: {found.first}")
+    inform(f"B: {found.second}")
+    names = [f"{it.plane}: {it.name}" if it.plane else it.name for it in found.quantities]
+    wide = max(map(len, names))
+    inform(f"{'':{wide}}  {'A':>12} {'B':>12} {'B - A':>12} {'in sigma':>9}  verdict")
+    for name, change in zip(names, found.quantities, strict=True):
+        numbers = " ".join(
+            "-".rjust(12) if n is None else f"{n:12.5g}" for n in (change.first, change.second, change.difference)
+        )
+        sigma = "-" if change.sigma is None else f"{change.sigma:+.1f}"
+        inform(f"{name:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}")
+    for it in found.pixels:
+        inform(f"{it.kind} pixels: {it.both} in both, {it.only_first} in A only, {it.only_second} in B only")
+    for difference in found.maps:
+        _inform_of_map(difference)
+    for note in found.notes:
+        inform(f"note: {note}")
+    changed = ", ".join(found.changed) or "nothing"
+    inform(
+        f"changed: {changed} (beyond {found.limit_sigma:.1f} sigma, so that {CHANCE:.0%} of {found.comparisons} "
+        "comparisons together are false alarms)"
+    )
+
+
+def _inform_of_map(found: MapChange) -> None:
+    """Print how the maps of a quantity differ."""
+    label = f"{found.plane}: {found.name} map" if found.plane else f"{found.name} map"
+    if found.rms_dn is None or found.expected_dn is None:
+        inform(f"{label}: {found.verdict}: {found.why}")
+    else:
+        inform(f"{label}: differs by {found.rms_dn:.4g} DN rms, expected {found.expected_dn:.4g} DN: {found.verdict}")

@@ -12,7 +12,7 @@ from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, write_noise_set
 
 
-def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, str | float]:
+def import_emva1288(descriptor: Path, out: Path, /, *, overwrite: bool = False) -> dict[str, str | float]:
     """Make a noise set of EMVA 1288 reference data.
 
     Parameters
@@ -21,13 +21,16 @@ def import_emva1288(descriptor: Path, out: Path, /) -> dict[str, str | float]:
         The data's descriptor file; images lie beside it.
     out
         Folder to write: noise.toml and copies of the images.
+    overwrite
+        Replace an earlier set in OUT.
     """
     read = read_descriptor(descriptor)
     sources = [image_path(descriptor, frame.file) for frame in read.frames]
     names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]
     frames = [msgspec.structs.replace(frame, file=name) for name, frame in zip(names, read.frames, strict=True)]
     saturation_dn = float(2**read.bits - 1)
-    with writing_folder(out) as folder:
+    replace = FILE_NAME if overwrite else None
+    with writing_folder(out, replace_if=replace, reads=[descriptor, *sources]) as folder:
         (folder / "frames").mkdir()
         for source, name in progress(list(zip(sources, names, strict=True)), "copying frames"):
             shutil.copyfile(source, folder / name)

@@ -6,18 +6,25 @@ are relative, often with backslashes; decimals may be commas; `#` begins a comme
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
 import msgspec
 
+from faintfield.calib.noise import Conditions
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S
 from faintfield.pipelines.formats.reading import is_file, read_text
 from faintfield.pipelines.formats.results.noise import NoiseFrame
 from faintfield.pipelines.formats.toml_files import inside
 
+DESCRIPTOR = "descriptor.txt"
+
 _NS_PER_S = 1e9
+
+# The release whose descriptors are written.
+_RELEASE = "4.0"
 
 
 @dataclass
@@ -103,3 +110,23 @@ def image_path(descriptor: Path, stated: str) -> Path:
     if not is_file(path):
         raise MissingFile(f"{path}: is named by {descriptor} but missing; unpack all of the data set")
     return path
+
+
+def descriptor_text(images: Sequence[tuple[Conditions, Sequence[str]]], bits: int, size_px: tuple[int, int]) -> str:
+    """Return the text of a descriptor file.
+
+    Parameters
+    ----------
+    images : sequence of (Conditions, sequence of str)
+        The series with the paths of their images; flats need their photons.
+    bits : int
+        Bits per pixel.
+    size_px : (int, int)
+        Width and height of an image.
+    """
+    lines = [f"v {_RELEASE}", f"n {bits} {size_px[0]} {size_px[1]}"]
+    for conditions, names in images:
+        exposure_ns = repr(conditions.exposure_s * _NS_PER_S)
+        lines.append(f"d {exposure_ns}" if conditions.kind == "dark" else f"b {exposure_ns} {conditions.photons!r}")
+        lines += ["i " + str(PureWindowsPath(name)) for name in names]
+    return "\n".join(lines) + "\n"

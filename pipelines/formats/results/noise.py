@@ -3,7 +3,7 @@
 Keys stand in the file in the order of the fields; docs/noise.md explains the quantities.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +21,7 @@ from faintfield.pipelines.formats.frames import at_phase
 from faintfield.pipelines.formats.limits import sound_mosaic
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.reading import is_file, read_arrays, read_json
+from faintfield.pipelines.formats.results.noise_emva import EmvaRecord
 from faintfield.pipelines.formats.results.noise_fit import FitRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured as Measured
 
@@ -81,6 +82,7 @@ class PhaseRecord(Quantities, frozen=True):
     likelihood: str
     masked_black_dn: float | None
     fit: FitRecord | UnsetType = UNSET
+    emva1288: EmvaRecord | UnsetType = UNSET
 
 
 class CovarianceRecord(Struct, frozen=True):
@@ -108,7 +110,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     """`noise.json`: the sensor's quantities (the mean over phases where there is a mosaic) and how they were measured.
 
     Pixels are (row, column). `mosaic` and `planes`, one entry per phase, are left out without colour filters; with
-    them, each plane has its own `fit`. Older files have none.
+    them, each plane has its own `fit` and `emva1288`. Older files have none.
     """
 
     covariance: CovarianceRecord = CovarianceRecord([], [])
@@ -127,6 +129,7 @@ class NoiseRecord(_StandardQuantities, frozen=True, kw_only=True):
     maps_sha256: str = ""
     provenance: Provenance[dict[str, object]] | None = None
     fit: FitRecord | UnsetType = UNSET
+    emva1288: EmvaRecord | UnsetType = UNSET
 
 
 def read_noise(path: Path) -> NoiseRecord:
@@ -152,7 +155,7 @@ def write_noise(
     maps : mapping of str to array (row, column)
         By the name in noise_maps.npz.
     pages : mapping of str to bytes
-        PNG by file name.
+        Pages of plots, PNG or HTML, by file name.
     """
     with exclusive(out):
         remove(out / NOISE_FILE)
@@ -209,7 +212,7 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
         raise BadValue(f"{path}: mosaic = {list(record.mosaic)} is no colour filter; run `faintfield noise` again")
     unusable = np.zeros(shape, bool)
     unusable[tuple(np.array(record.hot_pixels, int).reshape(-1, 2).T)] = True
-    maps = _read_maps(path.with_name(NOISE_MAPS), record, shape)
+    maps = read_maps(path.with_name(NOISE_MAPS), record, shape)
     unusable |= maps.pop("mask", np.False_).astype(bool)
     response = maps.pop("relative_response", None)
     if response is not None:
@@ -267,13 +270,21 @@ def _numbers(path: Path, record: NoiseRecord) -> dict[str, float]:
     return values
 
 
-def _read_maps(path: Path, record: NoiseRecord, shape: tuple[int, int]) -> dict[str, Any]:
-    """Return the maps (row, column) that the file has, of those that a reconstruction takes; none without a file."""
+def read_maps(
+    path: Path, record: NoiseRecord, shape: tuple[int, int], names: Collection[str] = _MAPS_TAKEN
+) -> dict[str, Any]:
+    """Return the maps (row, column) that the file has, of those named; none without a file.
+
+    Raises
+    ------
+    BadValue
+        The file is damaged, of another size, or not the one that the record names.
+    """
     if not is_file(path):
         return {}
     maps = read_arrays(
         path,
-        _MAPS_TAKEN,
+        names,
         shape=shape,
         max_bytes=_MAPS_WRITTEN * shape[0] * shape[1] * np.dtype(np.float64).itemsize,
         remedy="run `faintfield noise` again for this camera",

@@ -1,0 +1,264 @@
+"""Two measurements of a camera's noise compared: which quantities, pixels and maps have changed since."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from faintfield.calib.noise.change import chance, compare_maps, difference_in_sigma
+from faintfield.pipelines.errors import BadValue, WrongSize
+from faintfield.pipelines.formats.frames import at_phase, mosaic_period
+from faintfield.pipelines.formats.results.noise import (
+    NOISE_FILE,
+    NOISE_MAPS,
+    NoiseRecord,
+    PhaseRecord,
+    Quantities,
+    read_maps,
+    read_noise,
+)
+from faintfield.pipelines.formats.results.noise_fit import Measured
+
+# Probability that any quantity at all is called changed though nothing has.
+CHANCE = 0.05
+
+# Of the fit and of the report by EMVA 1288, those that do not follow from others.
+_OF_FIT = ("saturation_e", "linearity_error")
+_OF_EMVA = ("prnu_row", "prnu_column")
+
+_KINDS = ("hot", "noisy", "dead")
+
+type Verdict = Literal["changed", "unchanged", "not comparable"]
+
+
+class Change(Struct, frozen=True, omit_defaults=True):
+    """One quantity of both measurements, with their difference in standard errors, or the reason why there is none."""
+
+    name: str
+    first: float | None
+    second: float | None
+    difference: float | None
+    sigma: float | None
+    verdict: Verdict
+    plane: str = ""
+    why: str | None = None
+
+
+class PixelChange(Struct, frozen=True):
+    """Numbers of pixels that only the first, only the second, or both measurements call unusable, of one kind."""
+
+    kind: str
+    only_first: int
+    only_second: int
+    both: int
+
+
+class MapChange(Struct, frozen=True, omit_defaults=True):
+    """The difference of both offset maps, its mean taken out: its rms, and the rms that the errors of both make."""
+
+    name: str
+    pixels: int
+    rms_dn: float | None
+    expected_dn: float | None
+    verdict: Verdict
+    plane: str = ""
+    why: str | None = None
+
+
+class NoiseComparison(Struct, frozen=True):
+    """The result of `faintfield noise --compare`.
+
+    `comparisons` is the number m of verdicts that can be given; each is "changed" below a probability of `CHANCE`/m.
+    """
+
+    first: str
+    second: str
+    comparisons: int
+    limit_sigma: float
+    quantities: list[Change]
+    pixels: list[PixelChange]
+    maps: list[MapChange]
+    changed: list[str]
+    notes: list[str]
+
+
+def compare_noise(first: Path, second: Path) -> NoiseComparison:
+    """Return what has changed from one noise.json, or its folder, to another.
+
+    Raises
+    ------
+    MissingFile, BadValue
+        A file cannot be read, or is no result of `faintfield noise`.
+    WrongSize, BadValue
+        The sensors differ in size or in colour filters.
+    """
+    paths = tuple(path / NOISE_FILE if path.is_dir() else path for path in (first, second))
+    records = read_noise(paths[0]), read_noise(paths[1])
+    _check_alike(paths[0], records[0], paths[1], records[1])
+    quantities = list(_quantities(*records))
+    maps = list(_maps(paths[0], records[0], paths[1], records[1]))
+    count = sum(it.sigma is not None for it in quantities) + sum(it[1] is not None for it in maps)
+    level = CHANCE / max(count, 1)
+    judged = [_judged(it, level) for it in quantities]
+    judged_maps = [_judged_map(it, probability, level) for it, probability in maps]
+    changed = [(it.plane, it.name) for it in judged if it.verdict == "changed"]
+    changed += [(it.plane, f"{it.name} map") for it in judged_maps if it.verdict == "changed"]
+    return NoiseComparison(
+        str(paths[0]),
+        str(paths[1]),
+        count,
+        _limit_sigma(level),
+        judged,
+        [_pixel_change(kind, *records) for kind in _KINDS],
+        judged_maps,
+        [f"{plane}: {name}" if plane else name for plane, name in changed],
+        list(_notes(*records)),
+    )
+
+
+def _check_alike(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> None:
+    """Refuse records of sensors of different sizes or colour filters."""
+    if one.size_px != other.size_px:
+        sizes = [" x ".join(map(str, it.size_px)) + " px" if it.size_px else "of no stated size" for it in (one, other)]
+        raise WrongSize(
+            f"{second}: is {sizes[1]}, {first} is {sizes[0]}: they are not of one camera in one mode; name two "
+            "measurements of the same"
+        )
+    if (one.mosaic or None) != (other.mosaic or None):
+        filters = ["/".join(it.mosaic) if it.mosaic else "none" for it in (one, other)]
+        raise BadValue(
+            f"{second}: has the colour filters {filters[1]}, {first} has {filters[0]}: they are not of one camera; "
+            "name two measurements of the same"
+        )
+
+
+def _phases(one: NoiseRecord, other: NoiseRecord) -> Iterator[tuple[str, Quantities, Quantities]]:
+    """Yield the quantities of both, phase by phase of the mosaic."""
+    if not one.planes or not other.planes:
+        yield "", one, other
+        return
+    others = {plane.phase: plane for plane in other.planes}
+    for plane in one.planes:
+        if plane.phase in others:
+            yield _name(plane), plane, others[plane.phase]
+
+
+def _name(plane: PhaseRecord) -> str:
+    """Return the name of a phase."""
+    return f"{plane.colour}_r{plane.phase[0]}c{plane.phase[1]}"
+
+
+def _quantities(one: NoiseRecord, other: NoiseRecord) -> Iterator[Change]:
+    """Yield every quantity of both, without verdict yet."""
+    for plane, first, second in _phases(one, other):
+        known = _measured(first), _measured(second)
+        for name in known[0]:
+            yield _change(name, plane, known[0][name], known[1][name])
+
+
+def _measured(quantities: Quantities) -> dict[str, Measured]:
+    """Return the quantities to compare, by name; a reason stands for those that an older file lacks."""
+    lacking = Measured(None, why="not in this file: it is of an older version")
+    fit, emva = getattr(quantities, "fit", None), getattr(quantities, "emva1288", None)
+    found = {name: getattr(quantities, name) for name in Quantities.__struct_fields__}
+    found |= {name: getattr(fit, name) if fit else lacking for name in _OF_FIT}
+    found |= {name: getattr(emva, name) if emva else lacking for name in _OF_EMVA}
+    return {name: it if isinstance(it, Measured) else Measured(it) for name, it in found.items()}
+
+
+def _change(name: str, plane: str, first: Measured, second: Measured) -> Change:
+    """Return one quantity of both."""
+    whys = [
+        f"{which}: {it.why or 'no reason stated'}" for which, it in (("A", first), ("B", second)) if it.value is None
+    ]
+    if first.value is None or second.value is None:
+        if first.value is None and second.value is None and first.why == second.why:
+            whys = [f"A and B: {first.why or 'no reason stated'}"]
+        return Change(name, first.value, second.value, None, None, "not comparable", plane, "; ".join(whys))
+    difference = second.value - first.value
+    if first.ci95 is None or second.ci95 is None:
+        return Change(
+            name, first.value, second.value, difference, None, "not comparable", plane, "no interval is stated"
+        )
+    sigma = difference_in_sigma(first.value, first.ci95, second.value, second.ci95)
+    if not np.isfinite(sigma):
+        if not difference:
+            return Change(name, first.value, second.value, 0.0, 0.0, "unchanged", plane)
+        return Change(name, first.value, second.value, difference, None, "not comparable", plane, "both errors are 0")
+    return Change(name, first.value, second.value, difference, sigma, "unchanged", plane)
+
+
+def _judged(change: Change, level: float) -> Change:
+    """Return a change with its verdict at a level of probability."""
+    if change.sigma is None or chance(change.sigma) >= level:
+        return change
+    return msgspec.structs.replace(change, verdict="changed")
+
+
+def _limit_sigma(level: float) -> float:
+    """Return the standard errors beyond which a difference counts."""
+    from scipy import stats
+
+    return float(stats.norm.isf(level / 2))
+
+
+def _pixel_change(kind: str, one: NoiseRecord, other: NoiseRecord) -> PixelChange:
+    """Return how the unusable pixels of a kind differ."""
+    first, second = (set(map(tuple, getattr(it, f"{kind}_pixels"))) for it in (one, other))
+    return PixelChange(kind, len(first - second), len(second - first), len(first & second))
+
+
+def _maps(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> Iterator[tuple[MapChange, float | None]]:
+    """Yield the comparison of the offset maps of each phase, and the probability of its difference; None without."""
+    name, names = "offset_dn", ("offset_dn", "offset_variance_dn2", "mask")
+    if one.size_px is None:
+        return
+    shape = one.size_px[::-1]
+    maps = [
+        read_maps(path.with_name(NOISE_MAPS), record, shape, names) for path, record in ((first, one), (second, other))
+    ]
+    lacking = [which for which, it in zip("AB", maps, strict=True) if set(it) != set(names)]
+    if lacking:
+        why = f"{' and '.join(lacking)}: no offset map with its errors lies beside {NOISE_FILE}"
+        yield MapChange(name, 0, None, None, "not comparable", why=why), None
+        return
+    period = mosaic_period(one.mosaic or None)
+    usable = ~(maps[0]["mask"].astype(bool) | maps[1]["mask"].astype(bool))
+    for plane, phase in [(_name(it), it.phase) for it in one.planes or []] or [("", (0, 0))]:
+        used = at_phase(usable, phase, period)
+        values = [_of(it[key], phase, period, used) for it in maps for key in names[:2]]
+        if used.sum() < 2:
+            yield MapChange(name, 0, None, None, "not comparable", plane, "no pixel is usable in both"), None
+            continue
+        found = compare_maps(*values)
+        probability = found.chance if found.grown else 1.0
+        yield MapChange(name, found.pixels, found.rms, found.expected, "unchanged", plane), probability
+
+
+def _of(
+    values: NDArray[np.generic], phase: tuple[int, int], period: tuple[int, int], used: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return the values of the usable pixels of a phase."""
+    return np.asarray(at_phase(values, phase, period)[used], np.float64)
+
+
+def _judged_map(change: MapChange, probability: float | None, level: float) -> MapChange:
+    """Return the comparison of maps with its verdict at a level of probability."""
+    if probability is None or probability >= level:
+        return change
+    return msgspec.structs.replace(change, verdict="changed")
+
+
+def _notes(one: NoiseRecord, other: NoiseRecord) -> Iterator[str]:
+    """Yield what else differs between the measurements, which may be the reason for a change."""
+    warmth = [it.temperature_c.mean if it.temperature_c else None for it in (one, other)]
+    if None in warmth:
+        yield "a temperature is not stated: dark current may have changed by 10 % per kelvin"
+    elif warmth[0] != warmth[1]:
+        yield f"A was measured at {warmth[0]:.1f} °C, B at {warmth[1]:.1f} °C; dark current changes by 10 % per kelvin"
+    if one.likelihood != other.likelihood:
+        yield f"the likelihoods differ: {one.likelihood or 'not stated'}, then {other.likelihood or 'not stated'}"

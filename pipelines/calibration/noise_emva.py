@@ -1,0 +1,210 @@
+"""The report by EMVA 1288 of a calibrated sensor: which images it shows, and the quantities that follow."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise import Estimate, NoiseCalibration, Series
+from faintfield.calib.noise.emva import derived_quantities, gather_inputs
+from faintfield.calib.noise.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
+from faintfield.calib.noise.warmth import dark_current_doubling
+from faintfield.pipelines.calibration.noise_frames import MosaicPhase
+from faintfield.pipelines.formats.results.noise_emva import EmvaImageRecord, EmvaRecord
+from faintfield.pipelines.formats.results.noise_fit import Measured
+
+# The bright image is the series of the most frames within so much of half of saturation, or else the nearest to it.
+_BRIGHT_SHARE, _BRIGHT_WITHIN = 0.5, 0.1
+
+_NO_PAIR = "no {} has two frames, without which the pattern of the pixels cannot be told from noise; record at least 16"
+
+
+@dataclass(frozen=True)
+class MeanImage:
+    """The mean image of a series, as DSNU or PRNU are taken from it.
+
+    Attributes
+    ----------
+    series : Series
+        The series.
+    values : array (row, column)
+        In DN for a dark; for a bright one relative to its mean signal, dark and vignetting taken out.
+    noise : TemporalNoise
+        What temporal noise leaves in it.
+    signal_dn : float
+        Its mean above the dark of zero exposure.
+    """
+
+    series: Series
+    values: NDArray[np.floating[Any]]
+    noise: TemporalNoise
+    signal_dn: float
+
+    def record(self) -> EmvaImageRecord:
+        """Return which series it is."""
+        is_of = self.series.conditions
+        return EmvaImageRecord(is_of.exposure_s, is_of.level, self.series.frames, self.signal_dn)
+
+
+@dataclass(frozen=True)
+class EmvaMeasurement:
+    """What the report of one phase of the mosaic shows.
+
+    Attributes
+    ----------
+    name : str
+        Of the phase, "" when it is the only one.
+    calibration : NoiseCalibration
+        Its calibration.
+    series : tuple of Series
+        All its series, those that were left out included.
+    exposure_s : float
+        Exposure of the dark noise.
+    estimates : dict of Estimate
+        Quantities by the names of `EmvaRecord`.
+    dark, bright : MeanImage, optional
+        The images of DSNU and PRNU.
+    """
+
+    name: str
+    calibration: NoiseCalibration
+    series: tuple[Series, ...]
+    exposure_s: float
+    estimates: dict[str, Estimate]
+    dark: MeanImage | None
+    bright: MeanImage | None
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Pixels that count."""
+        return ~self.calibration.maps.unusable
+
+    def record(self) -> EmvaRecord:
+        """Return the part of noise.json."""
+        return EmvaRecord(
+            dark_noise_exposure_s=self.exposure_s,
+            **{name: Measured(it.value, it.se, it.ci95, it.why) for name, it in self.estimates.items()},
+            dark_image=self.dark.record() if self.dark else None,
+            bright_image=self.bright.record() if self.bright else None,
+        )
+
+
+def measure_emva(
+    phase: MosaicPhase, calibration: NoiseCalibration, temperature_c: Mapping[str, float]
+) -> EmvaMeasurement:
+    """Return the quantities of EMVA 1288 of one phase; `temperature_c` is that of each frame by its name."""
+    darks = [one for one in phase.series if one.conditions.kind == "dark"]
+    exposure_s = _exposure_s(calibration)
+    dark, bright = _dark_image(darks, calibration, exposure_s), _bright_image(darks, calibration)
+    inputs = gather_inputs(
+        calibration.estimates,
+        calibration.covariance,
+        full_well=calibration.saturation.limit == "full well",
+        charge_error=_charge_error(calibration),
+    )
+    estimates = derived_quantities(inputs, exposure_s)
+    estimates |= _dsnu(dark, calibration) | _prnu(bright, calibration)
+    estimates["dark_current_doubling_k"] = _doubling(darks, temperature_c)
+    return EmvaMeasurement(phase.name, calibration, tuple(phase.series), exposure_s, estimates, dark, bright)
+
+
+def _charge_error(calibration: NoiseCalibration) -> float:
+    """Return the relative error of the charge of a mean flat that the bend of the response leaves.
+
+    It is that of κ₁ at half of the brightest signal; further coefficients, which take part of it back, do not count.
+    """
+    se, kept = calibration.estimates["nonlinearity_per_dn"].se, calibration.saturation.kept
+    if se is None or not kept:
+        return 0.0
+    brightest = max(float(one.levels_dn.mean()) for one in kept) - (calibration.estimates["offset_dn"].value or 0.0)
+    return 0.5 * se * brightest
+
+
+def _exposure_s(calibration: NoiseCalibration) -> float:
+    """Return the exposure of the flats if they share one, else 0, as EMVA 1288 extrapolates to."""
+    exposures = {one.conditions.exposure_s for one in calibration.saturation.kept}
+    return exposures.pop() if len(exposures) == 1 else 0.0
+
+
+def _dark_image(
+    darks: list[Series], calibration: NoiseCalibration, exposure_s: float, *, nearest: bool = False
+) -> MeanImage | None:
+    """Return the mean of the darks of the most frames, of several those nearest to an exposure; or the nearest ones."""
+    used = ~calibration.maps.unusable
+    several = [one for one in darks if one.frames > 1]
+    if not several or not used.any():
+        return None
+    most = 0 if nearest else max(one.frames for one in several)
+    enough = [one for one in several if one.frames >= most]
+    dark = min(enough, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
+    mean = dark.mean_dn
+    offset = calibration.estimates["offset_dn"].value or 0.0
+    return MeanImage(dark, mean, temporal_noise(dark, used), float(mean.mean(where=used)) - offset)
+
+
+def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanImage | None:
+    """Return the mean of the flats nearest to half of saturation, over its mean; dark and vignetting are taken out."""
+    used, offset = ~calibration.maps.unusable, calibration.estimates["offset_dn"].value or 0.0
+    several = [one for one in calibration.saturation.kept if one.frames > 1]
+    if not several or not used.any():
+        return None
+    span = _end_dn(calibration) - offset
+
+    def off(one: Series) -> float:
+        return abs((float(one.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
+
+    flat = min(several, key=lambda one: (-one.frames, off(one)) if off(one) < _BRIGHT_WITHIN else (0, off(one)))
+    dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
+    if dark is None:
+        return None
+    signal = flat.mean_dn - dark.values
+    signal_dn = float(signal.mean(where=used))
+    slope = 1.0
+    if calibration.response is not None:  # PRNU is that of the charge, which a bend of the response compresses
+        ends = calibration.response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
+        slope = float(ends[1] - ends[0]) / (0.02 * signal_dn)
+        signal = calibration.response.charge_dn(signal)
+    mean = float(signal.mean(where=used))
+    vignetting = calibration.maps.vignetting
+    smooth = np.ones_like(signal) if vignetting is None else np.maximum(vignetting, 1e-3)
+    noise = temporal_noise(flat, used) + dark.noise
+    weight = float((1 / smooth**2).mean(where=used)) * (slope / mean) ** 2
+    return MeanImage(flat, signal / smooth / mean, noise.scaled(weight), signal_dn)
+
+
+def _end_dn(calibration: NoiseCalibration) -> float:
+    """Return the level of saturation; of the brightest flat where none is known."""
+    level = calibration.saturation.level_dn
+    if level is not None:
+        return level
+    brightest = max(float(one.levels_dn.mean()) for one in calibration.saturation.kept)
+    return calibration.saturation_dn if np.isfinite(calibration.saturation_dn) else brightest
+
+
+def _dsnu(dark: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
+    """Return DSNU in electrons: all of it, and its parts."""
+    gain = calibration.estimates["gain_dn_per_e"]
+    if gain.value is None or dark is None:
+        why = gain.why if gain.value is None else _NO_PAIR.format("dark")
+        return {f"dsnu_{part.name}_e": Estimate(None, why=why) for part in fields(Nonuniformity)}
+    parts = nonuniformity(dark.values, ~calibration.maps.unusable, dark.noise, 1 / gain.value)
+    return {f"dsnu_{part.name}_e": getattr(parts, part.name) for part in fields(parts)}
+
+
+def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
+    """Return PRNU as a share of the signal: all of it, and its parts."""
+    if bright is None:
+        why = _NO_PAIR.format("flat") if calibration.saturation.kept else calibration.estimates["prnu"].why
+        return {f"prnu_{part.name}": Estimate(None, why=why) for part in fields(Nonuniformity)}
+    parts = nonuniformity(bright.values, ~calibration.maps.unusable, bright.noise)
+    return {f"prnu_{part.name}": getattr(parts, part.name) for part in fields(parts)}
+
+
+def _doubling(darks: list[Series], temperature_c: Mapping[str, float]) -> Estimate:
+    """Return over which temperature difference the dark current doubles."""
+    level = np.concatenate([one.levels_dn for one in darks])
+    exposure = np.concatenate([np.full(one.frames, one.conditions.exposure_s) for one in darks])
+    warmth = np.array([temperature_c.get(name, np.nan) for one in darks for name in one.names])
+    return dark_current_doubling(level, exposure, warmth)

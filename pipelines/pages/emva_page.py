@@ -1,0 +1,156 @@
+"""The page `emva1288_report.html`: the report of a sensor by EMVA 1288 release 4.0."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from faintfield.calib.noise import Estimate
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
+from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
+from faintfield.pipelines.pages.emva_drawing import Drawing
+from faintfield.pipelines.pages.emva_plots import drawings
+from faintfield.pipelines.pages.page import template
+
+EMVA_PAGE = "emva1288_report.html"
+
+# Groups of rows: name, symbol, words, unit, factor to it.
+_TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
+    (
+        "Sensitivity",
+        (
+            ("quantum_efficiency", "η", "quantum efficiency", "%", 100.0),
+            ("gain_dn_per_e", "K", "system gain", "DN/e⁻", 1.0),
+            ("responsivity_dn_per_photon", "R", "responsivity", "DN/photon", 1.0),
+        ),
+    ),
+    (
+        "Temporal dark noise",
+        (
+            ("read_noise_e", "σ_d(0)", "at zero exposure", "e⁻", 1.0),
+            ("dark_noise_e", "σ_d", "at the exposure stated above", "e⁻", 1.0),
+            ("read_noise_dn", "K σ_d(0)", "at zero exposure, without rounding", "DN", 1.0),
+        ),
+    ),
+    (
+        "Range",
+        (
+            ("threshold_photons", "μ_p.min", "absolute sensitivity threshold", "photons", 1.0),
+            ("threshold_e", "μ_e.min", "absolute sensitivity threshold", "e⁻", 1.0),
+            ("saturation_photons", "μ_p.sat", "saturation capacity", "photons", 1.0),
+            ("saturation_e", "μ_e.sat", "saturation capacity", "e⁻", 1.0),
+            ("snr_max", "SNR_max", "largest signal-to-noise ratio", "", 1.0),
+            ("dynamic_range", "DR", "dynamic range", "", 1.0),
+        ),
+    ),
+    (
+        "Nonuniformity",
+        (
+            ("dsnu_total_e", "DSNU", "dark signal, all", "e⁻", 1.0),
+            ("dsnu_row_e", "DSNU.row", "its row part", "e⁻", 1.0),
+            ("dsnu_column_e", "DSNU.col", "its column part", "e⁻", 1.0),
+            ("dsnu_pixel_e", "DSNU.pixel", "its pixel part", "e⁻", 1.0),
+            ("prnu_total", "PRNU", "response to light, all", "%", 100.0),
+            ("prnu_row", "PRNU.row", "its row part", "%", 100.0),
+            ("prnu_column", "PRNU.col", "its column part", "%", 100.0),
+            ("prnu_pixel", "PRNU.pixel", "its pixel part", "%", 100.0),
+        ),
+    ),
+    ("Linearity", (("linearity_error", "LE", "mean absolute deviation, 5 to 95 % of saturation", "%", 100.0),)),
+    (
+        "Dark current",
+        (
+            ("dark_current_e_per_s", "μ_I", "dark current", "e⁻/s", 1.0),
+            ("dark_current_doubling_k", "T_d", "temperature difference that doubles it", "K", 1.0),
+        ),
+    ),
+)
+
+# Ratios that are given in decibels and bits too.
+_RATIOS = ("snr_max", "dynamic_range")
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of the table: symbol, words, value, interval, unit; or, in `why`, the reason for no value."""
+
+    symbol: str
+    words: str
+    value: str = ""
+    interval: str = ""
+    unit: str = ""
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of the page about one phase of the mosaic."""
+
+    name: str
+    measured: EmvaMeasurement
+    groups: list[tuple[str, list[Line]]]
+    drawings: list[Drawing]
+
+
+def emva_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
+    """Return the page about a sensor, with one part for each phase of its mosaic."""
+    parts = [Part(one.name, one, table_of(one), drawings(one)) for one in measured]
+    return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD)
+
+
+def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
+    """Return the table in groups; a reason that holds for several quantities is given once."""
+    known = {**measured.calibration.estimates, **measured.estimates}
+    told: dict[str, str] = {}
+    groups = []
+    for title, rows in _TABLE:
+        lines = [_line(known[key], symbol, words, unit, factor, told) for key, symbol, words, unit, factor in rows]
+        for key, symbol, words, _, _ in rows:
+            if key in _RATIOS and known[key].value is not None:
+                lines += [_ratio_line(known[key], symbol, words, *way) for way in _WAYS]
+        groups.append((title, lines))
+    return groups
+
+
+def _decibels(ratio: float) -> float:
+    """Return a ratio in decibels."""
+    return float(20 * np.log10(ratio))
+
+
+def _bits(ratio: float) -> float:
+    """Return a ratio in bits."""
+    return float(np.log2(ratio))
+
+
+_WAYS: tuple[tuple[str, Callable[[float], float]], ...] = (("dB", _decibels), ("bit", _bits))
+
+
+def _ratio_line(known: Estimate, symbol: str, words: str, unit: str, of: Callable[[float], float]) -> Line:
+    """Return a line of a ratio on a logarithmic scale."""
+    assert known.value is not None
+    assert known.ci95 is not None
+    low, high = (of(end) for end in known.ci95)
+    value, interval = rounded(of(known.value), (low, high))
+    return Line(f"{symbol}.{unit}", words, value, interval, unit)
+
+
+def _line(known: Estimate, symbol: str, words: str, unit: str, factor: float, told: dict[str, str]) -> Line:
+    """Return a line of the table."""
+    if known.value is None:
+        why = known.why or "no reason stated"
+        first = told.setdefault(why, symbol)
+        return Line(symbol, words, why=why if first == symbol else f"as for {first}")
+    ends = None if known.ci95 is None else (known.ci95[0] * factor, known.ci95[1] * factor)
+    value, interval = rounded(known.value * factor, ends)
+    return Line(symbol, words, value, interval, unit)
+
+
+def rounded(value: float, ends: tuple[float, float] | None) -> tuple[str, str]:
+    """Return a value and its interval as text, with two digits of half the interval's width."""
+    if ends is None:
+        return f"{value:.4g}".replace("-", "−"), ""
+    half = (ends[1] - ends[0]) / 2
+    scale = half if half > 0 else 1e-4 * abs(value) or 1.0
+    digits = int(np.clip(1 - np.floor(np.log10(scale)), 0, 8))
+    low, at, high = (f"{number:.{digits}f}".replace("-", "−") for number in (ends[0], value, ends[1]))
+    return at, f"{low} … {high}"

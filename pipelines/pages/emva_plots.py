@@ -1,0 +1,237 @@
+"""The drawings of the report by EMVA 1288: transfer of light, SNR, dark current, and how pixels differ."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise import Series
+from faintfield.calib.noise.emva import ROUNDING_DN2, snr
+from faintfield.calib.noise.response import known_light
+from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
+from faintfield.pipelines.pages.emva_drawing import MEASURED, MODEL, SECOND, Drawing, drawn
+from faintfield.pipelines.pages.emva_images import image_drawings
+from faintfield.pipelines.pages.page import INK
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_NO_FLATS = "there are no flats"
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Mean and variance of the flats or darks of a measurement, arrays (series,), dark ones first by brightness.
+
+    `signal_dn` is above the dark of zero exposure; `kept` tells which series are within the range of the sensor.
+    """
+
+    signal_dn: NDArray[np.float64]
+    variance_dn2: NDArray[np.float64]
+    error_dn2: NDArray[np.float64]
+    exposure_s: NDArray[np.float64]
+    photons: NDArray[np.float64]
+    kept: NDArray[np.bool_]
+
+
+def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
+    """Return the levels of all series of a kind; the variance of one that has a single frame is NaN."""
+    series = sorted((one for one in measured.series if one.conditions.kind == kind), key=lambda it: it.levels_dn.mean())
+    calibration, used = measured.calibration, measured.used
+    offset = calibration.estimates["offset_dn"].value or 0.0
+    kept = {id(one) for one in calibration.saturation.kept}
+    share = max(used.sum() - sum(used.shape) + 1, 1) / max(used.sum(), 1)
+    freedom = np.array([max((one.frames - 1) * used.sum() * share, 1) for one in series])
+    variance = np.array([_variance(one, used, share) for one in series])
+    return Levels(
+        signal_dn=np.array([one.levels_dn.mean() - offset for one in series]),
+        variance_dn2=variance,
+        error_dn2=variance * np.sqrt(2 / freedom),
+        exposure_s=np.array([one.conditions.exposure_s for one in series]),
+        photons=np.array([one.conditions.photons or np.nan for one in series]),
+        kept=np.array([kind == "dark" or id(one) in kept for one in series], bool),
+    )
+
+
+def _variance(one: Series, used: NDArray[np.bool_], share: float) -> float:
+    """Return the temporal variance of a pixel."""
+    return float(one.within_dn2.mean(where=used)) / ((one.frames - 1) * share) if one.frames > 1 else float("nan")
+
+
+def drawings(measured: EmvaMeasurement) -> list[Drawing]:
+    """Return the drawings of one phase, in the order of the standard's report."""
+    return [
+        _photon_transfer(measured),
+        _sensitivity(measured),
+        _linearity(measured),
+        _snr(measured),
+        _dark_signal(measured),
+        *image_drawings(measured),
+    ]
+
+
+def _photon_transfer(measured: EmvaMeasurement) -> Drawing:
+    """Draw the variance less that of the dark against the signal, with the line of the gain."""
+    title, flats = "Photon transfer", levels_of(measured, "flat")
+    if not flats.signal_dn.size:
+        return Drawing(title, "", missing=_NO_FLATS)
+    estimates = measured.calibration.estimates
+    gain, read_dn = estimates["gain_dn_per_e"].value, estimates["read_noise_dn"].value or 0.0
+
+    def draw(axes: "Axes") -> None:
+        for these, colour, mark, label in (
+            (flats.kept, MEASURED, "o", "flats, ± 2 s.e."),
+            (~flats.kept, SECOND, "x", "left out"),
+        ):
+            if these.any():
+                excess = flats.variance_dn2[these] - read_dn**2 - ROUNDING_DN2
+                error = 2 * flats.error_dn2[these]
+                axes.errorbar(flats.signal_dn[these], excess, error, fmt=mark, ms=4, color=colour, label=label)
+        if gain is not None:
+            _draw_model_variance(axes, measured, float(np.max(flats.signal_dn, initial=1.0)), gain)
+        axes.set(xlabel="μ_y − μ_y.dark (DN)", ylabel="σ_y² − σ_y.dark² (DN²)")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+
+    caption = "Its slope at the origin is the gain K. The dark is that of zero exposure."
+    return drawn(title, caption, draw)
+
+
+def _draw_model_variance(axes: "Axes", measured: EmvaMeasurement, brightest_dn: float, gain: float) -> None:
+    """Draw the variance that the gain and the bend of the response predict."""
+    level = measured.calibration.saturation.level_dn
+    offset = measured.calibration.estimates["offset_dn"].value or 0.0
+    signal = np.linspace(0, brightest_dn if level is None else min(brightest_dn, level - offset), 200)
+    axes.plot(signal, gain * _charge_dn(measured, signal) * _slope(measured, signal) ** 2, color=MODEL, label="model")
+
+
+def _charge_dn(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return K times the charge behind a signal."""
+    response = measured.calibration.response
+    return signal_dn if response is None else response.charge_dn(signal_dn)
+
+
+def _slope(measured: EmvaMeasurement, signal_dn: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the growth of the signal with K times the charge, 1 without a bend."""
+    step = 1e-3 * float(np.abs(signal_dn).max(initial=1.0))
+    grown = _charge_dn(measured, signal_dn + step) - _charge_dn(measured, signal_dn - step)
+    return np.asarray(2 * step / np.maximum(grown, 1e-9))
+
+
+def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64], str, str] | None:
+    """Return the light of the flats with its name and unit, None if it is not known up to one factor."""
+    if flats.photons.size and np.isfinite(flats.photons).all():
+        return flats.photons, "μ_p", "photons/pixel"
+    series = [one for one in measured.series if one.conditions.kind == "flat"]
+    if series and len({one.conditions.level for one in series}) == 1 and (known_light(series).group >= 0).all():
+        return flats.exposure_s, "exposure", "s"
+    return None
+
+
+def _sensitivity(measured: EmvaMeasurement) -> Drawing:
+    """Draw the signal against photons or exposure."""
+    title, flats = "Sensitivity", levels_of(measured, "flat")
+    light = _light(measured, flats)
+    if light is None:
+        why = "neither photons nor several exposures of one light are stated" if flats.signal_dn.size else _NO_FLATS
+        return Drawing(title, "", missing=why)
+    amount, name, unit = light
+    slope = measured.estimates["responsivity_dn_per_photon"].value if unit != "s" else None
+
+    def draw(axes: "Axes") -> None:
+        axes.plot(amount[flats.kept], flats.signal_dn[flats.kept], "o", ms=4, color=MEASURED, label="flats")
+        if not flats.kept.all():
+            axes.plot(amount[~flats.kept], flats.signal_dn[~flats.kept], "x", ms=5, color=SECOND, label="left out")
+        if slope is not None:
+            ends = np.array([0.0, float(amount[flats.kept].max(initial=0.0))])
+            axes.plot(ends, slope * ends, color=MODEL, label="R μ_p, R = K η")
+        axes.set(xlabel=f"{name} ({unit})", ylabel="μ_y − μ_y.dark (DN)")
+        axes.set_xlim(left=0)
+        axes.set_ylim(bottom=0)
+
+    return drawn(title, "The slope at the origin is the responsivity R.", draw)
+
+
+def _linearity(measured: EmvaMeasurement) -> Drawing:
+    """Draw the relative deviation of the signal from the straight line of EMVA 1288."""
+    title, flats = "Deviation from linearity", levels_of(measured, "flat")
+    light = _light(measured, flats)
+    level = measured.calibration.saturation.level_dn
+    if light is None or not flats.kept.any():
+        return Drawing(title, "", missing="the light of the flats is not known" if flats.signal_dn.size else _NO_FLATS)
+    offset = measured.calibration.estimates["offset_dn"].value or 0.0
+    full = float(flats.signal_dn[flats.kept].max()) if level is None else level - offset
+    current = measured.calibration.estimates["dark_signal_dn_per_s"].value or 0.0
+    signal = flats.signal_dn - current * flats.exposure_s
+    inside = flats.kept & (signal > 0.05 * full) & (signal < 0.95 * full)
+    if inside.sum() < 3:
+        return Drawing(title, "", missing="fewer than 3 levels are within 5 to 95 % of saturation")
+    design = np.stack([np.ones(inside.sum()), light[0][inside]], axis=1)
+    line = design @ np.linalg.lstsq(design / signal[inside, None], np.ones(inside.sum()))[0]
+
+    def draw(axes: "Axes") -> None:
+        axes.axhline(0, color=MODEL, lw=1)
+        axes.plot(light[0][inside], 100 * (signal[inside] / line - 1), "o-", ms=4, lw=0.8, color=MEASURED)
+        axes.set(xlabel=f"{light[1]} ({light[2]})", ylabel="deviation (%)")
+
+    caption = (
+        "From the straight line a₀ + a₁ μ_p that minimizes the squares of relative deviations, within 5 to 95 % of "
+    )
+    return drawn(title, caption + "saturation (of the brightest flat, if none is saturated).", draw)
+
+
+def _snr(measured: EmvaMeasurement) -> Drawing:
+    """Draw the SNR against photons, or electrons where the photons are not known."""
+    title, flats = "Signal-to-noise ratio", levels_of(measured, "flat")
+    gain, noise = measured.calibration.estimates["gain_dn_per_e"], measured.estimates["dark_noise_e"]
+    if gain.value is None or noise.value is None:
+        return Drawing(title, "", missing=gain.why)
+    k, sigma_e = gain.value, noise.value
+    efficiency = measured.calibration.estimates["quantum_efficiency"].value
+    name, per_e = ("μ_p (photons/pixel)", 1 / efficiency) if efficiency else ("μ_e (e⁻/pixel)", 1.0)
+    capacity = measured.calibration.estimates["saturation_e"].value
+    seen = flats.kept & np.isfinite(flats.variance_dn2) & (flats.signal_dn > 0)
+    signal = flats.signal_dn[seen]
+    charge = _charge_dn(measured, signal) / k
+    top = capacity or 2 * float(charge.max(initial=1e3))
+
+    def draw(axes: "Axes") -> None:
+        grid = np.geomspace(0.5, top, 300)
+        dsnu, prnu = (measured.estimates[f"{it}"].value for it in ("dsnu_total_e", "prnu_total"))
+        axes.plot(grid * per_e, snr(grid, k, sigma_e), color=MODEL, label="linear model")
+        if dsnu is not None and prnu is not None:
+            total = snr(grid, k, sigma_e, dsnu, prnu)
+            axes.plot(grid * per_e, total, color=MODEL, ls="--", label="total, DSNU and PRNU included")
+        axes.plot(grid * per_e, np.sqrt(grid * per_e), color=SECOND, ls=":", label="ideal sensor")
+        # Errors of the signal are those of the light behind it: the slope of the response carries them over.
+        ratio = charge * k * _slope(measured, signal) / np.sqrt(flats.variance_dn2[seen])
+        axes.plot(charge * per_e, ratio, "o", ms=4, color=MEASURED, label="flats")
+        axes.axhline(1, color=INK, lw=0.6)
+        for at, label in ((measured.estimates["threshold_e"].value, "min"), (capacity, "sat")):
+            if at is not None:
+                axes.axvline(at * per_e, color=INK, lw=0.6, ls="-.")
+                side = {"ha": "right", "xytext": (-3, 3)} if label == "sat" else {"ha": "left", "xytext": (3, 3)}
+                place = (at * per_e, 0.3)
+                axes.annotate(f"{name[:3]}.{label}", place, textcoords="offset points", color=INK, fontsize=9, **side)
+        axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
+        axes.set_ylim(bottom=0.3)
+
+    return drawn(title, "Where SNR = 1 is the absolute sensitivity threshold μ_p.min.", draw)
+
+
+def _dark_signal(measured: EmvaMeasurement) -> Drawing:
+    """Draw the dark signal against the exposure."""
+    title, darks = "Dark current", levels_of(measured, "dark")
+    if np.unique(darks.exposure_s).size < 2:
+        return Drawing(title, "", missing="all darks have one exposure")
+    slope = measured.calibration.estimates["dark_signal_dn_per_s"].value
+
+    def draw(axes: "Axes") -> None:
+        axes.plot(darks.exposure_s, darks.signal_dn, "o", ms=4, color=MEASURED, label="darks")
+        if slope is not None:
+            ends = np.array([0.0, darks.exposure_s.max()])
+            axes.plot(ends, slope * ends, color=MODEL, label="K μ_I t")
+        axes.set(xlabel="exposure (s)", ylabel="μ_y.dark − μ_y.dark(0) (DN)")
+
+    return drawn(title, "The slope over K is the dark current μ_I.", draw)

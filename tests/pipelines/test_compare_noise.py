@@ -1,0 +1,183 @@
+"""`faintfield noise --compare`: a camera that is as it was, one that has changed, and one that is another."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
+from faintfield.pipelines.formats.files import sha256, write_record
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, NoiseRecord, read_noise
+from faintfield.pipelines.formats.results.noise_fit import Measured
+from tests.calib.noise.darkroom import Chip, specimen
+from tests.pipelines.noise_sets import take_set, write_frames
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def measure(folder: Path, chip: Chip, seed: int, **settings: Any) -> Path:
+    rng = np.random.default_rng(seed)
+    noise(write_frames(folder, take_set(chip, rng, photons=(4000.0, 20000.0)), **settings))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    chip, _ = specimen(1, prnu=0.01, hot_fraction=0.005)
+    return measure(tmp_path_factory.mktemp("before"), chip, 10)
+
+
+def altered(source: Path, folder: Path, **changes: Any) -> Path:
+    """A copy of a result with some of its record changed, and its maps."""
+    folder.mkdir()
+    (folder / NOISE_MAPS).write_bytes((source / NOISE_MAPS).read_bytes())
+    write_record(folder / NOISE_FILE, msgspec.structs.replace(read_noise(source / NOISE_FILE), **changes))
+    return folder
+
+
+def test_a_camera_that_is_as_it_was_has_not_changed(before: Path, tmp_path: Path) -> None:
+    chip, _ = specimen(1, prnu=0.01, hot_fraction=0.005)
+    found = noise(compare=(before, measure(tmp_path, chip, 11)))
+    assert found.changed == []
+    assert found.comparisons > 15
+    sigmas = [abs(it.sigma) for it in found.quantities if it.sigma is not None]
+    assert np.mean(np.array(sigmas) < 1.96) > 0.8
+    (offsets,) = found.maps
+    assert offsets.rms_dn == pytest.approx(offsets.expected_dn, rel=0.1)
+    hot = found.pixels[0]
+    assert hot.kind == "hot"
+    assert hot.both > 10
+    assert hot.only_first + hot.only_second <= 3
+
+
+def test_each_change_is_found_and_nothing_else(before: Path, tmp_path: Path) -> None:
+    """Another gain, offsets that have moved, and new hot pixels."""
+    chip, _ = specimen(1, prnu=0.01, hot_fraction=0.005, gain_dn_per_e=2.1)
+    chip.offset_dn[:32] += np.random.default_rng(5).normal(0, 3, (32, 64))
+    chip.dark_current_e_per_s[10, 10:20] += 20
+    found = noise(compare=(before / NOISE_FILE, measure(tmp_path, chip, 12)))
+    assert {"gain_dn_per_e", "offset_dn map"} <= set(found.changed)
+    (offsets,) = found.maps
+    assert offsets.verdict == "changed"
+    assert offsets.rms_dn == pytest.approx(np.hypot(offsets.expected_dn or 0, 3 / np.sqrt(2)), rel=0.1)
+    assert found.pixels[0].only_second >= 9
+    assert not {"prnu", "quantum_efficiency", "read_noise_e"} & set(found.changed)
+
+
+def test_sigma_is_the_difference_over_both_errors(before: Path, tmp_path: Path) -> None:
+    record = read_noise(before / NOISE_FILE)
+    gain = record.gain_dn_per_e
+    assert gain.value is not None
+    assert gain.ci95 is not None
+    (low, high), shift = gain.ci95, 0.1
+    moved = Measured(gain.value + shift, gain.se, (low + shift, high + shift))
+    later = altered(before, tmp_path / "later", gain_dn_per_e=moved)
+    found = {it.name: it for it in noise(compare=(before, later)).quantities}["gain_dn_per_e"]
+    expected = shift / (np.hypot(high - gain.value, gain.value - low) / 1.959964)
+    assert found.sigma == pytest.approx(expected, rel=1e-5)
+    assert found.difference == pytest.approx(shift)
+    assert {it.name: it for it in noise(compare=(later, before)).quantities}["gain_dn_per_e"].sigma == pytest.approx(
+        -expected, rel=1e-5
+    )
+
+
+def test_the_limit_grows_with_the_number_of_comparisons(before: Path) -> None:
+    """With m comparisons at 5 % together, each has 5 %/m: two-sided, by Bonferroni."""
+    from scipy import stats
+
+    found = noise(compare=(before, before))
+    assert found.limit_sigma == pytest.approx(stats.norm.isf(0.025 / found.comparisons))
+    known = [it for it in found.quantities if it.sigma is not None]
+    assert found.comparisons == len(known) + len(found.maps)
+    assert {it.sigma for it in known} == {0}
+
+
+def test_reasons_for_missing_values_are_told_for_each(
+    before: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    later = altered(
+        before, tmp_path / "later", gain_dn_per_e=Measured(None, why="too few electrons"), fit=msgspec.UNSET
+    )
+    assert run(["noise", "--compare", str(before), str(later), "--json"]) == 0
+    out, err = capfd.readouterr()
+    found = {it["name"]: it for it in json.loads(out)["quantities"]}
+    assert found["gain_dn_per_e"]["verdict"] == "not comparable"
+    assert found["gain_dn_per_e"]["why"] == "B: too few electrons"
+    assert "A: no series of flats reaches" in found["saturation_e"]["why"]
+    assert "B: not in this file: it is of an older version" in found["saturation_e"]["why"]
+    assert "not comparable: B: too few electrons" in err
+    assert "changed: nothing" in err
+
+
+def of_a_mosaic(folder: Path, seed: int, **changes: Any) -> Path:
+    """The golden record of a mosaic with a map of random offsets, and the second green changed."""
+    golden = msgspec.json.decode((GOLDEN / "noise_of_a_mosaic.json").read_bytes(), type=NoiseRecord)
+    assert golden.size_px is not None
+    assert golden.planes
+    planes = [msgspec.structs.replace(it, **changes) if it.phase == (1, 0) else it for it in golden.planes]
+    shape = golden.size_px[::-1]
+    folder.mkdir()
+    offset = (
+        100 + np.random.default_rng(1).standard_normal(shape) + 0.1 * np.random.default_rng(seed).normal(size=shape)
+    )
+    offset[1::2, 0::2] += 50 * (seed - 1)
+    variance, mask = np.full(shape, 0.01), np.zeros(shape, bool)
+    np.savez(folder / NOISE_MAPS, offset_dn=offset, offset_variance_dn2=variance, mask=mask)
+    record = msgspec.structs.replace(golden, planes=planes, maps_sha256=sha256(folder / NOISE_MAPS))
+    write_record(folder / NOISE_FILE, record)
+    return folder
+
+
+def test_planes_of_a_mosaic_are_compared_one_by_one(tmp_path: Path) -> None:
+    """A step of one plane's offsets is no change of its map."""
+    first = of_a_mosaic(tmp_path / "a", 1)
+    moved = of_a_mosaic(tmp_path / "b", 2, offset_dn=Measured(500.0, 0.1, (499.8, 500.2)))
+    found = noise(compare=(first, moved))
+    assert found.changed == ["G_r1c0: offset_dn"]
+    assert [it.plane for it in found.maps] == ["R_r0c0", "G_r0c1", "G_r1c0", "B_r1c1"]
+    assert {it.verdict for it in found.maps} == {"unchanged"}
+    assert [it.rms_dn for it in found.maps] == pytest.approx([np.hypot(0.1, 0.1)] * 4, rel=0.1)
+
+
+def test_other_cameras_are_refused_by_name(before: Path, tmp_path: Path) -> None:
+    wide = altered(before, tmp_path / "wide", size_px=(128, 64))
+    with pytest.raises(WrongSize, match=r"wide.*128 x 64 px.*64 x 64 px"):
+        noise(compare=(before, wide))
+    coloured = altered(before, tmp_path / "coloured", mosaic=("RG", "GB"))
+    with pytest.raises(BadValue, match=r"coloured.*colour filters RG/GB.*none"):
+        noise(compare=(before, coloured))
+    with pytest.raises(MissingFile):
+        noise(compare=(before, tmp_path / "nowhere"))
+
+
+def test_maps_that_are_missing_or_of_another_record_are_named(before: Path, tmp_path: Path) -> None:
+    bare = altered(before, tmp_path / "bare")
+    (bare / NOISE_MAPS).unlink()
+    (offsets,) = noise(compare=(before, bare)).maps
+    assert offsets.verdict == "not comparable"
+    assert (offsets.why or "").startswith("B: no offset map")
+    with pytest.raises(BadValue, match=NOISE_MAPS):
+        noise(compare=(before, altered(before, tmp_path / "other", maps_sha256=sha256(before / NOISE_FILE))))
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["folder", "--compare", "a", "b"], ["--compare", "a", "b", "--out", "c"], ["--compare", "a"]]
+)
+def test_neither_both_nor_half_is_a_usage_error(arguments: list[str]) -> None:
+    assert run(["noise", *arguments]) == 2
+
+
+def test_records_by_hand_compare_as_far_as_they_go(tmp_path: Path) -> None:
+    """Numbers without intervals, and an efficiency that is one number."""
+    text = {"offset_dn": {"value": 1}, "gain_dn_per_e": {"value": 2}, "read_noise_e": {"value": 3}}
+    text |= {"dark_current_e_per_s": {"value": 0}, "quantum_efficiency": 0.5}  # type: ignore[dict-item]
+    (tmp_path / NOISE_FILE).write_text(json.dumps(text))
+    found = noise(compare=(tmp_path, tmp_path))
+    assert isinstance(msgspec.json.decode((tmp_path / NOISE_FILE).read_bytes(), type=NoiseRecord), NoiseRecord)
+    assert found.comparisons == 0
+    assert {it.verdict for it in found.quantities} == {"not comparable"}
