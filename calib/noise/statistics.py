@@ -88,6 +88,8 @@ class Series:
         Mean over the frames of each pixel minus level and profiles.
     within_dn2 : array (row, column), float32
         Sum over the frames of the squared deviations from `pattern_dn`.
+    cubes_dn3, fourths_dn4 : array (row, column), float32
+        Likewise of their third and fourth powers; of one zero for flats.
     suspect : array (row, column), bool
         Pixels left out of levels and profiles.
     sample_dn : array (frame, pixel), int32
@@ -112,6 +114,8 @@ class Series:
     column_noise_dn2: float
     pattern_dn: NDArray[np.float32]
     within_dn2: NDArray[np.float32]
+    cubes_dn3: NDArray[np.float32]
+    fourths_dn4: NDArray[np.float32]
     suspect: NDArray[np.bool_]
     sample_dn: NDArray[np.int32]
     floor_dn: int
@@ -184,6 +188,8 @@ class SeriesSums:
         self._column_count = np.maximum(self._regular.sum(0), 1)
         self._sampled = sample_index(first_dn.shape)
         self._pattern, self._squares = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
+        if self.conditions.kind == "dark":
+            self._cubes, self._fourths = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
 
     def _add_residual(self, residual_dn: NDArray[np.float64]) -> tuple[Any, ...]:
         """Subtract level, row and column means from a frame, in place, and add the rest to the sums.
@@ -197,9 +203,15 @@ class SeriesSums:
         columns = residual_dn.sum(0, where=self._regular) / self._column_count
         residual_dn -= columns
         self._pattern += residual_dn
-        residual_dn *= residual_dn
-        self._squares += residual_dn
-        return level, rows, columns, residual_dn.mean(where=self._regular)
+        square = residual_dn * residual_dn
+        self._squares += square
+        spread = square.mean(where=self._regular)
+        if self.conditions.kind == "dark":
+            residual_dn *= square
+            self._cubes += residual_dn
+            square *= square
+            self._fourths += square
+        return level, rows, columns, spread
 
     def _count_top(self, values_dn: NDArray[Any]) -> None:
         """Count the values at the highest one so far, and one below it; the stated end of the range is the highest."""
@@ -210,6 +222,14 @@ class SeriesSums:
         elif top == self._top_dn + 1:
             below += self._at_top
         self._top_dn, self._at_top, self._below_top = top, at, below
+
+    def _higher_powers(self, mean: NDArray[np.float64], frames: int) -> tuple[NDArray[np.float64], ...]:
+        """Return the sums of the third and fourth powers of the deviations from the means (row, column)."""
+        if self.conditions.kind == "flat":
+            return np.zeros((1, 1)), np.zeros((1, 1))
+        cubes = self._cubes - 3 * mean * self._squares + 2 * frames * mean**3
+        fourths = self._fourths - 4 * mean * self._cubes + 6 * mean**2 * self._squares - 3 * frames * mean**4
+        return cubes, fourths
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
@@ -226,6 +246,7 @@ class SeriesSums:
             raise ValueError("a series needs at least one frame, got none")
         mean = self._pattern / frames
         within = np.maximum(self._squares - frames * mean**2, 0.0)
+        cubes, fourths = self._higher_powers(mean, frames)
         names, digests, samples, *per_frame = zip(*self._frames, strict=True)
         levels, rows, columns, spreads_dn2 = map(np.array, per_frame)
         series = Series(
@@ -239,6 +260,8 @@ class SeriesSums:
             column_noise_dn2=float(columns.var(0, ddof=1).mean()) if frames > 1 else 0.0,
             pattern_dn=mean.astype(np.float32),
             within_dn2=within.astype(np.float32),
+            cubes_dn3=cubes.astype(np.float32),
+            fourths_dn4=fourths.astype(np.float32),
             suspect=self._suspect,
             sample_dn=np.array(samples),
             floor_dn=self._floor_dn,
