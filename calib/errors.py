@@ -47,7 +47,7 @@ class LightLeak(BadFrame):
 
 
 class SaturatedFlat(BadFrame):
-    """A flat frame reaches the end of the sensor's range, which clips its noise."""
+    """All flats reach the end of the sensor's range, which clips their noise."""
 
 
 class PoorFit(CalibrationError):

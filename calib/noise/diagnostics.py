@@ -85,8 +85,10 @@ def saturation_warnings(saturation: Saturation) -> list[str]:
     if not saturation.left_out:
         return []
     first, why = saturation.left_out[0]
-    names = ", ".join(dict.fromkeys(str(one.conditions) for one, _ in saturation.left_out))
-    return [f"left out: {names}; {first.names[0]}: {why}"]
+    return [
+        f"{len(saturation.left_out)} series of flats are left out, beginning with the {first.conditions}; "
+        f"{first.names[0]}: {why}"
+    ]
 
 
 def scatter_warnings(fitted: SeriesFit) -> list[str]:

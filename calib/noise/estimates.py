@@ -53,8 +53,9 @@ def estimate_all(
     """
     fit, darks = fitted.fit, fitted.darks
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
-    why_no_gain = _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
-    why_no_gain = why_no_gain or why_noise_denies(fitted)
+    why_no_gain = why_noise_denies(fitted) or _why_no_gain(
+        fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds
+    )
     why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
         "offset_dn": None,

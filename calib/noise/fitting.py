@@ -10,15 +10,12 @@ from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
-from faintfield.calib.errors import NotIdentifiable
 from faintfield.calib.noise.exact import Bent, fit_exact
 from faintfield.calib.noise.gaussian import dark_variances_dn2, flat_variances_dn2
-from faintfield.calib.noise.goodness import fit_with_excess
 from faintfield.calib.noise.marginal import Counts
 from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.moments import Moments, gather_moments
+from faintfield.calib.noise.moments import Moments, gather_moments, rounding_error
 from faintfield.calib.noise.response import (
     BENDS,
     MEASURED_BEND_SE,
@@ -26,6 +23,8 @@ from faintfield.calib.noise.response import (
     bend_range_dn,
     choose_bends,
 )
+from faintfield.calib.noise.scatter import fit_with_excess
+from faintfield.calib.noise.starts import censored_start, gaussian_start
 from faintfield.calib.noise.statistics import Series, sample_index
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
@@ -127,19 +126,29 @@ def fit_series(
     fit, bend, moments = _fit_gaussian(gather_moments(darks, flats, used), darks, flats, used, saturation_dn)
     # Among values cut off at the floor the highest look suspect; leaving them out would bias the fit.
     counts = collect_counts(darks, usable)
-    likelihood = choose_likelihood(counts, fit, _shared_noise_dn2(darks, fit))
+    # The likelihood of single values has no part for what pixels share, be it of a frame or of a series.
+    likelihood = choose_likelihood(counts, fit, _shared_noise_dn2(darks, fit) + moments.excess.drift_dn2)
     gaussian = fit
     if likelihood is not NoiseLikelihood.GAUSSIAN:
         exact = likelihood is NoiseLikelihood.EXACT
         if exact:
             counts = collect_counts(darks, used)
-        start = _gaussian_start(fit) if exact else _censored_start(counts)
+        start = gaussian_start(fit) if exact else censored_start(counts)
         # The Gaussian fit tells whether pixels differ in dark current, unless values are cut off.
         spread = not exact or fit.values.get("dcnu_dn2_per_s2", 0.0) > 3 * fit.standard_error("dcnu_dn2_per_s2")
         fit = fit_exact(counts, start, moments, bent_by(gaussian), exact=exact, try_spread=spread)
         if exact:
             fit = grown_like(gaussian, fit)
+    if flats or likelihood is NoiseLikelihood.GAUSSIAN:
+        fit = with_rounding(fit, max(rounding_error(one, used) for one in darks))
     return SeriesFit(darks, flats, moments, likelihood, fit, bend, used)
+
+
+def with_rounding(fit: NoiseFit, error: float) -> NoiseFit:
+    """Return a fit with the relative error that rounding may make of all darks alike, and what follows from it."""
+    at = list(fit.values).index("log_read_dn2")
+    follows = fit.covariance[at] / fit.covariance[at, at]
+    return replace(fit, covariance=fit.covariance + error**2 * np.outer(follows, follows))
 
 
 def _fit_gaussian(
@@ -242,65 +251,3 @@ def choose_likelihood(counts: Counts, gaussian: NoiseFit, shared_dn2: float) -> 
     if read_dn < _MIN_GAUSSIAN_READ_DN or (telling and read_e < _MIN_GAUSSIAN_READ_E):
         return NoiseLikelihood.EXACT
     return NoiseLikelihood.GAUSSIAN
-
-
-def _gaussian_start(gaussian: NoiseFit) -> dict[str, float]:
-    """Return initial values for the exact likelihood from the Gaussian fit."""
-    values = gaussian.values
-    signal = max(values["dark_signal_dn_per_s"], 1e-6)
-    return {
-        "log_gain": values["log_gain"],
-        "log_read_e": 0.5 * values["log_read_dn2"] - values["log_gain"],
-        "log_dark_e_per_s": float(np.log(signal)) - values["log_gain"],
-        "dcnu": float(np.sqrt(max(values.get("dcnu_dn2_per_s2", 0.0), 0.0)) / signal),
-        "offset_dn": values["offset_dn"],
-        "log_dsnu_dn": 0.5 * float(np.log(max(values["dsnu_dn2"], 1e-2))),
-    }
-
-
-def _censored_start(counts: Counts) -> dict[str, float]:
-    """Return initial values for the censored likelihood from quantiles above the floor.
-
-    Raises
-    ------
-    NotIdentifiable
-        There are no two exposures at which a twentieth of the values is above the black level.
-    """
-    exposure, centre, spread2 = [], [], []
-    for t, values in zip(counts.exposure_s, counts.values_dn, strict=True):
-        normal = _normal_above(values, counts.floor_dn or 0)
-        if normal is not None:
-            exposure.append(t)
-            centre.append(normal[0])
-            spread2.append(normal[1])
-    if len(set(exposure)) < 2:
-        raise NotIdentifiable(
-            f"the darks are cut off at the black level: of {len(counts.exposure_s)} exposures {len(exposure)} have a "
-            "twentieth of their values above it, 2 are needed; raise the camera's black offset and record them again"
-        )
-    slope, offset = np.polyfit(exposure, centre, 1)
-    slope = max(float(slope), 1e-6)
-    excess, both = np.polyfit(exposure, spread2, 1)
-    gain = float(np.clip(excess / slope, 0.05, 50.0))
-    read2 = max(0.7 * float(both), 0.1)
-    return {
-        "log_gain": float(np.log(gain)),
-        "log_read_e": 0.5 * float(np.log(read2)) - float(np.log(gain)),
-        "log_dark_e_per_s": float(np.log(slope / gain)),
-        "dcnu": 0.05,
-        "offset_dn": float(offset),
-        "log_dsnu_dn": 0.5 * float(np.log(max(0.3 * float(both), 0.1))),
-    }
-
-
-def _normal_above(values: NDArray[np.int32], floor_dn: int) -> tuple[float, float] | None:
-    """Return mean and variance of the normal law through two quantiles above the floor, None with too few values."""
-    hidden = float((values == floor_dn).mean())
-    if hidden > 0.95:
-        return None
-    low, high = max(0.5, hidden + 0.2 * (1 - hidden)), max(0.84, hidden + 0.8 * (1 - hidden))
-    # Half a DN of dither smooths the steps of the rounding.
-    dithered = values + np.linspace(-0.5, 0.5, values.size).reshape(values.shape)
-    below, above = np.quantile(dithered, [low, high])
-    sigma = float((above - below) / (ndtri(high) - ndtri(low)))
-    return float(below - sigma * ndtri(low)), sigma**2

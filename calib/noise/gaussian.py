@@ -65,7 +65,8 @@ def flat_log_likelihood(
     for index, v in enumerate(flat_variances_dn2(values, flats.mean_dn)):
         weight = flats.evenness[index]
         degrees = (flats.frames[index] - 1) * freedom * weight
-        grown = excess.dispersion(degrees, flat=True)
+        rounding2 = 0.0 if flats.rounding2 is None else flats.rounding2[index]
+        grown = excess.dispersion(degrees, rounding2, flat=True)
         total -= _chi_squared(degrees / grown, flats.within_dn2[index] * weight / grown, v)
         log_variances.append(ca.log(v))
         half_freedom.append(0.5 * degrees / grown)
@@ -97,7 +98,8 @@ def negative_log_likelihood(values: Mapping[str, Any], moments: Moments) -> Any:
     total = _between(values, dark_v, moments) + _line(values, dark_v, moments)
     for j, v in enumerate(dark_v):
         freedom = (darks.frames[j] - 1) * moments.freedom
-        grown = moments.excess.dispersion(freedom, flat=False)
+        rounding2 = 0.0 if darks.rounding2 is None else darks.rounding2[j]
+        grown = moments.excess.dispersion(freedom, rounding2, flat=False)
         total += _chi_squared(freedom / grown, darks.within_dn2[j] / grown, v)
     return total - _light(values, moments)
 

@@ -6,11 +6,14 @@ from faintfield.calib.noise.result import Estimate
 
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 
+# Largest exponent of an interval's end over its value; nothing beyond is of use.
+_MAX_EXPONENT = 50.0
+
 
 def interval(value: float, se: float, quantile: float, *, positive: bool = False) -> Estimate:
     """Return an estimate with its interval, which is symmetric on a logarithmic scale for positive quantities."""
     if positive:
-        factor = float(np.exp(quantile * se / value))
+        factor = float(np.exp(min(quantile * se / value, _MAX_EXPONENT)))
         return Estimate(value, se, (value / factor, value * factor))
     return Estimate(value, se, (value - quantile * se, value + quantile * se))
 

@@ -7,6 +7,7 @@ from scipy import stats
 from faintfield.calib.noise.drift import lamp_flicker2
 from faintfield.calib.noise.fitting import SeriesFit
 from faintfield.calib.noise.gaussian import level_variances_dn2
+from faintfield.calib.noise.goodness import series_goodness
 from faintfield.calib.noise.intervals import root
 from faintfield.calib.noise.response import BENDS, FittedLevels, charge_dn
 from faintfield.calib.noise.result import Estimate
@@ -26,17 +27,8 @@ _NO_LIGHT = (
 
 def why_noise_denies(fitted: SeriesFit) -> str | None:
     """Return why the noise of the series denies the model, None if it does not; only with flats."""
-    from faintfield.calib.noise.goodness import series_goodness
-
     if not fitted.flats:
         return None
-    scatter = float(np.sqrt(fitted.moments.excess.variance2))
-    if scatter > MAX_NOISE_ERROR:
-        return (
-            f"the noise of the series scatters by {scatter:.1%} in variance about the model (limit "
-            f"{MAX_NOISE_ERROR:.0%}): "
-            "the noise of the camera changed, or the response is not that of one sensor; record all series in one go"
-        )
     series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats, fitted.used)
     for one in series:
         if one.noise_excess is None or one.noise_se is None:
@@ -46,6 +38,13 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
                 f"the noise of the {one.series.conditions} is {one.noise_excess:+.1%} off the model's in variance "
                 f"({abs(one.noise_excess) / one.noise_se:.0f} standard errors); record it again or leave it out"
             )
+    scatter = float(np.sqrt(fitted.moments.excess.variance2))
+    if scatter > MAX_NOISE_ERROR:
+        return (
+            f"the noise of the series scatters by {scatter:.1%} in variance about the model (limit "
+            f"{MAX_NOISE_ERROR:.0%}): "
+            "the noise of the camera changed, or the response is not that of one sensor; record all series in one go"
+        )
     return None
 
 

@@ -34,6 +34,8 @@ class DarkMoments:
         Squared deviations of the frames' mean levels from the series' level, summed over frames.
     scatter_dn2 : array (series, series)
         S, the products of the pixels' patterns in two series, summed over pixels.
+    rounding2 : array (series,), optional
+        Square of the relative error of the noise that rounding may make; see `rounding_error`.
     """
 
     exposure_s: NDArray[np.float64]
@@ -42,6 +44,7 @@ class DarkMoments:
     within_dn2: NDArray[np.float64]
     level_scatter_dn2: NDArray[np.float64]
     scatter_dn2: NDArray[np.float64]
+    rounding2: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class FlatMoments:
         What is known of their light.
     range_dn, bend_se : float
         Signal at the end of the range, and the standard error of the bend there before it is measured.
+    rounding2 : array (series,), optional
+        As for the darks.
     """
 
     frames: NDArray[np.float64]
@@ -72,6 +77,7 @@ class FlatMoments:
     level_scatter_dn2: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     range_dn: float = np.inf
     bend_se: float = np.inf
+    rounding2: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)
@@ -96,9 +102,9 @@ class Excess:
     drift_dn2: float = 0.0
     light2: float = 0.0
 
-    def dispersion(self, freedom: float, *, flat: bool) -> float:
+    def dispersion(self, freedom: float, rounding2: float, *, flat: bool) -> float:
         """Return the variance of a sum of squares over that of χ² with `freedom` degrees of freedom."""
-        return (self.flats if flat else self.darks) + 0.5 * freedom * self.variance2
+        return (self.flats if flat else self.darks) + 0.5 * freedom * (self.variance2 + rounding2)
 
 
 NO_EXCESS = Excess()
@@ -139,6 +145,7 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
             within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in darks]),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
             scatter_dn2=patterns @ patterns.T,
+            rounding2=np.array([rounding_error(series, used) ** 2 for series in darks]),
         ),
         flats=FlatMoments(
             frames=np.array([series.frames for series in flats], np.float64),
@@ -148,8 +155,25 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
             exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
             light=known_light(flats),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in flats]),
+            rounding2=np.array([rounding_error(series, used) ** 2 for series in flats]),
         ),
     )
+
+
+def rounding_error(series: Series, used: NDArray[np.bool_]) -> float:
+    """Return how far the noise of a series may be off by rounding, relative to it.
+
+    Rounding adds 1/12 DN² to a variance σ² on average over the phase of the mean. At one phase the sum is off by up to
+    (1 + 4π²σ²) exp(−2π²σ²)/π² (Widrow, Kollár and Liu, IEEE Trans. Instrum. Meas. 45, 353, 1996), which means that
+    differ from pixel to pixel average.
+    """
+    if series.frames < 2:
+        return 0.0
+    total = float(series.within_dn2.mean(where=used)) / (series.frames - 1)
+    noise = max(total - 1 / 12, 0.0)
+    pattern = max(float(series.pattern_dn.var(where=used)) - total / series.frames, 0.0)
+    cosine = (1 + 4 * np.pi**2 * noise) * np.exp(-2 * np.pi**2 * (noise + pattern)) / np.pi**2
+    return float(cosine / max(total, 1e-6))
 
 
 def _mean_dn(series: Series, used: NDArray[np.bool_]) -> float:

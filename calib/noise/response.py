@@ -32,7 +32,7 @@ MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.01
 # Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
 _RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
 
-# A light must span this factor to show a bend; so many levels beyond the scales of the light give 1, 2, 3, 4 coefficients.
+# A light must span this factor to show a bend; so many levels beyond its scales give 1, 2, 3, 4 coefficients.
 _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
 
 # A further coefficient is fitted if the levels scatter less with it by an F test of this probability.

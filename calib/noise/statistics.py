@@ -13,17 +13,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak
+from faintfield.calib.noise.outliers import outlier
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
 _SUSPECT_SIGMA = 8.0
 
-# A dark has seen light if it is brighter than its series by the first multiple of the pixel noise, or by the second one
-# if jitter of the black level does that with less than this probability.
-_CERTAIN_LEAK, _MIN_LEAK, _MAX_CHANCE = 5.0, 0.25, 1e-7
+# A dark has seen light if brighter than its series by the first multiple of the noise, or by the second beyond chance.
+_CERTAIN_LEAK, _MIN_LEAK = 5.0, 0.25
 
 # A dark has another pattern if its variance exceeds that of its series by these fractions, likewise.
 _CERTAIN_EXCESS, _MIN_EXCESS = 1.0, 0.2
@@ -241,8 +240,7 @@ class SeriesSums:
         ValueError
             No frame was given.
         """
-        frames = len(self._frames)
-        if not frames:
+        if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
         mean = self._pattern / frames
         within = np.maximum(self._squares - frames * mean**2, 0.0)
@@ -310,33 +308,16 @@ def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
     if series.conditions.kind != "dark" or series.frames < 2:
         return
     noise_dn = float(np.sqrt(np.median(series.within_dn2) / (series.frames - 1)))
-    worst, excess_dn = _outlier(series.levels_dn, _MIN_LEAK * noise_dn, _CERTAIN_LEAK * noise_dn)
+    worst, excess_dn = outlier(series.levels_dn, _MIN_LEAK * noise_dn, _CERTAIN_LEAK * noise_dn)
     if excess_dn > 0:
         raise LightLeak(
             f"{series.names[worst]}: mean {series.levels_dn[worst]:.1f} DN, {excess_dn:.1f} DN above the other "
             f"{series.conditions} (their pixels are {noise_dn:.1f} DN rms noisy): light leaked in; cover the lens and "
             "record it again, or leave it out"
         )
-    odd, excess = _outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
+    odd, excess = outlier(spreads_dn2 / np.median(spreads_dn2), _MIN_EXCESS, _CERTAIN_EXCESS)
     if excess > 0:
         raise BadFrame(
             f"{series.names[odd]}: its pixels spread {np.sqrt(1 + excess):.2f} times as far as in the other "
             f"{series.conditions}: light leaked in or the readout failed; record it again, or leave it out"
         )
-
-
-def _outlier(values: NDArray[np.float64], min_excess: float, certain_excess: float) -> tuple[int, float]:
-    """Return the index of the largest value, and its excess over the mean of the others; 0 if it can be chance.
-
-    An excess above `certain_excess` always counts. One above `min_excess` counts if its probability, by Student's t
-    from the scatter of the others, is below `_MAX_CHANCE`.
-    """
-    largest = int(values.argmax())
-    others = np.delete(values, largest)
-    excess = float(values[largest] - others.mean())
-    if excess > certain_excess:
-        return largest, excess
-    if excess < min_excess or others.size < 2:
-        return largest, 0.0
-    t = excess / max(float(others.std(ddof=1)) * np.sqrt(1 + 1 / others.size), 1e-12)
-    return largest, excess if stats.t.sf(t, others.size - 1) < _MAX_CHANCE else 0.0

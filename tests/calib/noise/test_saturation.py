@@ -73,7 +73,10 @@ def test_the_capacity_is_the_charge_at_the_end() -> None:
     assert capacity.ci95[0] < (4095 - OFFSET_DN) / GAIN < capacity.ci95[1]
     assert capacity.value == pytest.approx((4095 - OFFSET_DN) / GAIN, rel=0.03)
     assert adc.noise_model().saturation_dn == 4095.0
-    assert any("left out: flats of 0.1 s at level 6" in warning for warning in adc.warnings)
+    assert any(
+        "1 series of flats are left out, beginning with the flats of 0.1 s at level 6" in warning
+        for warning in adc.warnings
+    )
     wells = [500.0, 1000.0, 2000.0, 3000.0, 4000.0, 4500.0, 5000.0, 5500.0]
     well = calibrate([*DARKS, *take(wells, well_e=5000.0)], 4095.0)
     capacity = well.estimates["saturation_e"]

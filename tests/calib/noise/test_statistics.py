@@ -9,7 +9,7 @@ from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise import Conditions, measure_series
-from faintfield.calib.noise.statistics import _MAX_CHANCE, _outlier
+from faintfield.calib.noise.outliers import MAX_CHANCE, outlier
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 DARK = Conditions("dark", 1.0)
@@ -99,12 +99,12 @@ def test_a_value_is_odd_whose_distance_from_the_others_is_no_chance_by_students_
     others = np.array([-1.2, 0.3, 1.4, -0.5, 0.2, -0.9, 0.7])
     others -= others.mean()
     # A new value differs from the mean of n others by σ √(1 + 1/n)
-    just = stats.t.isf(_MAX_CHANCE, 6) * others.std(ddof=1) * np.sqrt(1 + 1 / 7)
+    just = stats.t.isf(MAX_CHANCE, 6) * others.std(ddof=1) * np.sqrt(1 + 1 / 7)
     for factor, odd in ((0.98, False), (1.02, True)):
         values = np.insert(others, 3, factor * just)
-        index, excess = _outlier(values, 0.1, 1e9)
+        index, excess = outlier(values, 0.1, 1e9)
         assert index == 3
         assert excess == pytest.approx(factor * just if odd else 0.0)
-    assert _outlier(np.insert(others, 0, 1.02 * just), 1.03 * just, 1e9) == (0, 0.0), "too little to matter"
-    assert _outlier(np.insert(others, 0, 0.9 * just), 0.1, 0.8 * just)[1] == pytest.approx(0.9 * just), "certain"
-    assert _outlier(np.array([0.0, 5.0]), 0.1, 10.0) == (1, 0.0), "one other value has no scatter"
+    assert outlier(np.insert(others, 0, 1.02 * just), 1.03 * just, 1e9) == (0, 0.0), "too little to matter"
+    assert outlier(np.insert(others, 0, 0.9 * just), 0.1, 0.8 * just)[1] == pytest.approx(0.9 * just), "certain"
+    assert outlier(np.array([0.0, 5.0]), 0.1, 10.0) == (1, 0.0), "one other value has no scatter"
