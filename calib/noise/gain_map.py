@@ -25,8 +25,8 @@ from faintfield.calib.noise.statistics import Series
 
 type Array = NDArray[np.float64]
 
-# Standard errors from which a share or a scatter is real, up to which a share counts as 1, and at which a pixel is cut.
-_MIN_SIGMA, _ONE_SIGMA, _CLIP_SIGMA = 4.0, 2.0, 5.0
+# Standard errors from which a share is real, and a scatter; up to which a share counts as 1; at which a pixel is cut.
+_MIN_SIGMA, _MIN_SCATTER_SIGMA, _ONE_SIGMA, _CLIP_SIGMA = 3.0, 4.0, 2.0, 5.0
 
 # Differences between regions that matter, as a fraction of the gain.
 _MIN_SEAM = 2e-3
@@ -145,14 +145,14 @@ def _scatter(rest: Array, information: Array, usable: NDArray[np.bool_]) -> tupl
     chance = float(np.mean(1 / information[usable]))
     se = chance * float(np.sqrt(2 / usable.sum()))
     excess = float(np.var(rest[usable])) - chance
-    return (excess if excess > _MIN_SIGMA * se else 0.0), se
+    return (excess if excess > _MIN_SCATTER_SIGMA * se else 0.0), se
 
 
 def _why(information: Array, response: Response, share_se: float, scatter_se: float) -> str:
     """Return why pixels have no gain of their own, and what to record."""
     found = (
         f"photon transfer tells the gain of one pixel to ±{np.mean(information) ** -0.5:.0%}, and nothing shows that "
-        f"gains differ; differences of {np.sqrt(_MIN_SIGMA * scatter_se):.1%} would show"
+        f"gains differ; differences of {np.sqrt(_MIN_SCATTER_SIGMA * scatter_se):.1%} would show"
     )
     if not np.isfinite(share_se) or _MIN_SIGMA * share_se < 1:
         return found

@@ -32,8 +32,8 @@ _TAIL = 0.01
 # Pixels whose variances differ by less than this share a bin while the population is learnt, by so many EM steps.
 _BIN, _EM_STEPS = 0.01, 200
 
-# Pixels that are worked on at once.
-_CHUNK_PX = 1 << 15
+# Pixels without bins from which the population is learnt, and pixels that are worked on at once.
+_SAMPLE_PX, _CHUNK_PX = 6000, 1 << 15
 
 # Robust standard deviations beyond which a pixel says no more about its row or column.
 _CLIP_SIGMA = 3.0
@@ -106,9 +106,13 @@ def _measure(
     darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Array, usable: NDArray[np.bool_]
 ) -> PixelReadNoise:
     """Return the posterior if `kept` is the share of its variance that each pixel shows, (row, column)."""
-    freedom = np.array([series.frames - 1.0 for series in darks])
+    # Series of equal noise are one
+    shot_dn2, which = np.unique(shot_dn2, return_inverse=True)
+    freedom = np.bincount(which, [series.frames - 1.0 for series in darks])
     degrees = float(freedom.sum())
-    squares = np.stack([series.within_dn2 / kept for series in darks], axis=-1)
+    squares = np.zeros((*kept.shape, freedom.size))
+    for series, index in zip(darks, which, strict=True):
+        squares[..., index] += series.within_dn2 / kept
     ratio = (squares / (read_dn2 + shot_dn2)).sum(-1) / degrees
     chance = 2 / degrees
     limit = chance * np.sqrt((2 + 12 / degrees) / usable.sum()) * stats.norm.isf(_MAX_CHANCE)
@@ -174,6 +178,20 @@ def _log_likelihood(squares: Array, grid: Array, shot_dn2: Array, freedom: Array
     return np.asarray(squares @ (-0.5 / variance) - 0.5 * freedom @ np.log(variance))
 
 
+def _bins(ratio: Array, usable: NDArray[np.bool_], *, exact: bool) -> tuple[slice, NDArray[np.intp], Array]:
+    """Return which usable pixels tell the population, the bin of each, and the number of pixels in each bin.
+
+    Pixels of one variance tell the same if all frames are alike. If not, each is a bin of its own, and fewer do.
+    """
+    if not exact:
+        pixel = slice(None, None, -(-int(usable.sum()) // _SAMPLE_PX))
+        each = np.arange(int(usable.sum()))[pixel]
+        return pixel, np.arange(each.size), np.ones(each.size)
+    log = np.log(np.maximum(ratio[usable], 1e-9))
+    _, member, counts = np.unique(np.round(log / _BIN), return_inverse=True, return_counts=True)
+    return slice(None), member, counts.astype(float)
+
+
 @dataclass(frozen=True)
 class _Population:
     """Grid of ln r and population g on it, both (step,), and ln L of the pixels from which it was learnt."""
@@ -196,10 +214,9 @@ def _population(
     degrees = float(freedom.sum())
     ratio = ratio / factor
     grid = _grid(ratio, read_dn2, degrees, usable)
-    _, member, count = np.unique(
-        np.round(np.log(np.maximum(ratio[usable], 1e-9)) / _BIN), return_inverse=True, return_counts=True
-    )
-    sums = [np.bincount(member, weights) for weights in (squares[usable] / factor[usable, None]).T]
+    pixel, member, count = _bins(ratio, usable, exact=freedom.size == 1)
+    scaled = (squares[usable] / factor[usable, None])[pixel]
+    sums = [np.bincount(member, weights) for weights in scaled.T]
     log = _log_likelihood(np.stack(sums, axis=1) / count[:, None], grid, shot_dn2, freedom)
     peak = log.max(axis=1)
     likelihood = np.exp(log - peak[:, None])
@@ -209,7 +226,9 @@ def _population(
     share = (1 - _TAIL) * share / share.sum() + _TAIL / grid.size
     for _ in range(_EM_STEPS):
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
-    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(np.log(factor[usable]).sum())
+    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(
+        np.log(factor[usable][pixel]).sum()
+    )
     return _Population(grid, share, total)
 
 

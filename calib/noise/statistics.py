@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise.outliers import outlier
+from faintfield.calib.noise.powers import PowerSums
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
@@ -186,9 +187,7 @@ class SeriesSums:
         self._row_count = np.maximum(self._regular.sum(1), 1)
         self._column_count = np.maximum(self._regular.sum(0), 1)
         self._sampled = sample_index(first_dn.shape)
-        self._pattern, self._squares = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
-        if self.conditions.kind == "dark":
-            self._cubes, self._fourths = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
+        self._powers = PowerSums(first_dn.shape, higher=self.conditions.kind == "dark")
 
     def _add_residual(self, residual_dn: NDArray[np.float64]) -> tuple[Any, ...]:
         """Subtract level, row and column means from a frame, in place, and add the rest to the sums.
@@ -201,16 +200,8 @@ class SeriesSums:
         residual_dn -= rows[:, None]
         columns = residual_dn.sum(0, where=self._regular) / self._column_count
         residual_dn -= columns
-        self._pattern += residual_dn
-        square = residual_dn * residual_dn
-        self._squares += square
-        spread = square.mean(where=self._regular)
-        if self.conditions.kind == "dark":
-            residual_dn *= square
-            self._cubes += residual_dn
-            square *= square
-            self._fourths += square
-        return level, rows, columns, spread
+        self._powers.add(residual_dn)
+        return level, rows, columns, np.square(residual_dn).mean(where=self._regular)
 
     def _count_top(self, values_dn: NDArray[Any]) -> None:
         """Count the values at the highest one so far, and one below it; the stated end of the range is the highest."""
@@ -221,14 +212,6 @@ class SeriesSums:
         elif top == self._top_dn + 1:
             below += self._at_top
         self._top_dn, self._at_top, self._below_top = top, at, below
-
-    def _higher_powers(self, mean: NDArray[np.float64], frames: int) -> tuple[NDArray[np.float64], ...]:
-        """Return the sums of the third and fourth powers of the deviations from the means (row, column)."""
-        if self.conditions.kind == "flat":
-            return np.zeros((1, 1)), np.zeros((1, 1))
-        cubes = self._cubes - 3 * mean * self._squares + 2 * frames * mean**3
-        fourths = self._fourths - 4 * mean * self._cubes + 6 * mean**2 * self._squares - 3 * frames * mean**4
-        return cubes, fourths
 
     def series(self) -> Series:
         """Return the statistics of the frames so far.
@@ -242,9 +225,7 @@ class SeriesSums:
         """
         if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
-        mean = self._pattern / frames
-        within = np.maximum(self._squares - frames * mean**2, 0.0)
-        cubes, fourths = self._higher_powers(mean, frames)
+        mean, within, cubes, fourths = self._powers.central(frames)
         names, digests, samples, *per_frame = zip(*self._frames, strict=True)
         levels, rows, columns, spreads_dn2 = map(np.array, per_frame)
         series = Series(
