@@ -145,9 +145,10 @@ def fit_series(
 
 
 def with_rounding(fit: NoiseFit, error: float) -> NoiseFit:
-    """Return a fit with the relative error that rounding may make of all darks alike, and what follows from it."""
+    """Return a fit with the relative error that rounding may make of the noise of all darks, and so of the gain."""
     at = list(fit.values).index("log_read_dn2")
-    follows = fit.covariance[at] / fit.covariance[at, at]
+    concerns = np.array([name in ("log_read_dn2", "log_gain") for name in fit.values])
+    follows = np.where(concerns, fit.covariance[at] / fit.covariance[at, at], 0.0)
     return replace(fit, covariance=fit.covariance + error**2 * np.outer(follows, follows))
 
 

@@ -31,7 +31,8 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
         return None
     series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats, fitted.used)
     for one in series:
-        if one.noise_excess is None or one.noise_se is None:
+        # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
+        if one.noise_excess is None or one.noise_se is None or one.series.conditions.kind == "dark":
             continue
         if abs(one.noise_excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * one.noise_se):
             return (
