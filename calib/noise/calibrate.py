@@ -18,19 +18,11 @@ from faintfield.calib.noise.diagnostics import (
 from faintfield.calib.noise.estimates import estimate_all
 from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
 from faintfield.calib.noise.goodness import series_goodness
+from faintfield.calib.noise.maps import measure_pixels, noise_maps
 from faintfield.calib.noise.marginal import mass_function
-from faintfield.calib.noise.pixels import (
-    PixelLevels,
-    Response,
-    hot_pixels,
-    measure_response,
-    noisy_pixels,
-    pixel_levels,
-    shrunk_variance_ratio,
-    variance_ratio,
-)
-from faintfield.calib.noise.response import BENDS, charge_dn, charge_slope
-from faintfield.calib.noise.result import Estimate, Histogram, NoiseCalibration, NoiseMaps, TransferPoint
+from faintfield.calib.noise.pixels import hot_pixels, outlying_pixels, variance_ratio
+from faintfield.calib.noise.response import BENDS
+from faintfield.calib.noise.result import Histogram, NoiseCalibration, TransferPoint
 from faintfield.calib.noise.saturation import Saturation, find_saturation
 from faintfield.calib.noise.statistics import Series
 from faintfield.calib.noise_model import BentResponse
@@ -73,32 +65,31 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
     end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
-    return _result(*_fit_without_noisy(darks, saturation.kept, hot, end_dn), hot, saturation, end_dn)
+    return _result(*_fit_without_outlying(darks, saturation.kept, hot, end_dn), hot, saturation, end_dn)
 
 
 def _result(
-    fitted: SeriesFit, noisy: NDArray[np.bool_], hot: NDArray[np.bool_], saturation: Saturation, saturation_dn: float
+    fitted: SeriesFit, outlying: NDArray[np.bool_], hot: NDArray[np.bool_], saturation: Saturation, saturation_dn: float
 ) -> NoiseCalibration:
     """Return the numbers, maps and warnings that follow from a fit."""
-    usable, points = ~hot & ~noisy, _points(fitted)
+    pixels, points = measure_pixels(fitted, hot, outlying), _points(fitted)
     level, noise = level_warning(fitted), noise_warning(fitted, points)
-    levels = _levels(fitted, hot)
-    response = _response(fitted, levels, usable)
     estimates, covariance = estimate_all(
-        fitted, response, saturation, levels_hold=level is None, noise_holds=noise is None
+        fitted, pixels.response, saturation, levels_hold=level is None, noise_holds=noise is None
     )
-    dead = response.dead if response else np.zeros_like(hot)
+    dead = pixels.response.dead if pixels.response else np.zeros_like(hot)
     return NoiseCalibration(
         estimates=estimates,
         covariance=covariance,
         likelihood=fitted.likelihood,
-        maps=_maps(fitted, estimates, levels, response, hot | noisy | dead),
+        maps=noise_maps(fitted, estimates, pixels, hot | pixels.noisy | dead),
         hot=hot,
-        noisy=noisy,
+        noisy=pixels.noisy,
+        telegraph=pixels.telegraph,
         dead=dead,
         variance_ratio=variance_ratio(fitted.darks, fitted.dark_noise_dn2)[0].astype(np.float32),
         points=points,
-        histograms=_histograms(fitted, usable),
+        histograms=_histograms(fitted, ~hot & ~outlying),
         saturation_dn=saturation_dn,
         saturation=saturation,
         response=_bent_response(fitted),
@@ -108,61 +99,20 @@ def _result(
             *saturation_warnings(saturation),
             *filter(None, (level, noise)),
             *scatter_warnings(fitted),
+            *pixels.warnings(),
         ),
     )
 
 
-def _fit_without_noisy(
+def _fit_without_outlying(
     darks: Sequence[Series], flats: Sequence[Series], hot: NDArray[np.bool_], saturation_dn: float
 ) -> tuple[SeriesFit, NDArray[np.bool_]]:
-    """Return the fit without hot and noisy pixels, and the noisy ones (row, column)."""
+    """Return the fit without hot and outlying pixels, and the outlying ones (row, column)."""
     fitted = fit_series(darks, flats, ~hot, saturation_dn)
     if fitted.likelihood is NoiseLikelihood.CENSORED:  # variances of values that are cut off tell nothing
         return fitted, np.zeros_like(hot)
-    noisy = noisy_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
-    return (fit_series(darks, flats, ~hot & ~noisy, saturation_dn) if noisy.any() else fitted), noisy
-
-
-def _levels(fitted: SeriesFit, hot: NDArray[np.bool_]) -> PixelLevels:
-    """Return offset and dark signal of every pixel; the sensor's own if values are cut off."""
-    values = fitted.fit.values
-    if fitted.likelihood is NoiseLikelihood.CENSORED:
-        names = ("offset_dn", "dark_signal_dn_per_s", "dsnu_dn2", "dcnu_dn2_per_s2")
-        return PixelLevels(*(np.full(hot.shape, values[name]) for name in names))
-    return pixel_levels(fitted.darks, values, fitted.dark_noise_dn2, fitted.profiles_dn2, hot)
-
-
-def _maps(
-    fitted: SeriesFit,
-    estimates: dict[str, Estimate],
-    levels: PixelLevels,
-    response: Response | None,
-    unusable: NDArray[np.bool_],
-) -> NoiseMaps:
-    """Return the maps; those in electrons only where the gain is known."""
-    gain = estimates["gain_dn_per_e"].value
-    maps = {"offset_dn": levels.offset_dn, "offset_variance_dn2": levels.offset_variance_dn2}
-    if gain is not None:
-        ratio = shrunk_variance_ratio(*variance_ratio(fitted.darks, fitted.dark_noise_dn2), ~unusable)
-        maps["read_noise_e"] = np.sqrt(np.exp(fitted.fit.values["log_read_dn2"]) * ratio) / gain
-        if estimates["dark_current_e_per_s"].value is not None:
-            maps["dark_current_e_per_s"] = np.maximum(levels.dark_signal_dn_per_s / gain, 0)
-            maps["dark_current_variance_e2_per_s2"] = levels.dark_signal_variance_dn2_per_s2 / gain**2
-    if response is not None:
-        maps |= {"relative_response": response.relative, "vignetting": response.vignetting}
-    return NoiseMaps(unusable=unusable, **{name: values.astype(np.float32) for name, values in maps.items()})
-
-
-def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_]) -> Response | None:
-    """Return the photo response, None without flats."""
-    if not fitted.flats:
-        return None
-    values, signals, noise = fitted.fit.values, [], []
-    for v, one in zip(fitted.flat_noise_dn2, fitted.flats, strict=True):
-        signal = one.mean_dn - levels.offset_dn
-        signals.append(charge_dn(values, signal) - levels.dark_signal_dn_per_s * one.conditions.dark_time_s)
-        noise.append(v / one.frames * float(charge_slope(values, np.mean(signal)) ** 2))
-    return measure_response(signals, noise, usable)
+    outlying = outlying_pixels(*variance_ratio(darks, fitted.dark_noise_dn2)) & ~hot
+    return (fit_series(darks, flats, ~hot & ~outlying, saturation_dn) if outlying.any() else fitted), outlying
 
 
 def _bent_response(fitted: SeriesFit) -> BentResponse | None:

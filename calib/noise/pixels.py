@@ -3,8 +3,8 @@
 Offset and dark signal are posterior means. The mean of ten frames of a pixel is off by 1.1 e⁻ rms at 12 e⁻² of read
 noise: as much as the signal to be reconstructed. So offset and dark signal of pixel i get the priors N(μ, s²) and
 N(d, q²), whose spreads the fit has measured; the means m_ij of the series measure `o_i + d_i t_j` with variance
-v_j/n_j. Since both are Gaussian, the posterior mean is linear in the means, with one 2 × 2 matrix for all pixels
-(Gelman et al., Bayesian Data Analysis, 3rd ed., §5.4).
+v_ij/n_j, v_ij the noise of the pixel itself. Since both are Gaussian, the posterior mean is linear in the means, with a
+2 × 2 matrix (Gelman et al., Bayesian Data Analysis, 3rd ed., §5.4). What rows and columns share is part of μ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,8 +24,8 @@ _HOT_SIGMA = 5.0
 # Expected number of pixels per sensor that are noisy by chance alone.
 _NOISY_BY_CHANCE = 1e-2
 
-# Variances on the grid of the prior, and steps of expectation and maximization that find their weights.
-_GRID, _EM_STEPS = 80, 200
+# Variance over the median from which a pixel is of no use, and that of a pixel that also jumps between two levels.
+_USELESS, _USELESS_TELEGRAPH = 25.0, 4.0
 
 # Response over that of the neighbourhood below which a pixel is dead.
 _MIN_RESPONSE = 0.5
@@ -49,7 +49,7 @@ def hot_pixels(darks: Sequence[Series]) -> NDArray[np.bool_]:
     return np.asarray(signal_dn > np.median(signal_dn) + _HOT_SIGMA * spread_dn)
 
 
-def noisy_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArray[np.bool_]:
+def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArray[np.bool_]:
     """Return the pixels (row, column) with more noise than chance allows.
 
     Causes are random telegraph signals, cosmic rays and loose contacts.
@@ -65,6 +65,18 @@ def noisy_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArra
     freedom = min(freedom, 2 / max(robust_sigma(variance_ratio) ** 2, 1e-12))
     chance = _NOISY_BY_CHANCE / variance_ratio.size
     return np.asarray(variance_ratio * freedom > stats.chi2.isf(chance, freedom))
+
+
+def noisy_pixels(
+    outlying: NDArray[np.bool_], variance_ratio: NDArray[np.floating], telegraph: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the outlying pixels (row, column) that are too noisy to be of use; the others have a noise of their own.
+
+    A pixel of five times the usual noise tells a twenty-fifth of what others tell. One that jumps between two levels
+    is left out earlier, since its noise is not normal.
+    """
+    ratio = variance_ratio / max(float(np.median(variance_ratio)), 1e-12)
+    return np.asarray(outlying & (ratio > np.where(telegraph, _USELESS_TELEGRAPH, _USELESS)))
 
 
 def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple[NDArray[np.float64], float]:
@@ -86,11 +98,54 @@ class PixelLevels:
     dark_signal_variance_dn2_per_s2: Array
 
 
+@dataclass(frozen=True)
+class LinePattern:
+    """Pattern of rows and columns in the offsets, shrunk by its share of chance.
+
+    Attributes
+    ----------
+    offset_dn : array (row, column)
+        Sum of the patterns.
+    variance_dn2 : float
+        Variance of its error.
+    """
+
+    offset_dn: Array
+    variance_dn2: float
+
+
+def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
+    """Return what rows and columns share in the offsets, by the dark series of most frames.
+
+    Parameters
+    ----------
+    darks : sequence of Series
+        Dark series, at least one.
+    dsnu_dn2 : float
+        Variance of the offsets of the pixels, which scatters the means of rows and columns, too.
+    """
+    most = max(darks, key=lambda one: one.frames)
+    rows, columns = most.pattern_dn.shape
+    pattern, error = np.zeros((rows, columns)), 0.0
+    lines = (
+        (most.row_dn[:, None], most.row_noise_dn2, columns),
+        (most.column_dn[None, :], most.column_noise_dn2, rows),
+    )
+    for profile_dn, noise_dn2, averaged in lines:
+        # A lone frame does not tell the noise of its lines
+        chance = max(dsnu_dn2, 0.0) / averaged + noise_dn2 / most.frames
+        total = float(profile_dn.var())
+        kept = max(1 - chance / total, 0.0) if total > 0 and most.frames > 1 else 0.0
+        pattern = pattern + kept * profile_dn
+        error += kept * chance if most.frames > 1 else total
+    return LinePattern(pattern, error)
+
+
 def pixel_levels(
     darks: Sequence[Series],
     values: Mapping[str, float],
-    noise_dn2: Sequence[float],
-    pattern_dn2: float,
+    noise_dn2: Sequence[Array | float],
+    pattern: LinePattern,
     hot: NDArray[np.bool_],
 ) -> PixelLevels:
     """Return the posterior means of every pixel's offset and dark signal.
@@ -101,72 +156,35 @@ def pixel_levels(
         Dark series, at least one.
     values : mapping
         `offset_dn`, `dark_signal_dn_per_s`, `dsnu_dn2`, `dcnu_dn2_per_s2` of the fit.
-    noise_dn2 : sequence of float
-        v_j, the pixel noise of each series.
-    pattern_dn2 : float
-        Variance that the patterns of rows and columns add to the offsets.
+    noise_dn2 : sequence of arrays (row, column) or of float
+        Noise of the pixels in each series.
+    pattern : LinePattern
+        What rows and columns share in the offsets.
     hot : array (row, column), bool
         Pixels whose dark signal the prior does not describe; only their own values determine it.
     """
-    t = np.array([series.conditions.exposure_s for series in darks])
-    weight = np.array([series.frames for series in darks]) / np.asarray(noise_dn2)
-    mean = np.array([values["offset_dn"], values.get("dark_signal_dn_per_s", 0.0)])
-    design = np.stack([np.ones_like(t), t])
-    precision = (design * weight) @ design.T
+    exposures = [series.conditions.exposure_s for series in darks]
     # The floors stand for spreads that are zero or were not fitted.
-    offset_prior = 1 / max(values["dsnu_dn2"] + pattern_dn2, 1e-6)
-    typical = np.linalg.inv(precision + np.diag([offset_prior, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)]))
-    unbound = np.linalg.inv(precision + np.diag([offset_prior, 1e-12 if np.ptp(t) else 1e12]))
-    information = _information(darks, design * weight, hot)
-    posterior = mean[:, None, None] + np.tensordot(typical, information, 1)
-    posterior[:, hot] = mean[:, None] + unbound @ information[:, hot]
-    variances = np.where(hot, np.diag(unbound)[:, None, None], np.diag(typical)[:, None, None])
-    return PixelLevels(posterior[0], posterior[1], variances[0], variances[1])
-
-
-def _information(darks: Sequence[Series], weights: Array, hot: NDArray[np.bool_]) -> Array:
-    """Return the sums (2, row, column) of the pixels' deviations over the series, by `weights` (2, series)."""
-    information = np.zeros((2, *hot.shape))
-    for series, weight in zip(darks, weights.T, strict=True):
+    offset_prior = 1 / max(values["dsnu_dn2"] + pattern.variance_dn2, 1e-6)
+    signal_prior = np.where(
+        hot, 1e-12 if np.ptp(exposures) else 1e12, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)
+    )
+    # Precision of offset, of both, and of dark signal; and the deviations that they weigh
+    offset, signal = np.full(hot.shape, offset_prior), signal_prior
+    both, of_offset, of_signal = np.zeros(hot.shape), np.zeros(hot.shape), np.zeros(hot.shape)
+    for series, variance in zip(darks, noise_dn2, strict=True):
+        t, weight = series.conditions.exposure_s, series.frames / np.asarray(variance)
         # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
-        deviation = series.mean_dn - series.mean_dn.mean(where=~hot)
-        for row in range(2):
-            information[row] += weight[row] * deviation
-    return information
-
-
-def shrunk_variance_ratio(ratio: Array, freedom: float, usable: NDArray[np.bool_]) -> Array:
-    """Return each pixel's variance over the model's, shrunk towards those of other pixels as far as chance scatters it.
-
-    With ν degrees of freedom chance alone scatters a ratio r with variance 2 r²/ν. Any excess is real, and the result
-    is the posterior mean under the prior that the pixels themselves suggest: the distribution of variances on a grid
-    that makes their scatter the likeliest (Kiefer and Wolfowitz, Annals of Mathematical Statistics 27, 887, 1956).
-    Halves of a sensor that differ, and a few pixels that flicker, keep their own variance, where a prior of one centre
-    would pull them to a mean that no pixel has.
-    """
-    chance = 2 / max(freedom, 1.0)
-    excess = float(ratio.var(where=usable)) - chance
-    resolved = 3 * chance * np.sqrt(2 / usable.sum())
-    if freedom < 1 or excess < resolved:
-        return np.ones_like(ratio)
-    bins, weight = np.unique(_coarse(ratio[usable]), return_counts=True)
-    grid = np.geomspace(max(float(bins[0]), 1e-3), float(bins[-1]) * 1.05, _GRID)
-    # χ² density of each bin's ratio under each variance of the grid, up to a factor that all variances share.
-    logs = -0.5 * freedom * (np.log(grid) + bins[:, None] / grid)
-    likelihood = np.exp(logs - logs.max(1, keepdims=True))
-    prior = np.full(_GRID, 1 / _GRID)
-    for _ in range(_EM_STEPS):
-        posterior = likelihood * prior
-        posterior /= posterior.sum(1, keepdims=True)
-        prior = weight @ posterior / weight.sum()
-    posterior = likelihood * prior
-    mean = posterior @ grid / posterior.sum(1)
-    return np.asarray(np.interp(ratio, bins, mean))
-
-
-def _coarse(ratio: Array) -> Array:
-    """Return ratios rounded to 2 %, of which there are few different ones."""
-    return np.exp(np.round(np.log(np.maximum(ratio, 1e-3)) / 0.02) * 0.02)
+        deviation = series.mean_dn - series.mean_dn.mean(where=~hot) - pattern.offset_dn
+        offset, both, signal = offset + weight, both + weight * t, signal + weight * t**2
+        of_offset, of_signal = of_offset + weight * deviation, of_signal + weight * t * deviation
+    determinant = offset * signal - both**2
+    return PixelLevels(
+        values["offset_dn"] + pattern.offset_dn + (signal * of_offset - both * of_signal) / determinant,
+        values.get("dark_signal_dn_per_s", 0.0) + (offset * of_signal - both * of_offset) / determinant,
+        np.asarray(signal / determinant),
+        np.asarray(offset / determinant),
+    )
 
 
 @dataclass(frozen=True)
@@ -177,6 +195,8 @@ class Response:
     ----------
     relative, vignetting : array (row, column)
         Response over its mean, and its smooth part.
+    relative_se : array (row, column)
+        Standard error of the response of a pixel beside the smooth part.
     prnu, prnu_se : float
         Standard deviation of the rest relative to the mean (EMVA 1288's PRNU after its high-pass filter), and its
         standard error.
@@ -186,6 +206,7 @@ class Response:
 
     relative: NDArray[np.float64]
     vignetting: NDArray[np.float64]
+    relative_se: NDArray[np.float64]
     prnu: float
     prnu_se: float
     dead: NDArray[np.bool_]
@@ -220,6 +241,7 @@ def measure_response(
     return Response(
         relative=vignetting * (1 + np.where(usable, kept * pixel, 0.0)),
         vignetting=vignetting,
+        relative_se=vignetting * np.sqrt(kept * noise),
         prnu=float(np.sqrt(spread2)),
         prnu_se=float(np.sqrt(spread2 + error2) - np.sqrt(spread2)),
         dead=dead,

@@ -1,6 +1,6 @@
 """Result of a noise calibration: each quantity with its standard error, or the reason why it has no value."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,14 +46,18 @@ class NoiseMaps:
         Posterior mean of the offset, and the variance of its error.
     dark_current_e_per_s, dark_current_variance_e2_per_s2 : array, optional
         Posterior mean of the dark current, and the variance of its error.
-    read_noise_e : array, optional
-        Read noise.
-    relative_response : array, optional
-        Photo response over its mean: vignetting and PRNU.
+    read_noise_e, read_noise_se_e : array, optional
+        Posterior mean of the read noise, and its standard error.
+    gain_dn_per_e, gain_se_dn_per_e : array, optional
+        Gain, and the standard error of its difference from the mean gain. Maps in electrons are in those of this gain.
+    relative_response, relative_response_se : array, optional
+        Photo response in electrons over its mean, vignetting and PRNU, and its standard error.
     vignetting : array, optional
         Smooth part of the photo response.
     unusable : array, bool
         Pixels that are hot, noisy or dead.
+    absent : dict of str
+        Why there is no map of the gain or of the read noise, by the name of the map.
     """
 
     offset_dn: NDArray[np.float32]
@@ -62,8 +66,13 @@ class NoiseMaps:
     dark_current_e_per_s: NDArray[np.float32] | None = None
     dark_current_variance_e2_per_s2: NDArray[np.float32] | None = None
     read_noise_e: NDArray[np.float32] | None = None
+    read_noise_se_e: NDArray[np.float32] | None = None
+    gain_dn_per_e: NDArray[np.float32] | None = None
+    gain_se_dn_per_e: NDArray[np.float32] | None = None
     relative_response: NDArray[np.float32] | None = None
+    relative_response_se: NDArray[np.float32] | None = None
     vignetting: NDArray[np.float32] | None = None
+    absent: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -119,6 +128,8 @@ class NoiseCalibration:
         Maps per pixel.
     hot, noisy, dead : array (row, column), bool
         The kinds of unusable pixels.
+    telegraph : array (row, column), bool
+        Pixels that jump between two levels; those that are not among the noisy ones are used.
     variance_ratio : array (row, column)
         Variance of each pixel over the frames, divided by that of the model.
     points : tuple of TransferPoint
@@ -144,6 +155,7 @@ class NoiseCalibration:
     hot: NDArray[np.bool_]
     noisy: NDArray[np.bool_]
     dead: NDArray[np.bool_]
+    telegraph: NDArray[np.bool_]
     variance_ratio: NDArray[np.float32]
     points: tuple[TransferPoint, ...]
     histograms: tuple[Histogram, ...]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise.outliers import outlier
+from faintfield.calib.noise.powers import PowerSums
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
@@ -87,6 +88,8 @@ class Series:
         Mean over the frames of each pixel minus level and profiles.
     within_dn2 : array (row, column), float32
         Sum over the frames of the squared deviations from `pattern_dn`.
+    cubes_dn3, fourths_dn4 : array (row, column), float32
+        Likewise of their third and fourth powers; of one zero for flats.
     suspect : array (row, column), bool
         Pixels left out of levels and profiles.
     sample_dn : array (frame, pixel), int32
@@ -111,6 +114,8 @@ class Series:
     column_noise_dn2: float
     pattern_dn: NDArray[np.float32]
     within_dn2: NDArray[np.float32]
+    cubes_dn3: NDArray[np.float32]
+    fourths_dn4: NDArray[np.float32]
     suspect: NDArray[np.bool_]
     sample_dn: NDArray[np.int32]
     floor_dn: int
@@ -182,7 +187,7 @@ class SeriesSums:
         self._row_count = np.maximum(self._regular.sum(1), 1)
         self._column_count = np.maximum(self._regular.sum(0), 1)
         self._sampled = sample_index(first_dn.shape)
-        self._pattern, self._squares = np.zeros(first_dn.shape), np.zeros(first_dn.shape)
+        self._powers = PowerSums(first_dn.shape, higher=self.conditions.kind == "dark")
 
     def _add_residual(self, residual_dn: NDArray[np.float64]) -> tuple[Any, ...]:
         """Subtract level, row and column means from a frame, in place, and add the rest to the sums.
@@ -195,10 +200,8 @@ class SeriesSums:
         residual_dn -= rows[:, None]
         columns = residual_dn.sum(0, where=self._regular) / self._column_count
         residual_dn -= columns
-        self._pattern += residual_dn
-        residual_dn *= residual_dn
-        self._squares += residual_dn
-        return level, rows, columns, residual_dn.mean(where=self._regular)
+        self._powers.add(residual_dn)
+        return level, rows, columns, np.square(residual_dn).mean(where=self._regular)
 
     def _count_top(self, values_dn: NDArray[Any]) -> None:
         """Count the values at the highest one so far, and one below it; the stated end of the range is the highest."""
@@ -222,8 +225,7 @@ class SeriesSums:
         """
         if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
-        mean = self._pattern / frames
-        within = np.maximum(self._squares - frames * mean**2, 0.0)
+        mean, within, cubes, fourths = self._powers.central(frames)
         names, digests, samples, *per_frame = zip(*self._frames, strict=True)
         levels, rows, columns, spreads_dn2 = map(np.array, per_frame)
         series = Series(
@@ -237,6 +239,8 @@ class SeriesSums:
             column_noise_dn2=float(columns.var(0, ddof=1).mean()) if frames > 1 else 0.0,
             pattern_dn=mean.astype(np.float32),
             within_dn2=within.astype(np.float32),
+            cubes_dn3=cubes.astype(np.float32),
+            fourths_dn4=fourths.astype(np.float32),
             suspect=self._suspect,
             sample_dn=np.array(samples),
             floor_dn=self._floor_dn,

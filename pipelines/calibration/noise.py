@@ -32,9 +32,12 @@ _MAPS = {
     "dark_current_e_per_s": 0.0,
     "dark_current_variance_e2_per_s2": 0.0,
     "read_noise_e": 1.0,
+    "read_noise_se_e": 0.0,
     "relative_response": 1.0,
+    "relative_response_se": 0.0,
     "vignetting": 1.0,
 }
+_GAIN_MAPS = {"gain_dn_per_e": 1.0, "gain_se_dn_per_e": 0.0}
 
 
 @dataclass(frozen=True)
@@ -114,11 +117,23 @@ def noise_maps(sensor: SensorCalibration) -> dict[str, NDArray[Any]]:
         parts = [getattr(c.maps, name) for c in phases]
         if all(part is not None for part in parts):
             maps[name] = _interleave(readout, parts, fill)
-    gains = [c.estimates["gain_dn_per_e"].value for c in phases]
-    if len(gains) > 1 and None not in gains:
-        shape = phases[0].maps.offset_dn.shape
-        maps["gain_dn_per_e"] = _interleave(readout, [np.full(shape, gain, np.float32) for gain in gains], fill=1.0)
+    gains = [_gain_map(c) for c in phases]
+    if len(gains) > 1 or phases[0].maps.gain_dn_per_e is not None:
+        for (name, fill), kept in zip(_GAIN_MAPS.items(), zip(*gains, strict=True), strict=True):
+            whole = [part for part in kept if part is not None]
+            if len(whole) == len(phases):
+                maps[name] = _interleave(readout, whole, fill)
     return maps
+
+
+def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+    """Return the gain of each pixel of a phase, its gain for all where pixels have none of their own; and its error."""
+    maps, gain = calibration.maps, calibration.estimates["gain_dn_per_e"].value
+    if gain is None:
+        return None, None
+    if maps.gain_dn_per_e is not None:
+        return maps.gain_dn_per_e, maps.gain_se_dn_per_e
+    return np.full(maps.offset_dn.shape, gain, np.float32), None
 
 
 def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:

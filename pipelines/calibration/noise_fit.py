@@ -25,6 +25,8 @@ def fit_record(calibration: NoiseCalibration) -> FitRecord:
         saturation=SaturationRecord(saturation.limit, saturation.level_dn, saturation.interval_dn),
         response=bends,
         series=series,
+        telegraph_pixels=int(calibration.telegraph.sum()),
+        maps_absent=calibration.maps.absent,
         **{name: _measured(estimates[name]) for name in names},
     )
 

@@ -156,6 +156,18 @@ def test_maps_of_the_noise_follow_the_lattices(make_set: SetMaker) -> None:
     )
 
 
+def test_every_pixel_has_its_own_gain_and_read_noise_in_the_likelihood(make_set: SetMaker) -> None:
+    frames_dn = np.random.default_rng(2).integers(90, 200, (2, 4, 6))
+    folder = make_set([frame.astype(np.uint16) for frame in frames_dn], noise="noise.json", exposure_s=2.0)
+    values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 1.5, "dark_current_e_per_s": 0.0}
+    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    gain, read_e = np.random.default_rng(3).uniform(1.5, 4.0, (2, 4, 6)).astype(np.float32)
+    np.savez(folder / "noise_maps.npz", gain_dn_per_e=gain, read_noise_e=read_e)
+    images = _channels(folder)["grey"]
+    np.testing.assert_allclose(images.electrons, (frames_dn - 100) / gain, rtol=1e-5)
+    np.testing.assert_allclose(images.read_variance_e2, (read_e**2 + 1 / (12 * gain**2))[None], rtol=1e-5)
+
+
 def test_hot_pixels_do_not_reach_the_plane(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
     planes = []
     for name, level in (("cold", 100), ("hot", 60_000)):

@@ -57,7 +57,9 @@ def test_numbers_maps_and_page_are_written(tmp_path: Path, capfd: pytest.Capture
         "dark_current_e_per_s",
         "dark_current_variance_e2_per_s2",
         "read_noise_e",
+        "read_noise_se_e",
         "relative_response",
+        "relative_response_se",
         "vignetting",
     }
     assert shapes == dict.fromkeys(floats, ((64, 64), "float32")) | {"mask": ((64, 64), "bool")}

@@ -32,7 +32,7 @@ STANDARD = "EMVA 1288 release 4.0"
 _NEEDED = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
 
 # The maps that it takes, and the largest number of them that is written.
-_MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 9
+_MAPS_TAKEN, _MAPS_WRITTEN = (*_NEEDED, "mask", "relative_response"), 12
 
 
 class NoiseFrame(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -51,7 +51,11 @@ class GoodnessRecord(Struct, frozen=True, omit_defaults=True):
 
 
 class FitRecord(Struct, frozen=True):
-    """What the flats say of saturation and response, how far series scatter about the model, and how well each fits."""
+    """What the flats say of saturation and response, how far series scatter about the model, and how well each fits.
+
+    `telegraph_pixels` is how many jump between two levels; `maps_absent` tells why there is no map of the gain per
+    pixel, or of the read noise.
+    """
 
     saturation: SaturationRecord
     saturation_e: Measured
@@ -62,3 +66,5 @@ class FitRecord(Struct, frozen=True):
     light_error: Measured
     lamp_flicker: Measured
     series: list[GoodnessRecord]
+    telegraph_pixels: int = 0
+    maps_absent: dict[str, str] = {}

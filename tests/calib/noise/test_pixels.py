@@ -6,77 +6,33 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, Series, measure_series
 from faintfield.calib.noise.pixels import (
+    LinePattern,
     hot_pixels,
+    line_pattern,
     measure_response,
     noisy_pixels,
+    outlying_pixels,
     pixel_levels,
-    shrunk_variance_ratio,
 )
 from faintfield.calib.noise.statistics import robust_sigma
 from tests.calib.noise.darkroom import darks, specimen
 
 
-def ratios(variance: float) -> NDArray[np.float64]:
-    """Return 10 000 ratios of mean 1 and of exactly this variance."""
-    ratio = np.random.default_rng(4).normal(size=(100, 100))
-    ratio -= ratio.mean()
-    return np.asarray(1 + np.sqrt(variance) * ratio / ratio.std())
-
-
-@pytest.mark.parametrize("freedom", [9.0, 27.0])
-def test_variances_are_shrunk_once_their_scatter_exceeds_chance_by_three_standard_errors(freedom: float) -> None:
-    usable = np.ones((100, 100), bool)
-    chance = 2 / freedom
-    se = chance * np.sqrt(2 / 10_000)
-    for excess in (-se, 0.0, 2.9 * se):
-        np.testing.assert_array_equal(shrunk_variance_ratio(ratios(chance + excess), freedom, usable), 1.0)
-    for excess in (3.1 * se, 0.5, 4.0):
-        found = shrunk_variance_ratio(ratios(chance + excess), freedom, usable)
-        assert found.std() > 0
-    np.testing.assert_array_equal(shrunk_variance_ratio(ratios(4.0), 0.0, usable), 1.0)
-
-
-def test_halves_of_a_sensor_keep_their_own_noise() -> None:
-    """2 and 4 e⁻: a prior with one centre draws the quiet half up by an eighth."""
-    rng = np.random.default_rng(3)
-    freedom, truth = 27.0, np.where(np.arange(100) < 50, 0.4, 1.6) * np.ones((100, 1))
-    ratio = truth * rng.chisquare(freedom, truth.shape) / freedom
-    found = shrunk_variance_ratio(ratio, freedom, np.ones(truth.shape, bool))
-    for half in (slice(0, 50), slice(50, 100)):
-        assert np.sqrt(found[:, half]).mean() == pytest.approx(np.sqrt(truth[0, half][0]), rel=0.02)
-    assert np.std(found / truth) < 0.55 * np.std(ratio / truth)
-
-
-def test_variances_of_a_known_population_have_their_posterior_means() -> None:
-    """Inverse gamma variances have conjugate posteriors: (ν₀ s² + ν r)/(ν₀ + ν − 2), the best that can be done."""
-    rng = np.random.default_rng(5)
-    freedom, prior = 20.0, 12.0
-    truth = prior / rng.chisquare(prior, (150, 150))
-    ratio = truth * rng.chisquare(freedom, truth.shape) / freedom
-    best = (prior + freedom * ratio) / (prior + freedom - 2)
-    found = shrunk_variance_ratio(ratio, freedom, np.ones(truth.shape, bool))
-    rms = [np.sqrt(np.mean((one - truth) ** 2)) for one in (found, best, ratio)]
-    assert rms[0] < 1.05 * rms[1] < rms[2]
-
-
-def test_only_usable_pixels_tell_the_scatter() -> None:
-    usable = np.ones((100, 100), bool)
-    usable[:, :50] = False
-    ratio = ratios(2 / 9)
-    ratio[:, :50] *= 100.0
-    ratio[:, 50:] = ratios(2 / 9)[:, :50]
-    found = shrunk_variance_ratio(ratio, 9.0, usable)
-    even = shrunk_variance_ratio(ratio[:, 50:], 9.0, usable[:, 50:])
-    np.testing.assert_allclose(found[:, 50:], even)
-
-
-def test_a_pixel_in_a_hundred_sensors_is_noisy_by_chance() -> None:
+def test_a_pixel_in_a_hundred_sensors_lies_out_by_chance() -> None:
     generator = np.random.default_rng(1)
-    flagged = sum(int(noisy_pixels(generator.chisquare(20, (200, 200)) / 20, 20.0).sum()) for _ in range(50))
+    flagged = sum(int(outlying_pixels(generator.chisquare(20, (200, 200)) / 20, 20.0).sum()) for _ in range(50))
     assert flagged <= 4
     ratio = generator.chisquare(20, (200, 200)) / 20
     ratio[3, 4] = 4.5
-    assert np.argwhere(noisy_pixels(ratio, 20.0)).tolist() == [[3, 4]]
+    assert np.argwhere(outlying_pixels(ratio, 20.0)).tolist() == [[3, 4]]
+
+
+def test_outlying_pixels_are_of_no_use_at_five_times_the_usual_noise_or_twice_if_they_jump() -> None:
+    ratio = np.full((5, 5), 2.0)
+    ratio[0] = [49.0, 51.0, 7.9, 8.1, 51.0]
+    outlying, telegraph = np.zeros((5, 5), bool), np.zeros((5, 5), bool)
+    outlying[0, :4] = telegraph[0, 2:4] = True
+    assert np.argwhere(noisy_pixels(outlying, ratio, telegraph)).tolist() == [[0, 1], [0, 3]]
 
 
 def series(exposure_s: float, frames: int, seed: int, **changes: object) -> Series:
@@ -97,28 +53,47 @@ def test_hot_pixels_lie_five_robust_deviations_above_the_median_rise_from_the_sh
 def test_the_levels_of_a_pixel_are_the_posterior_means_of_its_own_linear_model() -> None:
     taken = [series(0.1, 10, 1), series(10.0, 8, 2), series(60.0, 5, 3)]
     values = {"offset_dn": 100.0, "dark_signal_dn_per_s": 0.4, "dsnu_dn2": 9.0, "dcnu_dn2_per_s2": 0.002}
-    noise_dn2, pattern_dn2 = [48.0, 56.0, 96.0], 1.5
+    noise_dn2: list[NDArray[np.float64] | float] = [48.0 + np.arange(480.0).reshape(24, 20), 56.0, 96.0]
+    pattern = LinePattern(np.linspace(-3, 3, 20)[None, :] + np.zeros((24, 1)), 1.5)
     hot = np.zeros((24, 20), bool)
     hot[3, 4] = True
-    found = pixel_levels(taken, values, noise_dn2, pattern_dn2, hot)
+    found = pixel_levels(taken, values, noise_dn2, pattern, hot)
     t = np.array([0.1, 10.0, 60.0])
     design = np.stack([np.ones(3), t], axis=1)
-    weights = np.diag(np.array([10, 8, 5]) / noise_dn2)
-    means = np.array([one.mean_dn - one.mean_dn.mean(where=~hot) for one in taken])
+    means = np.array([one.mean_dn - one.mean_dn.mean(where=~hot) for one in taken]) - pattern.offset_dn
     for place, prior in (((5, 6), np.diag([1 / 10.5, 1 / 0.002])), ((3, 4), np.diag([1 / 10.5, 1e-12]))):
+        weights = np.diag(np.array([10, 8, 5]) / [48.0 + 20 * place[0] + place[1], 56.0, 96.0])
         covariance = np.linalg.inv(design.T @ weights @ design + prior)
         expected = np.array([100.0, 0.4]) + covariance @ design.T @ weights @ means[:, *place]
-        assert found.offset_dn[place] == pytest.approx(expected[0], rel=1e-9)
+        assert found.offset_dn[place] == pytest.approx(expected[0] + pattern.offset_dn[place], rel=1e-9)
         assert found.dark_signal_dn_per_s[place] == pytest.approx(expected[1], rel=1e-9)
         assert found.offset_variance_dn2[place] == pytest.approx(covariance[0, 0], rel=1e-9)
         assert found.dark_signal_variance_dn2_per_s2[place] == pytest.approx(covariance[1, 1], rel=1e-9)
+
+
+def test_the_pattern_of_columns_is_shrunk_by_the_chance_of_its_means() -> None:
+    rng = np.random.default_rng(12)
+    # Column means scatter by 2² of their own, by 4²/64 of the pixels' offsets and by 3²/64/8 of their noise.
+    own, offsets = 2.0 * rng.standard_normal((1, 90)), 4.0 * rng.standard_normal((64, 90))
+    frames = [
+        (f"{k}", np.rint(500 + own + offsets + 3.0 * rng.standard_normal((64, 90))).astype(np.uint16)) for k in range(8)
+    ]
+    found = line_pattern([measure_series(frames, Conditions("dark", 0.1))], 16.0)
+    chance = 16 / 64 + 9 / 64 / 8
+    kept = 4 / (4 + chance)
+    profile = own + offsets.mean(axis=0)
+    np.testing.assert_allclose(found.offset_dn[0], (kept * (profile - profile.mean()))[0], atol=0.4)
+    assert found.variance_dn2 == pytest.approx(kept * chance, rel=0.2)
+    assert np.ptp(found.offset_dn, axis=0).max() < 1.0, "rows share next to nothing"
 
 
 def test_without_a_second_exposure_a_hot_pixel_has_the_common_dark_signal() -> None:
     taken = [series(1.0, 10, 1)]
     hot = np.zeros((24, 20), bool)
     hot[3, 4] = True
-    found = pixel_levels(taken, {"offset_dn": 100.0, "dsnu_dn2": 9.0}, [48.0], 0.0, hot)
+    found = pixel_levels(
+        taken, {"offset_dn": 100.0, "dsnu_dn2": 9.0}, [48.0], LinePattern(np.zeros((24, 20)), 0.0), hot
+    )
     assert found.dark_signal_dn_per_s[3, 4] == pytest.approx(0.0, abs=1e-6)
 
 
@@ -148,3 +123,5 @@ def test_the_response_is_vignetting_times_what_pixels_differ_beyond_noise() -> N
     # Shrunk by k = p²/(p² + n), the error is that of the best linear estimate
     assert off.std() == pytest.approx(np.sqrt(prnu**2 * noise2 / (prnu**2 + noise2)), rel=0.1)
     assert found.relative[100, 100] == found.vignetting[100, 100]
+    stated = (found.relative_se / found.relative)[inner][(usable & ~found.dead)[inner]]
+    assert np.sqrt(np.mean((off / stated) ** 2)) == pytest.approx(1.0, abs=0.1)
