@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.uncertainty import texture
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.reconstruction.planes import Settings, solve
@@ -24,6 +23,8 @@ from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.rig.simulation.experiment import paper_experiment
+from faintfield.rig.simulation.scene import render
 
 type Array = NDArray[np.float64]
 
@@ -116,10 +117,17 @@ def map_errors(sensor: Sensor, calibration: NoiseCalibration, dark: Series) -> d
     }
 
 
+def _truck(size_px: tuple[int, int]) -> Array:
+    """Return the demo's first object (row, column) as the reference camera sees it."""
+    experiment = paper_experiment(*size_px)
+    view = next(render([experiment.planes[0].grey()], experiment.optics.ideal(), np.zeros((1, 6))))
+    return np.asarray(view.light, np.float64)
+
+
 def picture_errors(sensor: Sensor, calibration: NoiseCalibration, rng: np.random.Generator) -> dict[str, float]:
     """Return the mean squared error of the picture with each kind of calibration, in (e⁻)²."""
     shape = sensor.up.shape
-    truth = texture(0, shape[::-1]).astype(float)
+    truth = _truck((shape[1], shape[0]))
     on = truth > 0
     truth *= signal_scale_for_snr(truth[on], _SNR, _DARK_E, float(np.sqrt(np.mean(sensor.total_noise_e**2))))
     homographies = np.stack([np.eye(3)] * _VIEWS)

@@ -41,8 +41,9 @@ def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     calibration, used = measured.calibration, measured.used
     offset = calibration.estimates["offset_dn"].value or 0.0
     kept = {id(one) for one in calibration.saturation.kept}
-    share = max(used.sum() - sum(used.shape) + 1, 1) / max(used.sum(), 1)
-    freedom = np.array([max((one.frames - 1) * used.sum() * share, 1) for one in series])
+    pixels = int(used.sum())
+    share = max(pixels - sum(used.shape) + 1, 1) / max(pixels, 1)
+    freedom = np.array([max((one.frames - 1) * pixels * share, 1) for one in series])
     variance = np.array([_variance(one, used, share) for one in series])
     return Levels(
         signal_dn=np.array([one.levels_dn.mean() - offset for one in series]),

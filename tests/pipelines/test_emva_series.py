@@ -1,6 +1,7 @@
 """EMVA 1288 data as the standard has them, up to saturation: imported whole and measured without a step by hand."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from faintfield.pipelines.formats.sets.noise_set import load_noise_set
 from tests.pipelines.emva_sets import EmvaCamera, write_emva_set
 
 
-def measure(tmp_path: Path, camera: EmvaCamera, seed: int, **how: int | None) -> NoiseRecord:
+def measure(tmp_path: Path, camera: EmvaCamera, seed: int, **how: Any) -> NoiseRecord:
     """Import and measure a simulated set."""
     import_emva1288(write_emva_set(tmp_path / "data", camera, np.random.default_rng(seed), **how), tmp_path / "set")
     return noise_record(calibrate_sensor(*load_noise_set(tmp_path / "set")))

@@ -13,8 +13,6 @@ from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.cross_validation import _lowest_offset
 from faintfield.recon.solver.data_fit import DataFit
-from faintfield.recon.solver.uncertainty import _degree, _divergence, _draw
-from tests.recon.small_problems import SHAPE, difference_matrix
 
 
 def test_a_grid_covers_a_rectangle_with_samples_in_the_middle_of_squares() -> None:
@@ -111,26 +109,6 @@ def test_noisier_pixels_bound_the_curvature_of_the_samples_that_they_see_by_the_
     expected = operator.coverage() * blurred(1 / (level_e * response + known_e2), (1,))
     found = DataFit(operator, images, level_e).metric(samples)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
-
-
-def test_the_pieces_of_a_draw_are_those_of_the_dense_matrix() -> None:
-    """The precision W + ∇ᵀ D ∇, its diagonal, ∇ᵀ, and the solution by conjugate gradients."""
-    generator = np.random.default_rng(6)
-    gradient = difference_matrix()
-    w, curvature = generator.uniform(1, 2, SHAPE), generator.uniform(0.5, 8, SHAPE)
-    matrix = np.diag(w.ravel()) + gradient.T @ np.diag(np.tile(curvature.ravel(), 2)) @ gradient
-    np.testing.assert_allclose(w + _degree(curvature), np.diag(matrix).reshape(SHAPE), rtol=1e-12)
-    field = generator.normal(size=(2, *SHAPE))
-    field[0, -1], field[1, :, -1] = 0.0, 0.0  # the gradient has no differences there
-    np.testing.assert_allclose(_divergence(field).ravel(), gradient.T @ field.ravel(), atol=1e-12)
-    white, of_edges = generator.normal(size=SHAPE), generator.normal(size=(2, *SHAPE))
-    of_edges[0, -1], of_edges[1, :, -1] = 0.0, 0.0
-    target = np.sqrt(w).ravel() * white.ravel() + gradient.T @ (np.sqrt(curvature) * of_edges).ravel()
-    found = _draw(w, curvature, white, of_edges, np.zeros(SHAPE)).ravel()
-    left = target - matrix @ found
-    by_diagonal = np.diag(matrix)
-    assert left @ (left / by_diagonal) <= 1.01e-4 * (target @ (target / by_diagonal))
-    assert left @ (left / by_diagonal) > 1e-8 * (target @ (target / by_diagonal)), "no more work than that"
 
 
 @pytest.mark.parametrize("mean_e", [0.05, 1.0, 20.0])
