@@ -39,7 +39,7 @@ _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
 _MAX_CHANCE = 0.1
 
 # Residuals are chance alone if those of a good model are larger with this probability.
-_USUAL_CHANCE = 0.3
+_USUAL_CHANCE = 0.1
 
 # Range of the linearity error as fractions of saturation, and the fewest levels in it; EMVA 1288 release 4.0.
 LINEARITY_RANGE, _MIN_LINEARITY_LEVELS = (0.05, 0.95), 3

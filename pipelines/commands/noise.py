@@ -53,7 +53,7 @@ def noise(
         _inform_of_comparison(comparison)
         return comparison
     if folder is None:
-        raise WrongUsage("name a FOLDER with frames to measure, or two results with --compare A B")
+        raise WrongUsage("nothing to measure is named; give a FOLDER with frames, or two results with --compare A B")
     return measure(folder, out)
 
 

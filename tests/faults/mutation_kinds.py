@@ -32,7 +32,7 @@ from tests.pipelines.noise_sets import take_set, write_frames
 from tests.pipelines.sessions import captured, rig_toml
 from tests.simulated_boards import simulate_board_set
 
-_SIDES_PX = (24, 18)
+_SIDES_PX = (32, 24)
 _BOARD_PX = (320, 240)
 _SMALL_RIG = msgspec.structs.replace(SMALL_RIG, camera=SimulatedSettings(size_px=_SIDES_PX))
 
@@ -97,7 +97,7 @@ def _simulated(folder: Path, sides_px: tuple[int, int] = _SIDES_PX) -> None:
 
 
 def _dark_room(folder: Path) -> None:
-    """Write dark and flat frames of 24 x 18 px, with their noise.toml."""
+    """Write dark and flat frames of 32 x 24 px, with their noise.toml."""
     chip, rng = specimen(11, shape=_SIDES_PX[::-1])
     write_frames(folder, take_set(chip, rng, frames=3, photons=(2000.0, 8000.0)))
 
@@ -164,7 +164,7 @@ def _exported(*words: str) -> Callable[[Path], None]:
 def _emva1288(folder: Path) -> None:
     """Write EMVA 1288 reference data: a descriptor and its images."""
     (folder / "images").mkdir(parents=True)
-    lines = ["v 4.0", "n 12 24 18"]
+    lines = ["v 4.0", "n 12 32 24"]
     rng = np.random.default_rng(3)
     for number, measurement in enumerate(("b 100000000,0 1000.0", "b 100000000.0 6000.0", "d 100000000.0", "d 3e10")):
         lines.append(measurement)

@@ -155,7 +155,8 @@ def test_pixels_outside_the_region_are_masked(tmp_path: Path) -> None:
 def test_results_can_go_elsewhere(tmp_path: Path) -> None:
     folder = write_frames(tmp_path / "set", take_set(*specimen(6)))
     noise(folder, out=tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"noise.json", "noise_maps.npz", "noise_page.png"}
+    files = {"noise.json", "noise_maps.npz", "noise_page.png", "emva1288_report.html"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == files
     assert not (folder / "noise.json").exists()
 
 
