@@ -70,8 +70,9 @@ def encoded_film(frames: Sequence[Picture], frame_ms: int) -> bytes | None:
 
 def grey_levels(plane: NDArray[np.floating], white: float, black: float = 0.0) -> Picture:
     """Return a plane as 8-bit levels on a linear scale from black to white."""
-    scaled = (np.asarray(plane, np.float32) - black) * (255.0 / max(white - black, 1e-30))
-    return np.asarray(np.rint(np.clip(scaled, 0, 255)), np.uint8)
+    # Clipped first: files may hold infinite values
+    inside = np.clip(np.nan_to_num(np.asarray(plane, np.float32), nan=black), black, max(white, black))
+    return np.asarray(np.rint((inside - black) * (255.0 / max(white - black, 1e-30))), np.uint8)
 
 
 def mask_picture(mask: NDArray[np.bool_]) -> Picture:
@@ -80,8 +81,9 @@ def mask_picture(mask: NDArray[np.bool_]) -> Picture:
 
 
 def white_level(plane: NDArray[np.floating]) -> float:
-    """Return the white level of a plane's grey scale: its 99.8 % quantile."""
-    return float(np.quantile(plane, 0.998))
+    """Return the white level of a plane's grey scale: the 99.8 % quantile of its finite values, 0 without any."""
+    finite = plane[np.isfinite(plane)]
+    return float(np.quantile(finite, 0.998)) if finite.size else 0.0
 
 
 def contact_sheet(views: list[Picture], columns: int) -> Picture:
