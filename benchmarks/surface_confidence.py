@@ -66,9 +66,8 @@ def fitted(
     def loss(a: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         margin = (offset + x @ a) * sign
         slope = -(x.T @ (weight * sign / (1 + np.exp(margin))))
-        return float(weight @ np.logaddexp(0, -margin)) + _PRIOR * float(
-            a[free] @ a[free]
-        ), slope + 2 * _PRIOR * a * free
+        value = float(weight @ np.logaddexp(0, -margin)) + _PRIOR * float(a[free] @ a[free])
+        return value, slope + 2 * _PRIOR * a * free
 
     return np.asarray(minimize(loss, np.zeros(x.shape[1]), jac=True).x)
 
