@@ -7,26 +7,40 @@ from functools import partial
 
 import msgspec
 
+from faintfield.rig.cameras.aravis import AravisCamera
 from faintfield.rig.cameras.folder import FolderCamera
 from faintfield.rig.cameras.gphoto2 import GPhoto2Camera
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
-from faintfield.rig.cameras.protocol import Camera
-from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, MicroManagerSettings, SimulatedSettings
+from faintfield.rig.cameras.protocol import Camera, Decode
+from faintfield.rig.cameras.settings import (
+    AravisSettings,
+    CameraSettings,
+    FolderSettings,
+    GPhoto2Settings,
+    MicroManagerSettings,
+    PluginSettings,
+    SimulatedSettings,
+)
 from faintfield.rig.clock import Clock, WallClock
 from faintfield.rig.errors import PlanRefused
+from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import StepKind
+from faintfield.rig.plugins import checked_options, plugin_camera, plugin_controller
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
-from faintfield.rig.stages.gantry import Gantry, make_stage
-from faintfield.rig.stages.protocol import StageSettings
+from faintfield.rig.stages.drivers import make_stage
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.micromanager.controller import MicroManagerController
+from faintfield.rig.stages.micromanager.settings import MicroManagerStage
+from faintfield.rig.stages.protocol import SERIAL_PROTOCOLS, StageSettings
+from faintfield.rig.stages.protocol import SIMULATED as SIMULATED  # commands take it from here
 from faintfield.rig.stages.transport import SerialPort, TrafficLog
 
-# Prefix of the port of a simulated stage; the name of its controller follows.
-SIMULATED = "simulated:"
-SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "marlin": SimulatedMarlin}
+SIMULATED_FIRMWARE = {"grbl": SimulatedGrbl, "grblhal": SimulatedGrblHal, "marlin": SimulatedMarlin}
 
 
 @dataclass(frozen=True)
@@ -42,71 +56,134 @@ class Rig:
     arrange : callable
         Called with kind and sweep at the beginning of each step; a simulated lab then does what a person does in a
         real one.
+    camera_sees_stage : bool
+        Whether the camera moves with the stage: a real camera does not swing with a simulated one, nor share its clock.
     """
 
     stage: Gantry
     camera: Camera
     clock: Clock
     arrange: Callable[[StepKind, int], None]
+    camera_sees_stage: bool = True
 
 
-def open_rig(settings: RigSettings, traffic: TrafficLog | None = None) -> Rig:
+def open_rig(settings: RigSettings, traffic: TrafficLog | None = None, decode: Decode = lambda path: None) -> Rig:
     """Construct the stage and the camera of a rig.toml; neither is connected yet.
+
+    A real camera may look on while a simulated stage moves: a rehearsal without motors.
+
+    Parameters
+    ----------
+    settings : RigSettings
+        Content of the rig.toml.
+    traffic : TrafficLog, optional
+        Log of every byte to and from the stage.
+    decode : callable, optional
+        Reads the pixels of a frame's file; a watched folder then knows when a file is complete.
 
     Raises
     ------
     PlanRefused
-        The camera is simulated and the stage is not, so that the camera's true position is not known.
+        The camera is simulated and the stage is not, so that the camera's true position is not known; camera and stage
+        cannot share Micro-Manager; a plug-in cannot be used; or the stage has no homing switches that a drift check
+        could time.
     """
-    bench = _simulated_bench(settings.stage) if is_simulated(settings.stage) else None
-    stage = open_stage(settings.stage, traffic, bench)
-    match settings.camera:
+    if settings.stage.protocol == "micromanager" and settings.drift.check:
+        raise PlanRefused(
+            "drift.check = true times homing against the switches, which Micro-Manager does not tell; set it to false"
+        )
+    bench = _simulated_bench(settings.stage) if settings.stage.simulated else None
+    core = _shared_core(settings)
+    stage = open_stage(settings.stage, traffic, bench, core)
+    if not isinstance(settings.camera, SimulatedSettings):
+        camera = _open_camera(settings.camera, core, decode)
+        return Rig(stage, camera, stage.clock, lambda kind, sweep: None, camera_sees_stage=bench is None)
+    if bench is None:
+        raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
+    centre = settings.grid.centre().target
+    lab = SimulatedLab(centre, bench.true_position, bench.still_s, settings.board, settings.camera)
+    return Rig(stage, SimulatedCamera(settings.camera, stage.clock, lab), stage.clock, lab.arrange)
+
+
+def _open_camera(settings: CameraSettings, core: SharedCore | None, decode: Decode) -> Camera:
+    """Return a real camera, not yet connected."""
+    match settings:
         case GPhoto2Settings():
-            camera: Camera = GPhoto2Camera(settings.camera)
+            return GPhoto2Camera(settings)
         case MicroManagerSettings():
-            camera = MicroManagerCamera(settings.camera)
+            return MicroManagerCamera(settings, core)
+        case AravisSettings():
+            return AravisCamera(settings)
         case FolderSettings():
-            camera = FolderCamera(settings.camera, WallClock())
-        case SimulatedSettings() if bench is not None:
-            centre = settings.grid.centre().target
-            lab = SimulatedLab(centre, bench.true_position, bench.still_s, settings.board, settings.camera)
-            camera = SimulatedCamera(settings.camera, stage.clock, lab)
-            return Rig(stage, camera, stage.clock, lab.arrange)
-        case SimulatedSettings():
-            raise PlanRefused("camera.backend = 'simulated' needs stage.protocol = 'simulated'; change one of them")
-    return Rig(stage, camera, stage.clock, lambda kind, sweep: None)
+            return FolderCamera(settings, WallClock(), decode)
+        case PluginSettings():
+            return plugin_camera(settings, WallClock())
+    raise TypeError(f"no driver for {type(settings).__name__}")
 
 
-def open_stage(settings: StageSettings, traffic: TrafficLog | None = None, bench: Bench | None = None) -> Gantry:
+def _shared_core(settings: RigSettings) -> SharedCore | None:
+    """Return the core that camera and stage share if Micro-Manager drives both."""
+    if not isinstance(settings.camera, MicroManagerSettings) or settings.stage.protocol != "micromanager":
+        return None
+    ours, theirs = settings.camera, _micromanager_stage(settings.stage)
+    if (ours.configuration, ours.adapters) != (theirs.configuration, theirs.adapters):
+        raise PlanRefused(
+            f"camera.configuration = {ours.configuration!r} and stage.configuration = {theirs.configuration!r}, or "
+            "their adapters, differ; Micro-Manager loads one configuration with all devices: name the same in both"
+        )
+    return SharedCore(ours.configuration, ours.adapters)
+
+
+def _micromanager_stage(settings: StageSettings) -> MicroManagerStage:
+    """Return the settings of a Micro-Manager stage."""
+    return checked_options(settings.options, MicroManagerStage, "[stage] with protocol = 'micromanager'")
+
+
+def open_stage(
+    settings: StageSettings,
+    traffic: TrafficLog | None = None,
+    bench: Bench | None = None,
+    core: SharedCore | None = None,
+) -> Gantry:
     """Return the stage that `settings` describe, not yet connected.
 
-    Protocol `simulated`, or a port `simulated:grbl` or `simulated:marlin`, gives a simulated stage with a clock of its
-    own, so that motions take no real time.
+    Protocol `simulated`, or a port `simulated:grbl`, `simulated:grblhal` or `simulated:marlin`, gives a simulated stage
+    with a clock of its own, so that motions take no real time.
 
     Parameters
     ----------
     settings : StageSettings
         The `[stage]` table.
     traffic : TrafficLog, optional
-        Log of every byte sent and received.
+        Log of every byte sent and received over a serial port.
     bench : Bench, optional
         Bench of a simulated stage; by default a new one.
+    core : SharedCore, optional
+        Micro-Manager's core, if the camera uses it as well.
 
     Raises
     ------
     PlanRefused
-        The port names no simulated stage.
+        The port names no simulated stage, or a driver cannot be used with these settings.
     """
-    if is_simulated(settings):
+    clock = WallClock()
+    if settings.simulated:
         bench = bench or _simulated_bench(settings)
         port = bench.link.url if isinstance(bench.link, PtyLink) else settings.port or bench.link.url
-        return bench.stage(msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port), traffic)
-    return make_stage(settings, WallClock(), traffic, partial(SerialPort, settings.port, settings.baud))
+        simulated = msgspec.structs.replace(settings, protocol=bench.firmware.protocol, port=port, options={})
+        return bench.stage(simulated, traffic)
+    if settings.protocol in SERIAL_PROTOCOLS:
+        return make_stage(settings, clock, traffic, partial(SerialPort, settings.port, settings.baud))
+    if settings.protocol == "micromanager":
+        options = _micromanager_stage(settings)
+        core = core or SharedCore(options.configuration, options.adapters)
+        return Gantry(MicroManagerController(core, options, settings.travel_mm, clock), settings, clock)
+    return Gantry(plugin_controller(settings, clock), settings, clock)
 
 
 def is_simulated(settings: StageSettings) -> bool:
     """Return whether `settings` describe a simulated stage."""
-    return settings.protocol == "simulated" or settings.port.startswith(SIMULATED)
+    return settings.simulated
 
 
 def _simulated_bench(settings: StageSettings) -> Bench:

@@ -7,13 +7,16 @@ RigError
 │   ├── StageLost
 │   ├── StageRejected
 │   ├── StageUnfit
+│   ├── DriftUnknown
 │   └── PositionLost
 │       └── PositionDrifted
 ├── PlanRefused
 │   ├── OutsideTravel
 │   ├── KeepOutCrossed
 │   ├── NotHomed
-│   └── WrongFirmware
+│   ├── WrongFirmware
+│   ├── UnknownPlugin
+│   └── PluginFailed
 ├── CameraError
 │   ├── CameraTimeout
 │   └── MissingExtra
@@ -99,6 +102,22 @@ class PositionDrifted(PositionLost):
         self.suspect = suspect
 
 
+class DriftUnknown(StageError):
+    """Homing could not be timed, as this computer or the line delayed answers: nothing is known about lost steps.
+
+    Attributes
+    ----------
+    suspect : tuple
+        What was recorded since the last passed check, in order.
+    """
+
+    position_kept = True
+
+    def __init__(self, message: str, *, suspect: tuple[object, ...] = ()) -> None:
+        super().__init__(message)
+        self.suspect = suspect
+
+
 class PlanRefused(RigError):
     """A request is refused before anything moves."""
 
@@ -117,6 +136,14 @@ class NotHomed(PlanRefused):
 
 class WrongFirmware(PlanRefused):
     """The firmware, or one of its settings, cannot be used safely."""
+
+
+class UnknownPlugin(PlanRefused):
+    """No driver of this name is built in or installed, or it does not have these settings."""
+
+
+class PluginFailed(PlanRefused):
+    """A driver that another package brings cannot be imported or used."""
 
 
 class CameraError(RigError):

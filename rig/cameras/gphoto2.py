@@ -1,6 +1,7 @@
 """Tethered cameras, through libgphoto2; files are kept byte for byte."""
 
 import re
+from contextlib import suppress
 from functools import partial
 from pathlib import PurePath
 from typing import Any
@@ -136,13 +137,55 @@ class GPhoto2Camera:
         if nearest is None or abs(nearest - exposure_s) > 0.01 * nearest:
             offered = ", ".join(f"{seconds:g}" for seconds in sorted(choices))
             raise CameraError(f"exposure_s = {exposure_s:g} is not among the camera's: {offered}; choose one of them")
-        self._set(self._shutter().get_name(), choices[nearest])
+        widget = self._shutter()
+        widget.set_value(choices[nearest])
+        self._camera.set_single_config(widget.get_name(), widget)
 
     def _set(self, name: str, value: str) -> None:
-        """Change one of the camera's settings."""
-        widget = self._camera.get_single_config(name)
-        widget.set_value(value)
+        """Change one of the camera's settings; raises `CameraError` for a name or a value that it does not offer."""
+        try:
+            widget = self._camera.get_single_config(name)
+        except self._gphoto2.GPhoto2Error as failure:
+            present = self._read_settings()
+            if name in present:
+                raise
+            raise CameraError(
+                f"camera.settings.{name} = {value!r}: the camera has no setting {name}, it has: "
+                f"{', '.join(sorted(present))}; correct the name"
+            ) from failure
+        widget.set_value(self._accepted(widget, name, value))
         self._camera.set_single_config(name, widget)
+
+    def _accepted(self, widget: Any, name: str, value: str) -> str | int | float:
+        """Return a value in the type of its setting; raises `CameraError` for one that the camera does not offer."""
+        gphoto2, kind = self._gphoto2, widget.get_type()
+        if widget.get_readonly() and value != str(widget.get_value()):
+            raise CameraError(
+                f"camera.settings.{name} = {value!r}: the camera lets no program set this, it is "
+                f"{widget.get_value()!r}; set it at the camera, and remove the key"
+            )
+        if kind in (gphoto2.GP_WIDGET_RADIO, gphoto2.GP_WIDGET_MENU):
+            choices = list(widget.get_choices())
+            if value in choices:
+                return value
+        elif kind == gphoto2.GP_WIDGET_TOGGLE:
+            choices = ["0", "1"]
+            if value in choices:
+                return int(value)
+        elif kind == gphoto2.GP_WIDGET_RANGE:
+            low, high, step = widget.get_range()
+            choices = [f"{low:g} to {high:g} in steps of {step:g}"]
+            with suppress(ValueError):
+                if low <= float(value) <= high:
+                    return float(value)
+        elif kind == gphoto2.GP_WIDGET_TEXT:
+            return value
+        else:
+            choices = ["nothing that a file can state"]
+        raise CameraError(
+            f"camera.settings.{name} = {value!r} is not offered by the camera, which offers: {', '.join(choices)}; "
+            "choose one of them"
+        )
 
     def _release(self) -> tuple[bytes, str]:
         """Expose, and return the file and its name."""

@@ -1,13 +1,18 @@
 """Scientific cameras, through Micro-Manager's device adapters."""
 
+import math
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import suppress
 from typing import Any
 
 from faintfield.rig.cameras.bounded import call_within
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import CameraReport, Exposure, Metadata
 from faintfield.rig.cameras.settings import MicroManagerSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra, in_one_line
+from faintfield.rig.micromanager import NotOffered, PackageMissing, SharedCore, set_properties
+
+# Names that device adapters give the measured temperature of the sensor in °C, the surest first.
+_TEMPERATURES = ("CCDTemperature", "SensorTemperature", "Temperature")
 
 
 class MicroManagerCamera:
@@ -17,27 +22,27 @@ class MicroManagerCamera:
     ----------
     settings : MicroManagerSettings
         The `[camera]` table.
+    shared : SharedCore, optional
+        The core, if the stage uses it as well.
     """
 
-    def __init__(self, settings: MicroManagerSettings) -> None:
+    def __init__(self, settings: MicroManagerSettings, shared: SharedCore | None = None) -> None:
         self._settings = settings
+        self._shared = shared or SharedCore(settings.configuration, settings.adapters)
         self._core: Any = None
 
     def open(self) -> None:
         """Load the configuration, and change the camera's properties as configured."""
         try:
-            from pymmcore_plus import CMMCorePlus
-        except ImportError as failure:
-            raise MissingExtra(
-                "backend 'micromanager' needs a package that is not installed; "
-                "run: pip install 'faintfield[micromanager]'"
-            ) from failure
+            self._shared.import_package()
+        except PackageMissing as failure:
+            raise MissingExtra(f"backend {failure}") from failure
         self.close()
-        self._core = CMMCorePlus()
+        what = f"loading {self._settings.configuration or 'the demonstration configuration'}"
         try:
-            self._bounded(self._load, f"loading {self._settings.configuration or 'the demonstration configuration'}")
+            self._core = self._bounded(self._load, what, connecting=True)
         except CameraError:
-            self.close()
+            self._release()
             raise
 
     def report(self) -> CameraReport:
@@ -46,57 +51,73 @@ class MicroManagerCamera:
 
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Take one frame."""
-        pixels, label = self._bounded(
+        pixels, metadata = self._bounded(
             lambda: self._snap(exposure_s), f"an exposure of {exposure_s:g} s", extra_s=2.0 * exposure_s
         )
         if pixels.dtype.kind != "u" or pixels.dtype.itemsize > 2:
             raise CameraError(
                 f"the camera gives pixels of type {pixels.dtype}; set its PixelType to 16bit, or 8bit if it has no more"
             )
-        return Exposure(".tiff", pixels=pixels, metadata={"camera": label})
+        return Exposure(".tiff", pixels=pixels, metadata=metadata)
+
+    def temperature_c(self) -> float | None:
+        """Return the temperature of the sensor in °C, None if the camera has no such property."""
+        return self._bounded(self._read_temperature, "reporting its temperature")
 
     def close(self) -> None:
-        """Unload the devices."""
-        core, self._core = self._core, None
-        if core is not None:
-            try:
-                call_within(self._settings.answer_s, core.unloadAllDevices, "disconnecting")
-            except (CameraError, RuntimeError):
-                pass  # any fault was already raised when the camera was used
+        """Unload the devices, unless the stage uses them."""
+        if self._core is not None:
+            self._core = None
+            self._release()
 
-    def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0) -> T:
+    def _bounded[T](self, call: Callable[[], T], what: str, extra_s: float = 0.0, *, connecting: bool = False) -> T:
         """Call with a time limit, and raise `CameraError` for what the library raises."""
-        if self._core is None:
+        if self._core is None and not connecting:
             raise CameraError("the camera is not connected; open it first")
         try:
             return call_within(self._settings.answer_s + extra_s, call, what)
         except CameraTimeout:
-            self._core = None  # it hangs, so it is not asked to disconnect
+            self._core = None
+            self._shared.abandon("camera")  # it hangs, so it is not asked to disconnect
             raise
+        except NotOffered as failure:
+            raise CameraError(f"camera.properties: {failure}") from failure
         except (RuntimeError, OSError) as failure:
             raise CameraError(
                 f"the camera failed at {what}: {in_one_line(failure)}; check its cable, its power and the "
                 "configuration file"
             ) from failure
 
-    def _load(self) -> None:
-        """Load the configured devices and set the camera's properties."""
-        if self._settings.adapters:
-            self._core.setDeviceAdapterSearchPaths([self._settings.adapters])
-        if self._settings.configuration:
-            self._core.loadSystemConfiguration(str(Path(self._settings.configuration).absolute()))
-        else:
-            self._core.loadSystemConfiguration()
-        camera = self._core.getCameraDevice()
+    def _release(self) -> None:
+        """Let the devices go."""
+        with suppress(CameraError, RuntimeError):  # any fault was already raised when the camera was used
+            call_within(self._settings.answer_s, lambda: self._shared.release("camera"), "disconnecting")
+
+    def _load(self) -> Any:
+        """Load the configured devices, set the camera's properties, and return the core."""
+        core = self._shared.acquire("camera")
+        camera = core.getCameraDevice()
         if not camera:
             raise RuntimeError("the configuration has no camera")
-        for name, value in self._settings.properties.items():
-            self._core.setProperty(camera, name, value)
+        set_properties(core, camera, self._settings.properties)
+        return core
 
-    def _snap(self, exposure_s: float) -> tuple[Any, str]:
-        """Expose, and return the pixels and the camera's label."""
+    def _snap(self, exposure_s: float) -> tuple[Any, Metadata]:
+        """Expose, and return the pixels, the camera's label and its temperature."""
         self._core.setExposure(1e3 * exposure_s)
-        return self._core.snap(), self._core.getCameraDevice()
+        pixels = self._core.snap()
+        return pixels, {"camera": self._core.getCameraDevice(), "temperature_c": self._read_temperature()}
+
+    def _read_temperature(self) -> float | None:
+        """Return the temperature of the sensor, None if there is no such property, or none that is a number."""
+        label = self._core.getCameraDevice()
+        present = set(self._core.getDevicePropertyNames(label))
+        name = next((it for it in _TEMPERATURES if it in present), None)
+        try:
+            found_c = math.nan if name is None else float(self._core.getProperty(label, name))
+        except ValueError:
+            return None
+        return found_c if math.isfinite(found_c) else None
 
     def _read_report(self) -> CameraReport:
         """Return the report."""

@@ -1,14 +1,19 @@
 """Defines a camera: the types that drivers, capture and simulators share."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
 
 from msgspec import Struct
 from numpy.typing import NDArray
 
 type Pixels = NDArray[Any]
 type Metadata = Mapping[str, str | int | float | Sequence[float] | None]
+
+# Reads the pixels of a frame's file: None if files of this kind cannot be decoded here; raises `CameraError` if it is
+# of a kind that can, and is truncated or damaged.
+type Decode = Callable[[Path], Pixels | None]
 
 
 class CameraReport(Struct, frozen=True):
@@ -22,6 +27,8 @@ class CameraReport(Struct, frozen=True):
         Size of one frame on disk, or an upper estimate.
     exposures_s : tuple of float, optional
         Available exposure times; None if any can be set.
+    exposure_range_s : (float, float), optional
+        Shortest and longest exposure time; None if there are no limits.
     readout_s : float
         Time per frame in addition to the exposure; an estimate until it is measured.
     settings : dict
@@ -33,9 +40,14 @@ class CameraReport(Struct, frozen=True):
     exposures_s: tuple[float, ...] | None = None
     readout_s: float = 0.0
     settings: dict[str, str] = {}
+    exposure_range_s: tuple[float, float] | None = None
 
     def offers(self, exposure_s: float) -> bool:
         """Return whether this exposure time can be set, to within 1 %."""
+        if self.exposure_range_s is not None:
+            shortest_s, longest_s = self.exposure_range_s
+            if not 0.99 * shortest_s <= exposure_s <= 1.01 * longest_s:
+                return False
         return self.exposures_s is None or any(
             abs(exposure_s - offered) <= 0.01 * offered for offered in self.exposures_s
         )
@@ -54,7 +66,7 @@ class Exposure:
     pixels : array, optional
         Values (row, column) or (row, column, colour), if there is no file.
     metadata : mapping
-        What the camera reports about this frame.
+        What the camera reports about this frame; `temperature_c` is that of the sensor.
     """
 
     suffix: str
@@ -89,3 +101,11 @@ class Camera(Protocol):
 
     def close(self) -> None:
         """Disconnect; closing twice does no harm."""
+
+
+@runtime_checkable
+class Thermometer(Protocol):
+    """A camera that can report the temperature of its sensor, without exposing."""
+
+    def temperature_c(self) -> float | None:
+        """Return the temperature in °C, None if this camera has no sensor for it."""

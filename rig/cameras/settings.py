@@ -1,16 +1,70 @@
 """The `[camera]` table of rig.toml, one type for each backend."""
 
 from pathlib import Path
+from typing import Any
 
 from msgspec import Struct
+
+from faintfield.rig.cameras.aravis_pixels import PixelFormat
 
 type Mosaic = tuple[str, ...]
 
 # Largest frame that is simulated; rendering takes some hundred bytes of memory for each pixel.
 MAX_SIMULATED_PIXELS = 40_000_000
 
+# Values of `backend` that are built in.
+BUILT_IN_BACKENDS = ("gphoto2", "micromanager", "aravis", "folder", "simulated")
 
-class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
+# GenICam features that have keys of their own in `[camera]`, or that each frame sets.
+_OWN_FEATURES = {"PixelFormat", "Gain", "ExposureTime"}
+
+# Longest time limit of an operation in s.
+MAX_ANSWER_S = 3600.0
+
+
+def check_mosaic(mosaic: Mosaic | None) -> None:
+    """Check the rows of one period of colour filters; raises `ValueError`."""
+    if mosaic is None:
+        return
+    if not mosaic or not mosaic[0] or len({len(row) for row in mosaic}) > 1 or set("".join(mosaic)) - set("RGB"):
+        raise ValueError(f"camera.mosaic = {list(mosaic)}; give rows of one length of the letters R, G and B")
+
+
+class CoolingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of every `[camera]` table: the temperature at which frames are taken.
+
+    Parameters
+    ----------
+    settle_temperature_c : float, optional
+        Temperature of the sensor that a capture waits for before the first frame of each step; by default it does not
+        wait. The camera's own settings make it cool.
+    settle_tolerance_c : float
+        Largest difference from it.
+    settle_limit_s : float
+        Time limit for the wait.
+    """
+
+    settle_temperature_c: float | None = None
+    settle_tolerance_c: float = 0.5
+    settle_limit_s: float = 900.0
+
+    def __post_init__(self) -> None:
+        wanted_c = self.settle_temperature_c
+        if wanted_c is not None and not -273.15 <= wanted_c < 200.0:
+            raise ValueError(f"camera.settle_temperature_c = {wanted_c:g}; give degrees Celsius")
+        if not (self.settle_tolerance_c > 0.0 and self.settle_limit_s > 0.0):
+            raise ValueError(
+                f"camera.settle_tolerance_c = {self.settle_tolerance_c:g} and settle_limit_s = "
+                f"{self.settle_limit_s:g}; both are positive, correct them"
+            )
+        if wanted_c is None and (self.settle_tolerance_c, self.settle_limit_s) != (0.5, 900.0):
+            raise ValueError(
+                "camera.settle_tolerance_c and settle_limit_s are those of the wait for settle_temperature_c; give it, "
+                "or remove them"
+            )
+
+
+class GPhoto2Settings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="gphoto2"):
     """A tethered camera that libgphoto2 supports.
 
     Parameters
@@ -34,7 +88,9 @@ class GPhoto2Settings(Struct, frozen=True, forbid_unknown_fields=True, tag_field
     keep_on_card: bool = True
 
 
-class MicroManagerSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="micromanager"):
+class MicroManagerSettings(
+    CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="micromanager"
+):
     """A camera for which Micro-Manager has a device adapter.
 
     Parameters
@@ -57,8 +113,91 @@ class MicroManagerSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_
     answer_s: float = 20.0
     mosaic: Mosaic | None = None
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_mosaic(self.mosaic)
 
-class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
+
+class AravisSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="aravis"):
+    """A GenICam camera (GigE Vision or USB3 Vision), through Aravis.
+
+    Parameters
+    ----------
+    pixel_format : str
+        Name by the Pixel Format Naming Convention: Mono or BayerRG, GR, GB or BG, then 8, 10, 12, 14 or 16, or 10p,
+        12p, 10Packed or 12Packed. A Bayer format states the mosaic.
+    camera : str
+        Aravis' name of the camera, its address or its serial number, if there are several; by default the first found.
+    region_px : (int, int, int, int), optional
+        Left column, upper row, width and height of the part of the sensor that is read; by default all of it. Column
+        and row are even for a Bayer format, so that its mosaic stays the same.
+    gain : float, optional
+        Gain in the camera's unit; by default as it is set in the camera. Automatic gain is switched off.
+    features : dict
+        Other GenICam features, set when the camera is opened, such as `BlackLevel = "64"`.
+    packet_bytes : int, optional
+        Size of a network packet; by default as it is set in the camera.
+    packet_socket : bool
+        Whether a network camera may be read through a packet socket, which loses fewer packets and needs rights.
+    answer_s : float
+        Time limit for every operation, in addition to the exposure.
+    """
+
+    pixel_format: str
+    camera: str = ""
+    region_px: tuple[int, int, int, int] | None = None
+    gain: float | None = None
+    features: dict[str, str] = {}
+    packet_bytes: int | None = None
+    packet_socket: bool = True
+    answer_s: float = 20.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if taken := sorted(_OWN_FEATURES & set(self.features)):
+            raise ValueError(f"camera.features has {', '.join(taken)}, which other keys or the capture set; remove it")
+        if self.packet_bytes is not None and not 576 <= self.packet_bytes <= 65535:
+            raise ValueError(f"camera.packet_bytes = {self.packet_bytes}; give 576 to 65535")
+        bayer = self.mosaic is not None
+        if self.region_px is not None:
+            left, upper, width, height = self.region_px
+            if min(left, upper) < 0 or min(width, height) < 1 or (bayer and (left % 2 or upper % 2)):
+                raise ValueError(
+                    f"camera.region_px = {list(self.region_px)}; give left column, upper row, width and height in the "
+                    "sensor, the first two even for a mosaic"
+                )
+        if not 0.0 < self.answer_s <= MAX_ANSWER_S:
+            raise ValueError(f"camera.answer_s = {self.answer_s:g}; give more than 0 and at most {MAX_ANSWER_S:g} s")
+
+    @property
+    def mosaic(self) -> Mosaic | None:
+        """Colour filters, as the pixel format names them."""
+        return PixelFormat.named(self.pixel_format).mosaic
+
+
+class PluginSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="plugin"):
+    """A camera that another package drives; docs/plugins.md.
+
+    Parameters
+    ----------
+    name : str
+        Name of the entry point in the group `faintfield.cameras`, which is `backend` in rig.toml.
+    options : dict
+        The other keys of the table, which the plug-in's own settings type checks.
+    mosaic : tuple of str, optional
+        Rows of one period of the colour filters, such as `["RG", "GB"]`; by default there are none.
+    """
+
+    name: str
+    options: dict[str, Any] = {}
+    mosaic: Mosaic | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_mosaic(self.mosaic)
+
+
+class FolderSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="folder"):
     """Any vendor's program that saves each frame as a file in a folder.
 
     Parameters
@@ -71,6 +210,11 @@ class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
         Upper estimate of the size of a file.
     arrival_s : float
         Time limit from the end of the exposure until the file is complete.
+    quiet_s : float
+        Time without a change after which a file that cannot be decoded here, or that ends in zeros, is complete.
+    file_times : bool
+        Refuse a file that was last changed before the exposure could end; switch this off for a program that gives its
+        files the camera's own time.
     mosaic : tuple of str, optional
         Rows of one period of the colour filters; raw files contain this themselves.
     """
@@ -79,14 +223,22 @@ class FolderSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field=
     suffixes: tuple[str, ...] = (".tif", ".tiff", ".png", ".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf")
     frame_mb: float = 60.0
     arrival_s: float = 60.0
+    quiet_s: float = 5.0
+    file_times: bool = True
     mosaic: Mosaic | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not Path(self.folder).name:
             raise ValueError(f"camera.folder = {self.folder!r} names no folder; give the folder of the camera's files")
+        check_mosaic(self.mosaic)
+        if not 0.0 <= self.quiet_s < self.arrival_s:
+            raise ValueError(
+                f"camera.quiet_s = {self.quiet_s:g}; give less than arrival_s = {self.arrival_s:g}, and at least 0"
+            )
 
 
-class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):
+class SimulatedSettings(CoolingSettings, frozen=True, forbid_unknown_fields=True, tag_field="backend", tag="simulated"):
     """The paper's camera and scene, rendered from the true position of the simulated stage.
 
     Parameters
@@ -103,6 +255,10 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
         Standard deviation, per axis, of the camera's pose from where the motors are.
     scale_error, squareness_mrad : float
         Relative error of distances along x, and the angle by which y deviates from a right angle.
+    start_temperature_c : float, optional
+        Temperature of the sensor when the camera is switched on, from which it cools; by default it is cool already.
+    cooling_s : float
+        Time in which the distance to the set point falls to 1/e. The set point is `settle_temperature_c`, or −20 °C.
     seed : int
         Seed of the random generator.
     """
@@ -118,9 +274,12 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
     rotation_error_mrad: float = 0.0
     scale_error: float = 0.0
     squareness_mrad: float = 0.0
+    start_temperature_c: float | None = None
+    cooling_s: float = 120.0
     seed: int = 1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if min(self.size_px) < 8:
             raise ValueError(f"camera.size_px = {list(self.size_px)} is too small; give at least 8 x 8")
         width, height = self.size_px
@@ -133,8 +292,11 @@ class SimulatedSettings(Struct, frozen=True, forbid_unknown_fields=True, tag_fie
             raise ValueError("camera: a gain is positive, and read noise and errors are not negative; correct them")
         if min(self.lit_photons_per_s, self.unlit_photons_per_s, self.seed) < 0 or not 0 < self.saturation_dn < 2**16:
             raise ValueError("camera: light and seed are not negative, and saturation_dn is 1 to 65535; correct them")
-        if self.mosaic is not None and (not self.mosaic or set("".join(self.mosaic)) - set("RGB")):
-            raise ValueError(f"camera.mosaic = {list(self.mosaic)}; give rows of the letters R, G and B")
+        if not self.cooling_s > 0.0:
+            raise ValueError(f"camera.cooling_s = {self.cooling_s:g}; give a positive time")
+        check_mosaic(self.mosaic)
 
 
-type CameraSettings = GPhoto2Settings | MicroManagerSettings | FolderSettings | SimulatedSettings
+type CameraSettings = (
+    GPhoto2Settings | MicroManagerSettings | AravisSettings | FolderSettings | SimulatedSettings | PluginSettings
+)

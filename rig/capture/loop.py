@@ -1,7 +1,5 @@
 """Run a capture: take every missing frame of a session, step by step, and handle requests and failures."""
 
-from contextlib import suppress
-
 import msgspec
 
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, OperatorInterface, Prompt, step_prompt
@@ -9,8 +7,10 @@ from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.survey import check_plan
 from faintfield.rig.capture.take import Decode, DriftChecks, FrameTaker
 from faintfield.rig.devices import Rig
-from faintfield.rig.errors import CameraError, NotHomed, StageError
+from faintfield.rig.errors import CameraError, DriftUnknown, NotHomed, PlanRefused, PositionDrifted, StageError
 from faintfield.rig.plan import PlannedFrame
+from faintfield.rig.session.homings import begin_group, unchecked_frames
+from faintfield.rig.session.journal import CommittedFrame, Suspect
 from faintfield.rig.session.session import Session
 from faintfield.rig.stages.drift import recover
 
@@ -38,7 +38,9 @@ class Capture:
         self._dialogue = Dialogue(session, operator, self._pace)
         self._drift = DriftChecks(session, rig, self._dialogue, self._pace)
         self._taker = FrameTaker(session, rig, self._dialogue, self._drift, self._pace, decode)
-        self._failures = 0
+        self._failures = self._untimed_checks = 0
+        self._homings_in_journal = 0
+        self._unrecovered: Exception | None = None
 
     def run(self) -> None:
         """Take every missing frame and seal the session.
@@ -55,6 +57,8 @@ class Capture:
                 self._connect()
             while missing := self._session.missing() or self._ask_about_skipped():
                 self._run_step(missing)
+            if self._drift.watch is not None:  # a capture that was killed may have left nothing but the last check
+                self._mark_unchecked("the capture ended")
             self._session.seal()
         finally:
             self._rig.camera.close()
@@ -72,7 +76,19 @@ class Capture:
         check_plan(session.plan, rig.stage, report)
         if not self._may_home("The stage moves to its switches, to find its position.", "Keep clear of it."):
             self._dialogue.stop()
-        self._drift.begin()
+        self._begin_drift_checks()
+
+    def _begin_drift_checks(self) -> None:
+        """Home, and measure what drift is judged by; again while delayed answers prevent it, up to a bound."""
+        for attempts_left in reversed(range(MAX_UNATTENDED_TRIES)):
+            try:
+                self._drift.begin()
+            except (DriftUnknown, PositionDrifted) as failure:
+                if failure.__cause__ is not None or not attempts_left:
+                    raise
+                self._dialogue.warn(str(failure))
+            else:
+                return
 
     def _run_step(self, missing: list[PlannedFrame]) -> None:
         """Prompt for the next step, and take its frames."""
@@ -90,21 +106,52 @@ class Capture:
         if answer == "stop":
             self._dialogue.stop()
         self._rig.arrange(first.kind, first.sweep)
-        for frame in frames:
-            if frame in session.skipped():
-                continue
-            self._handle_request(frame)
-            if frame in session.missing():
-                self._take(frame)
-            self._drift.check_after(session.frozen.rig.drift.every_nodes)
+        for frame, following in zip(frames, [*frames[1:], None], strict=True):
+            if frame not in session.skipped():
+                self._handle_request(frame)
+                if frame in session.missing():
+                    self._take(frame)
+            if following is None or following.stop != frame.stop:  # a homing would part the frames of a node
+                self._check_drift(frame, session.frozen.rig.drift.every_nodes)
         if session.plan.steps[first.step].at == "grid":
-            self._drift.check_after(1)
+            self._check_drift(frames[-1], 1)
+
+    def _check_drift(self, frame: PlannedFrame, nodes: int) -> None:
+        """Check for drift after `nodes` nodes; a failure of the stage is handled like one at `frame`."""
+        self._failures = 0
+        while True:
+            try:
+                self._drift.check_after(nodes)
+            except DriftUnknown as failure:
+                self._handle_untimed_check(failure)
+            except (StageError, NotHomed, PlanRefused) as failure:
+                if self._handle_failure(frame, failure) == "again":
+                    continue
+            else:
+                if self._drift.watch is not None and not self._drift.watch.unchecked:
+                    self._untimed_checks = 0
+            return
+
+    def _handle_untimed_check(self, failure: DriftUnknown) -> None:
+        """Record frames about which a check says nothing, and ask whether to take them again."""
+        doubtful = [it for it in failure.suspect if isinstance(it, CommittedFrame)]
+        self._session.journal.event("suspect", message=str(failure), intents=[it.intent for it in doubtful])
+        self._dialogue.warn(str(failure))
+        self._untimed_checks += 1
+        unattended: Answer = "retake" if self._untimed_checks < MAX_UNATTENDED_TRIES else "stop"
+        answers: tuple[Answer, ...] = ("retake", "keep", "stop")
+        answer = self._dialogue.ask(Prompt("drift", "Drift could not be checked", (str(failure),), answers, unattended))
+        if answer == "stop":
+            self._dialogue.stop()
+        if answer == "retake":
+            self._session.void(doubtful, "taken before a check of the stage that says nothing")
 
     def _take(self, frame: PlannedFrame) -> None:
         """Take a frame; after a failure, ask what to do until it is taken, skipped, or the capture stops."""
         self._failures = 0
         while True:
             try:
+                self._note_homing()
                 self._taker.take(frame)
             except (StageError, NotHomed, CameraError) as failure:
                 if self._handle_failure(frame, failure) == "skip":
@@ -133,6 +180,8 @@ class Capture:
 
     def _handle_failure(self, frame: PlannedFrame, failure: Exception) -> Answer:
         """Record a failure and ask what to do; prepare another try, or re-raise it if the answer is to stop."""
+        if isinstance(failure, NotHomed) and self._unrecovered is not None:
+            failure = self._unrecovered
         device = "camera" if isinstance(failure, CameraError) else "stage"
         self._failures += 1
         self._pace.here = None
@@ -145,14 +194,43 @@ class Capture:
         if answer == "stop":
             raise failure
         if answer == "again":
-            # If this fails, the next motion or exposure fails as well
-            with suppress(StageError, CameraError):
-                if device == "stage":
-                    recover(self._rig.stage, self._may_home, self._drift.watch)
-                else:
-                    self._rig.camera.close()
-                    self._rig.camera.open()
+            self._recover(frame, device)
         return answer
+
+    def _recover(self, frame: PlannedFrame, device: str) -> None:
+        """Make a device usable again; if that fails, so does the next motion or exposure, which is then handled."""
+        self._dialogue.show_status(frame, f"waiting for the {device}")
+        self._unrecovered = None
+        try:
+            if device == "stage":
+                recover(self._rig.stage, self._may_home, self._drift.watch)
+            else:
+                self._rig.camera.close()
+                self._rig.camera.open()
+        except (StageError, CameraError, NotHomed, PlanRefused) as failure:
+            self._unrecovered = failure
+            event = {"error": type(failure).__name__, "message": str(failure)}
+            self._session.journal.event("recovery_failed", frame=frame.number, device=device, **event)
+            self._dialogue.warn(f"{frame.name}: the {device} was not recovered: {failure}")
+
+    def _note_homing(self) -> None:
+        """Begin a homing group in the journal if the stage was homed since the last frame."""
+        if self._rig.stage.homings != self._homings_in_journal:
+            self._homings_in_journal = self._rig.stage.homings
+            if self._drift.watch is not None:
+                self._mark_unchecked("the stage was homed")
+            begin_group(self._session.journal)
+
+    def _mark_unchecked(self, event: str) -> None:
+        """Mark the frames at nodes that no drift check will confirm, since `event` came before it."""
+        session = self._session
+        steps = [session.plan.steps[it.step] for it in session.frames]
+        marked = {intent for it in session.journal.details("suspect", Suspect) for intent in it.intents}
+        unchecked = [it.intent for it in unchecked_frames(session.journal) if steps[it.frame].at == "grid"]
+        if not marked.issuperset(unchecked):
+            message = f"{event} before {len(unchecked)} frames were checked for drift; they stay as suspect"
+            session.journal.event("suspect", message=message, intents=unchecked)
+            self._dialogue.warn(message)
 
     def _may_home(self, *question: str) -> bool:
         """Ask before the stage moves to its switches."""

@@ -5,6 +5,7 @@ import math
 from msgspec import Struct
 
 from faintfield.rig.cameras.protocol import CameraReport
+from faintfield.rig.capture.temperature import require_temperature
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import PlanRefused
 from faintfield.rig.plan import CapturePlan
@@ -46,6 +47,7 @@ def survey(rig: Rig, settings: RigSettings) -> Survey:
         rig.stage.connect()
         rig.camera.open()
         report = rig.camera.report()
+        require_temperature(rig.camera, settings.camera)
         plan = CapturePlan.of(
             settings.grid,
             settings.steps(),
@@ -74,7 +76,7 @@ def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
     plan.check(stage.workspace())
     for exposure_s in sorted({exposure_s for step in plan.steps for exposure_s in step.exposure_s}):
         if not camera.offers(exposure_s):
-            offered = camera.exposures_s or ()
+            offered = camera.exposures_s or camera.exposure_range_s or ()
             nearest = min(offered, key=lambda it: abs(math.log(it / exposure_s)), default=math.nan)
             raise PlanRefused(
                 f"exposure_s = {exposure_s:g} is not offered by the camera, the nearest that is: {nearest:g}; "

@@ -1,17 +1,19 @@
 """Take one frame, and check for drift: move, rest, verify the position, expose, write, check and commit."""
 
 import itertools
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import msgspec
 
+from faintfield.rig.cameras.protocol import Decode as Decode  # the loop takes it from here
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.checks import LIT_KINDS, Findings, board_warnings, check_frame
 from faintfield.rig.capture.guide import MAX_UNATTENDED_TRIES, Answer, Dialogue, Prompt
+from faintfield.rig.capture.layout import LayoutCheck
 from faintfield.rig.capture.pace import Pace
 from faintfield.rig.capture.settling import Settling, measure_settling
+from faintfield.rig.capture.temperature import TemperatureWait
 from faintfield.rig.devices import Rig
 from faintfield.rig.errors import CameraError, PositionDrifted
 from faintfield.rig.plan import PlannedFrame
@@ -100,8 +102,6 @@ class DriftChecks:
         self.begin()
 
 
-type Decode = Callable[[Path], Pixels | None]
-
 # Exposures that are not kept are numbered from here, beyond the number of any frame.
 _FIRST_UNKEPT_NUMBER = 10**9
 
@@ -122,7 +122,7 @@ class FrameTaker:
     pace : Pace
         Knows the position of the stage, and learns how long a frame takes.
     decode : callable
-        Reads the pixels of a frame's file; returns None if it cannot.
+        Reads the pixels of a frame's file; returns None if it cannot, and raises `CameraError` for a damaged file.
 
     Attributes
     ----------
@@ -134,18 +134,20 @@ class FrameTaker:
         self, session: Session, rig: Rig, dialogue: Dialogue, drift: DriftChecks, pace: Pace, decode: Decode
     ) -> None:
         self._session = session
-        self._settings = session.frozen.rig
+        self._settings = session.rig
         self._rig = rig
         self._dialogue = dialogue
         self._drift = drift
         self._pace = pace
         self._decode = decode
+        self._layouts = LayoutCheck(session, decode)
+        self._temperature = TemperatureWait(session, rig, dialogue)
         self._settle_s: float | None = None
         self._unkept_numbers = itertools.count(_FIRST_UNKEPT_NUMBER)
         self.last: PlannedFrame | None = None
 
     def take(self, frame: PlannedFrame) -> None:
-        """Move to the node of a frame and take it.
+        """Move to the node of a frame and take it; before the first frame of a step, wait for the sensor to be cool.
 
         Raises
         ------
@@ -156,10 +158,15 @@ class FrameTaker:
         SessionUnwritable
             The frame could not be written.
         """
+        self._temperature.before(frame)
         self._dialogue.show_status(frame, "moving")
         self._go_to(frame)
         self._dialogue.show_status(frame, "exposing")
-        self._expose(frame)
+        try:
+            self._expose(frame)
+        except CameraError:
+            self._temperature.forget()
+            raise
 
     def _go_to(self, frame: PlannedFrame) -> None:
         """Move the stage to the node of a frame, and wait until it is at rest."""
@@ -185,7 +192,11 @@ class FrameTaker:
         exposure = rig.camera.expose(frame.exposure_s, intent)
         rig.stage.verify_at(*frame.stop.target)
         written = session.write(frame, intent, exposure)
-        pixels = exposure.pixels if exposure.pixels is not None else self._decode(written.path)
+        try:
+            pixels = self._layouts.pixels_of(frame, written.path, exposure)
+        except CameraError as failure:
+            session.reject(frame, written, str(failure))
+            raise
         found = self._check(frame, pixels)
         record = FrameRecord(position.point, frame.exposure_s, dict(exposure.metadata), found.values, found.warnings)
         self._drift.add(session.commit(frame, written, record))
@@ -227,7 +238,7 @@ class FrameTaker:
         measured = self._session.journal.details("settling", Settling)
         if measured:
             return measured[-1].wait_s
-        if not settings.measure:
+        if not (settings.measure and self._rig.camera_sees_stage):
             return self._session.plan.settle_s
         self._dialogue.show_status(frame, "measuring how long the rig swings")
         found = measure_settling(self._take_unkept, self._rig.clock, settings)

@@ -5,7 +5,7 @@ Rows are only added, ordered by their numbers, and chained by hashes; times are 
 back.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -123,7 +123,7 @@ class Begun(Struct, frozen=True):
 
 
 class Suspect(Struct, frozen=True):
-    """Detail of an event `suspect`: the exposures that relied on a stage that lost its scale."""
+    """Detail of an event `suspect`: the exposures after which no check says that the stage kept its scale."""
 
     intents: tuple[int, ...]
 
@@ -200,6 +200,12 @@ class Journal:
         with self._transaction():
             self._add("event", (None, _now(), kind, frame, _to_json(detail)))
 
+    def add_events(self, kind: str, details: Sequence[Struct]) -> None:
+        """Record events of a kind, all or none."""
+        if details:
+            with self._transaction():
+                self._add("event", *((None, _now(), kind, None, _to_json(it)) for it in details))
+
     def intend(self, frame: int) -> int:
         """Record that `frame` will be taken now, and return the number of the exposure."""
         with self._transaction():
@@ -230,6 +236,12 @@ class Journal:
         """Return the number and the frame of every exposure that was not committed."""
         with self._translate_errors():
             return self._read(_UncommittedRow, _UNCOMMITTED)
+
+    def next_intent(self) -> int:
+        """Return the number that the next exposure will have."""
+        with self._translate_errors():
+            ((last,),) = self._read(tuple[_Index], "SELECT coalesce(max(id), 0) FROM intent")
+            return int(last) + 1
 
     def events(self, kind: str | None = None) -> list[JournalEvent]:
         """Return the events in order, all or those of one kind."""

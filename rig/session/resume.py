@@ -8,7 +8,8 @@ from pathlib import Path
 
 import msgspec
 
-from faintfield.rig.errors import PlanRefused, SessionCorrupt
+from faintfield.rig.errors import SessionCorrupt
+from faintfield.rig.session.changes import settings_of
 from faintfield.rig.session.disk import (
     PART,
     list_names,
@@ -33,7 +34,6 @@ from faintfield.rig.session.session import (
     open_journal,
     read_plan_and_hash,
 )
-from faintfield.rig.settings import RigSettings
 
 type Progress = Callable[[Iterable[CommittedFrame]], Iterable[CommittedFrame]]
 
@@ -77,6 +77,7 @@ def open_session(folder: Path, plan: FrozenPlan | None, progress: Progress = ite
             with translate_errors(folder):
                 make_folder(folder / FRAMES)
             session = Session(folder, frozen, journal)
+            session.rig = settings_of(frozen, journal)
             _reconcile(session, names, progress)
             yield session
 
@@ -139,23 +140,3 @@ def _is_intact(path: Path, digest: str) -> bool:
 def _printable(name: str) -> str:
     """Return a file name without bytes that are no text."""
     return os.fsencode(name).decode(errors="backslashreplace")
-
-
-def check_same_rig(frozen: FrozenPlan, now: RigSettings) -> None:
-    """Raise if a session was planned for another rig than the present one.
-
-    The port, its baud rate and the `[scene]` table, which is only read after the capture, may differ.
-
-    Raises
-    ------
-    PlanRefused
-        A table differs; the message names the first.
-    """
-    stage = msgspec.structs.replace(now.stage, port=frozen.rig.stage.port, baud=frozen.rig.stage.baud)
-    now = msgspec.structs.replace(now, stage=stage, scene=frozen.rig.scene)
-    for name in now.__struct_fields__:
-        if getattr(now, name) != getattr(frozen.rig, name):
-            raise PlanRefused(
-                f"[{name}] of the rig.toml is not what the plan.json of the session says; restore the one that "
-                "was changed, or begin a new session"
-            )

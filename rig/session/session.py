@@ -14,7 +14,7 @@ from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.errors import SessionCorrupt, SessionUnreadable, SessionUnwritable
 from faintfield.rig.plan import MAX_NUMBER, CapturePlan, PlannedFrame, planned_frames
 from faintfield.rig.session.database import FORMAT
-from faintfield.rig.session.disk import encode_exposure, list_names, translate_errors, write_new
+from faintfield.rig.session.disk import encode_exposure, list_names, set_aside, translate_errors, write_new
 from faintfield.rig.session.journal import CommittedFrame, FrameRecord, Journal
 from faintfield.rig.session.names import is_plain_name
 from faintfield.rig.session.regular_files import read_regular, sha256
@@ -74,6 +74,8 @@ class Session:
     ----------
     frames : tuple of PlannedFrame
         All frames of the plan, in order.
+    rig : RigSettings
+        The settings that apply now: those of plan.json, with the changes that were made before it was resumed.
     """
 
     def __init__(self, folder: Path, frozen: FrozenPlan, journal: Journal) -> None:
@@ -81,6 +83,7 @@ class Session:
         self.frozen = frozen
         self.journal = journal
         self.frames = planned_frames(frozen.plan)
+        self.rig = frozen.rig
         self._skipped: set[int] = set()
         self._valid = valid_frames(folder, self.frames, journal.committed())
 
@@ -126,6 +129,11 @@ class Session:
             digest = hashing.submit(hashlib.sha256, content)
             write_new(path, content)
         return WrittenFile(intent, path, digest.result().hexdigest(), len(content))
+
+    def reject(self, frame: PlannedFrame, written: WrittenFile, why: str) -> None:
+        """Set the file of an exposure aside that is no frame of this session; its frame stays missing."""
+        moved = set_aside(written.path, self.folder / ASIDE)
+        self.journal.event("set_aside", frame=frame.number, file=written.path.name, to=moved.name, why=why)
 
     def commit(self, frame: PlannedFrame, written: WrittenFile, record: FrameRecord) -> CommittedFrame:
         """Record that a frame is taken; earlier takes of it become void."""
@@ -183,7 +191,7 @@ def read_plan_and_hash(folder: Path) -> tuple[FrozenPlan, str]:
     try:
         encoded = read_regular(path, _MAX_PLAN_BYTES)
         content = msgspec.json.decode(encoded)
-        if place := _find_wild_number(content):
+        if place := find_wild_number(content):
             raise SessionCorrupt(f"{path}: {place} in size is more than {MAX_NUMBER:g}; restore it from a copy")
         return msgspec.convert(content, FrozenPlan), hashlib.sha256(encoded).hexdigest()
     except OSError as failure:
@@ -196,7 +204,7 @@ def read_plan_and_hash(folder: Path) -> tuple[FrozenPlan, str]:
         raise SessionCorrupt(f"{path}: is not a plan ({failure}); restore it from a copy") from failure
 
 
-def _find_wild_number(content: object, place: str = "plan") -> str | None:
+def find_wild_number(content: object, place: str = "plan") -> str | None:
     """Return place and value of a number that no rig has, at any depth."""
     if isinstance(content, dict):
         parts = [(value, f"{place}.{key}") for key, value in content.items()]
@@ -206,7 +214,7 @@ def _find_wild_number(content: object, place: str = "plan") -> str | None:
         return f"{place} = {float(content):g}"
     else:
         return None
-    return next((found for value, name in parts if (found := _find_wild_number(value, name))), None)
+    return next((found for value, name in parts if (found := find_wild_number(value, name))), None)
 
 
 def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read_only: bool = False) -> Journal:

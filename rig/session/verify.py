@@ -45,7 +45,7 @@ class Verdict(Struct, frozen=True):
     superseded : int
         Number of files replaced by a later take of the same frame.
     suspect : tuple of str
-        Names of frames that were kept although the next check of the stage failed.
+        Names of frames that were kept although the next check of the stage failed, or the stage was homed before it.
     sealed : bool
         Whether the session is complete.
     """

@@ -15,6 +15,7 @@ from faintfield.rig.errors import CameraError
 from faintfield.rig.plan import StepKind
 from faintfield.rig.settings import BoardSettings
 from faintfield.rig.simulation.boards import standing_board
+from faintfield.rig.simulation.cooling import SET_POINT_C, Cooling
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from faintfield.rig.simulation.scene import TexturedPlane, render
 from faintfield.rig.simulation.sensor import through_mosaic
@@ -179,9 +180,6 @@ TRUE_POSE = "true_rt_cam_ref"
 # Time to read a frame.
 _READOUT_S = 0.05
 
-# Temperature of the cooled sensor, recorded with each frame.
-_TEMPERATURE_C = -20.0
-
 # Upper estimate of what a TIFF file holds besides its pixels.
 _TIFF_HEADER_BYTES = 512
 
@@ -204,10 +202,15 @@ class SimulatedCamera:
         self._clock = clock
         self._lab = lab
         self._open = False
+        set_point_c = SET_POINT_C if settings.settle_temperature_c is None else settings.settle_temperature_c
+        self._cooling = Cooling(settings.start_temperature_c, set_point_c, settings.cooling_s, settings.seed)
+        self._switched_on_s: float | None = None
 
     def open(self) -> None:
-        """Connect."""
+        """Connect; the cooler starts when this is done first."""
         self._open = True
+        if self._switched_on_s is None:
+            self._switched_on_s = self._clock.now_s()
 
     def report(self) -> CameraReport:
         """Return the size of a frame."""
@@ -218,14 +221,20 @@ class SimulatedCamera:
     def expose(self, exposure_s: float, number: int) -> Exposure:
         """Render the scene from the camera's pose at the beginning of the exposure."""
         self._require_open()
+        temperature_c = self.temperature_c()
         truth = [float(value) for value in self._lab.rt_cam_ref(exposure_s)]
         pixels = self._lab.expose(exposure_s, number)
         self._clock.sleep_s(exposure_s + _READOUT_S)
         return Exposure(
             ".tiff",
             pixels=pixels,
-            metadata={"camera": "simulated camera", "temperature_c": _TEMPERATURE_C, TRUE_POSE: truth},
+            metadata={"camera": "simulated camera", "temperature_c": temperature_c, TRUE_POSE: truth},
         )
+
+    def temperature_c(self) -> float:
+        """Return the temperature of the sensor in °C."""
+        self._require_open()
+        return self._cooling.temperature_c(self._clock.now_s() - (self._switched_on_s or 0.0))
 
     def close(self) -> None:
         """Disconnect."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from msgspec import Struct
 
-from faintfield.rig.errors import OutsideTravel, PlanRefused, PositionDrifted
+from faintfield.rig.errors import DriftUnknown, OutsideTravel, PlanRefused, PositionDrifted
 from faintfield.rig.stages.drift import DriftWatch
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.motion import path_duration_s
@@ -53,7 +53,8 @@ def check_conformance(stage: Gantry) -> Iterator[Check]:
     yield _speed(stage)
     yield _arrival(stage)
     yield _report_rate(stage)
-    yield _repeatability(stage)
+    if stage.identify().has_switches:
+        yield _repeatability(stage)
 
 
 def _settings(stage: Gantry) -> Check:
@@ -124,7 +125,7 @@ def _repeatability(stage: Gantry) -> Check:
         for corner in _corners(stage):
             watch.note(stage.move_to(*corner))
         drift = watch.check()
-    except (PositionDrifted, PlanRefused) as failure:
+    except (PositionDrifted, DriftUnknown, PlanRefused) as failure:
         return Check("repeatability", False, str(failure), "no drift")
     worst_mm = max(map(abs, drift.away_mm))
     return Check("repeatability", True, f"{worst_mm:.2f} mm", f"<= {drift.limit_mm:g} mm")

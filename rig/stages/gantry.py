@@ -7,16 +7,13 @@ axes restores trust.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import NotHomed, OutsideTravel, PositionLost, StageError, StageLost
-from faintfield.rig.stages.grbl.controller import GrblController
-from faintfield.rig.stages.marlin.controller import MarlinController
 from faintfield.rig.stages.motion import duration_s, one_sided_path, path_duration_s
 from faintfield.rig.stages.protocol import AxisIndex, Box, Controller, Homing, Identity, Point, Position, StageSettings
-from faintfield.rig.stages.transport import LineTransport, Port, TrafficLog
 from faintfield.rig.stages.workspace import StageWorkspace
 
 # Longest jog without homing, in mm: enough to see which way an axis moves, too short to do damage.
@@ -44,8 +41,14 @@ class Gantry:
         self.settings = settings
         self._controller = controller
         self._identity: Identity | None = None
-        self._trusted = False
+        self._trusted = self._failed = False
         self._here: Point | None = None
+        self._homings = 0
+
+    @property
+    def homings(self) -> int:
+        """How often it was homed: positions before and after a homing may differ by what the switches do."""
+        return self._homings
 
     @property
     def trusted(self) -> bool:
@@ -112,10 +115,11 @@ class Gantry:
         identity = self.identify()
         was_trusted = self._trusted
         with self._stopping_on_error():
-            taken_s = self._controller.home(None if identity.homes_together else axis, identity.homing_bound_s)
+            self._homings += 1
+            time = self._controller.home(None if identity.homes_together else axis, identity.homing_bound_s)
             point = self._controller.read_position()
         self._trusted, self._here = was_trusted or axis is None or identity.homes_together, point
-        return Homing(self._report(point), taken_s)
+        return Homing(self._report(point), time)
 
     def move_to(self, x_mm: float, y_mm: float) -> Position:
         """Go to a position, wait until the stage stands still there, and return the verified report.
@@ -208,7 +212,7 @@ class Gantry:
     def hold(self) -> None:
         """Stop at once; the position is kept if the controller decelerates without losing steps."""
         self._here = None
-        with self._tracking_trust():
+        with self._stopping_on_error():
             self._trusted &= self._controller.stop()
 
     def recover(self) -> None:
@@ -221,14 +225,22 @@ class Gantry:
         """
         self._here = None
         with self._tracking_trust():
-            self._trusted &= self._controller.recover()
+            self._trusted &= self._controller.recover(self.settings.reconnect_s)
             self._identity = self._controller.identify()
+        self._failed = False
 
     def close(self) -> None:
-        """Close the port, without moving; the stage must be homed after the next `connect`."""
+        """Close the port, without moving; the stage must be homed after the next `connect`.
+
+        After a failure the controller is stopped first, so that it holds no motion that could go on.
+        """
         self._distrust()
-        self._identity = None
-        self._controller.close()
+        try:
+            if self._failed:
+                self._controller.abort()
+        finally:  # a plug-in may raise anything
+            self._identity, self._failed = None, False
+            self._controller.close()
 
     def _require_trust(self, target: Point) -> None:
         """Raise `NotHomed` unless reported positions can be trusted."""
@@ -260,11 +272,12 @@ class Gantry:
         try:
             yield
         except StageError as failure:
-            self._here = None
+            self._here, self._failed = None, True
             self._trusted &= failure.position_kept
             raise
         except BaseException:
             self._distrust()
+            self._failed = True
             raise
 
     @contextmanager
@@ -276,25 +289,3 @@ class Gantry:
         except BaseException:
             self._trusted &= self._controller.abort()
             raise
-
-
-def make_stage(
-    settings: StageSettings, clock: Clock, traffic: TrafficLog | None, open_port: Callable[[], Port]
-) -> Gantry:
-    """Return the stage that `settings` describe, not yet connected.
-
-    Parameters
-    ----------
-    settings : StageSettings
-        Protocol, axes and limits.
-    clock : Clock
-        Clock of the rig.
-    traffic : TrafficLog, optional
-        Log of every byte sent and received.
-    open_port : callable
-        Opens the connection; for real hardware, a `SerialPort` on `settings.port`.
-    """
-    line = LineTransport(open_port, clock, traffic)
-    if settings.protocol == "grbl":
-        return Gantry(GrblController(line, settings.axes), settings, clock)
-    return Gantry(MarlinController(line, settings.axes, settings.travel_mm), settings, clock)

@@ -5,7 +5,7 @@ not shifted or flipped, so a position in a log can be compared with the controll
 """
 
 from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol, Self
+from typing import Any, Literal, NamedTuple, Protocol, Self
 
 from msgspec import Struct
 
@@ -84,6 +84,8 @@ class Identity(Struct, frozen=True):
         The controller's settings as reported, for the record.
     warnings : tuple of str
         Settings that work but should be changed, each with its remedy.
+    has_switches : bool
+        Whether homing ends at switches, so that its time shows lost steps.
     """
 
     firmware: str
@@ -95,6 +97,7 @@ class Identity(Struct, frozen=True):
     pull_off_mm: float
     settings: dict[str, str]
     warnings: tuple[str, ...] = ()
+    has_switches: bool = True
 
 
 class Position(Struct, frozen=True):
@@ -120,11 +123,23 @@ class Position(Struct, frozen=True):
         return self.trusted and all(abs(here - there) <= tolerance for here, there, tolerance in near)
 
 
+class AnswerTime(NamedTuple):
+    """How long a command took (s), and by how much less it may have taken because its answer was read late."""
+
+    taken_s: float
+    late_s: float
+
+
 class Homing(Struct, frozen=True):
     """The result of homing: the position at its end, and how long the controller took."""
 
     position: Position
-    duration_s: float
+    time: AnswerTime
+
+    @property
+    def duration_s(self) -> float:
+        """How long the controller took, at most."""
+        return self.time.taken_s
 
 
 class Controller(Protocol):
@@ -133,14 +148,14 @@ class Controller(Protocol):
     Every method is bounded in time, and raises a `StageError` if the controller does not obey.
     """
 
-    def connect(self) -> None:
-        """Open the connection and wait until the controller answers."""
+    def connect(self, wait_s: float = 0.0) -> None:
+        """Open the connection, waiting up to `wait_s` for its port, and wait until the controller answers."""
 
     def identify(self) -> Identity:
         """Read the firmware's version and settings; raises `WrongFirmware`."""
 
-    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
-        """Home, and return how long the controller took, in seconds."""
+    def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
+        """Home, and return how long the controller took."""
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Move through the points of `path`, wait until the stage stands still, and return the reported position."""
@@ -158,10 +173,13 @@ class Controller(Protocol):
         """Stop the motion, wait until it has ended, and return whether the position is kept."""
 
     def abort(self) -> bool:
-        """Tell the stage to stop, without waiting and without raising; return whether the position is kept."""
+        """Stop the stage and leave no motion that could go on, without raising; return whether the position is kept."""
 
-    def recover(self) -> bool:
-        """Make the controller accept commands again, without moving; return whether the position is kept."""
+    def recover(self, wait_s: float) -> bool:
+        """Make the controller accept commands again, without moving; return whether the position is kept.
+
+        Waits up to `wait_s` for a port that is lost.
+        """
 
     def close(self) -> None:
         """Close the connection."""
@@ -169,8 +187,16 @@ class Controller(Protocol):
 
 type ProtocolName = Literal["grbl", "marlin", "simulated"]
 
+# Firmware that is driven over a serial port; protocols that no options belong to; all that are built in.
+SERIAL_PROTOCOLS = ("grbl", "marlin")
+WITHOUT_OPTIONS = (*SERIAL_PROTOCOLS, "simulated")
+BUILT_IN_PROTOCOLS = (*WITHOUT_OPTIONS, "micromanager")
+
+# Prefix of the port of a simulated stage; the name of its controller follows.
+SIMULATED = "simulated:"
 
 # pyserial has others, of which one writes a file (`spy://`), and a rig.toml may come from anyone.
+_MAX_RECONNECT_S = 86400.0
 _URL_SCHEMES = ("socket", "rfc2217", "hwgrep", "alt")
 
 
@@ -180,7 +206,8 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     Parameters
     ----------
     protocol : str
-        Firmware of the controller; `simulated` needs no port and no hardware.
+        Firmware of the controller: `grbl` or `marlin`; `micromanager`, or the name of a plug-in (docs/plugins.md);
+        `simulated` needs no port and no hardware.
     port : str
         Serial device, or a pyserial URL such as `socket://127.0.0.1:7000`.
     baud : int
@@ -195,9 +222,13 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
         Allowed positions, if the controller allows more or does not report its travel.
     keep_out : tuple of Box
         Boxes that the stage must neither enter nor cross.
+    reconnect_s : float
+        How long to wait for a port that was lost, such as one that USB lists anew.
+    options : dict
+        The other keys of the table, for `micromanager` and plug-ins, whose settings types check them.
     """
 
-    protocol: ProtocolName
+    protocol: str
     port: str = ""
     baud: int = 115200
     axes: tuple[str, str] = ("X", "Y")
@@ -205,10 +236,19 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
     approach_mm: float = 2.0
     travel_mm: Box | None = None
     keep_out: tuple[Box, ...] = ()
+    reconnect_s: float = 60.0
+    options: dict[str, Any] = {}
 
     def __post_init__(self) -> None:
-        if not self.port and self.protocol != "simulated":
+        if not self.port and self.protocol in SERIAL_PROTOCOLS:
             raise ValueError("stage.port is missing; give the serial device, such as /dev/ttyUSB0")
+        if self.options and self.protocol in WITHOUT_OPTIONS:
+            raise ValueError(f"stage.options are not for protocol = {self.protocol!r}; remove them")
+        firmware = self.port.removeprefix(SIMULATED).partition(":")[0]
+        if self.simulated and self.protocol in SERIAL_PROTOCOLS and firmware and not firmware.startswith(self.protocol):
+            raise ValueError(
+                f"stage.port = {self.port!r} is not of protocol = {self.protocol!r}; set stage.protocol to 'simulated'"
+            )
         scheme, of_url, _ = self.port.partition("://")
         if of_url and scheme not in _URL_SCHEMES:
             raise ValueError(
@@ -219,5 +259,12 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")
         if self.approach_mm < 0.0:
             raise ValueError(f"stage.approach_mm must not be negative; got {self.approach_mm:g}")
+        if not 0.0 <= self.reconnect_s <= _MAX_RECONNECT_S:
+            raise ValueError(f"stage.reconnect_s = {self.reconnect_s:g}; give 0 to {_MAX_RECONNECT_S:g} s")
         if self.feed_mm_per_min is not None and not self.feed_mm_per_min > 0.0:
             raise ValueError(f"stage.feed_mm_per_min must be positive; got {self.feed_mm_per_min:g}")
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the stage is simulated."""
+        return self.protocol == "simulated" or self.port.startswith(SIMULATED)

@@ -10,11 +10,19 @@ from serial.tools.list_ports import comports
 
 from faintfield.rig.clock import Clock
 from faintfield.rig.errors import StageLost, in_one_line
+from faintfield.rig.stages.protocol import AnswerTime
 
 type Direction = Literal["sent", "received"]
 
 # Bytes kept of a line without end, which is noise: longer than any line of the controllers.
 _MAX_LINE_BYTES = 1024
+
+# Time in s between two attempts to open a port that is missing.
+_REOPEN_S = 0.5
+
+# The port is looked at this often (s), so that it is known how long an answer may have waited there. Two such times are
+# as much as serial adapters hold back a short answer.
+_LOOK_S = 0.008
 
 # Timeout of a write in s, for a port that has stopped accepting bytes.
 _WRITE_TIMEOUT_S = 2.0
@@ -78,7 +86,8 @@ class SerialPort:
     def read(self, timeout_s: float) -> bytes:
         """Return what has arrived, waiting up to `timeout_s` for the first byte."""
         with self._reported_as_lost():
-            self._serial.timeout = timeout_s
+            if self._serial.timeout != timeout_s:  # setting it configures the port anew
+                self._serial.timeout = timeout_s
             data = bytearray(self._serial.read(1))
             while data and (waiting := self._serial.in_waiting):
                 data += self._serial.read(waiting)
@@ -119,16 +128,35 @@ class LineTransport:
         self._traffic = traffic
         self._port: Port | None = None
         self._buffer = b""
+        self._sent_s = self._looked_s = self._read_s = clock.now_s()
+        self._sending_s = self._late_s = 0.0
+
+    @property
+    def answer_time(self) -> AnswerTime:
+        """Time from the last sending to the last bytes that were read.
+
+        A computer that is busy may read an answer long after it has come. It came after the last look at the port that
+        found nothing. The time since then and the time of sending, as far as they are more than usual, are `late_s`.
+        """
+        late_s = max(0.0, self._late_s - 2.0 * _LOOK_S) + max(0.0, self._sending_s - _LOOK_S)
+        return AnswerTime(self._read_s - self._sent_s, late_s)
 
     @property
     def is_open(self) -> bool:
         """Whether the connection was opened and has not been lost since."""
         return self._port is not None
 
-    def open(self) -> None:
-        """Open the connection, after closing an open one."""
+    def open(self, wait_s: float = 0.0) -> None:
+        """Open the connection, after closing an open one; try again for `wait_s` while it cannot be opened."""
         self.close()
-        self._port = self._open_port()
+        deadline_s = self.clock.now_s() + wait_s
+        while self._port is None:
+            try:
+                self._port = self._open_port()
+            except StageLost:
+                if self.clock.now_s() >= deadline_s:
+                    raise
+                self.clock.sleep_s(_REOPEN_S)
 
     def close(self) -> None:
         """Close the connection, if it is open."""
@@ -138,8 +166,10 @@ class LineTransport:
 
     def send(self, data: bytes) -> None:
         """Send `data`; raises `StageLost`."""
+        self._sent_s = self._looked_s = self.clock.now_s()
         with self._live_port() as port:
             port.write(data)
+        self._sending_s = self.clock.now_s() - self._sent_s
         self._log("sent", data)
 
     def next_line(self, deadline_s: float) -> str | None:
@@ -156,14 +186,17 @@ class LineTransport:
                 continue
             # Noise may go on without a line end: limit the buffer.
             self._buffer = line[-_MAX_LINE_BYTES:]
-            remaining_s = max(0.0, deadline_s - self.clock.now_s())
+            asked_s = self.clock.now_s()
             with self._live_port() as port:
-                data = port.read(remaining_s)
+                data = port.read(min(_LOOK_S, max(0.0, deadline_s - asked_s)))
             if data:
+                self._read_s = self.clock.now_s()
+                self._late_s = self._read_s - self._looked_s
                 self._log("received", data)
                 self._buffer += data
             elif self.clock.now_s() >= deadline_s:
                 return None
+            self._looked_s = asked_s
 
     def lines_until(self, deadline_s: float) -> Iterator[str]:
         """Yield lines until the clock reaches `deadline_s`; if that is now, yield those already received."""

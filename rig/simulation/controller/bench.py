@@ -10,7 +10,8 @@ from typing import Protocol
 from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
-from faintfield.rig.stages.gantry import Gantry, make_stage
+from faintfield.rig.stages.drivers import make_stage
+from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.rig.stages.transport import Port, SerialPort, TrafficLog
 
@@ -157,6 +158,11 @@ class Bench:
         The cable; by default a `DirectLink`.
     resets_on_open : bool
         Whether opening the port restarts the controller, as it does on most boards.
+
+    Attributes
+    ----------
+    host_busy_until_s : float
+        Until then the driver does not come to read what has arrived, as on a computer that is busy; faults raise it.
     """
 
     def __init__(
@@ -171,6 +177,7 @@ class Bench:
         self.firmware = firmware(self.clock, self.wire)
         self.link = link or DirectLink()
         self.resets_on_open = resets_on_open
+        self.host_busy_until_s = 0.0
 
     def open_port(self) -> Port:
         """Open the host's end of the link."""
@@ -235,7 +242,10 @@ class SteppedPort:
             if not bench.wire.connected:
                 return self._port.read(0.0)
             if not bench.clock.step(deadline_s):
-                return b""
+                break
+        bench.clock.sleep_s(max(0.0, bench.host_busy_until_s - bench.clock.now_s()))
+        if not bench.wire.arrived():
+            return b""
         data = bench.wire.take()
         bench.link.send(data)
         received = b""

@@ -71,6 +71,11 @@ class SimulatedFirmware(ABC):
             self._boot.cancel()
         self._boot = self.clock.after(self.boot_s, self._booted)
 
+    @property
+    def homing(self) -> bool:
+        """Whether the carriages are searching their switches."""
+        return self._homing is not None
+
     @abstractmethod
     def receive(self, data: bytes) -> None:
         """Take bytes from the host."""
@@ -94,7 +99,12 @@ class SimulatedFirmware(ABC):
 
     def _start_homing(self, duration_s: float, finish: Callable[[], None]) -> None:
         """Call `finish` when homing ends."""
-        self._homing = self.clock.after(self.homing_slowdown * duration_s, finish)
+
+        def end() -> None:
+            self._homing = None
+            finish()
+
+        self._homing = self.clock.after(self.homing_slowdown * duration_s, end)
 
     def _cancel_homing(self) -> None:
         """Interrupt homing."""

@@ -6,23 +6,19 @@ before GRBL has asked for it; a failed homing still answers `ok`; and only some 
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Sequence
 
-from faintfield.rig.simulation.controller.firmware import SimulatedFirmware, words
-from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error, status_report
-from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
+from faintfield.rig.simulation.controller.firmware import words
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings, jog_error
+from faintfield.rig.simulation.controller.grbl_states import GrblStates
+from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics, Vector
 from faintfield.rig.simulation.controller.wire import SimulatedClock, Wire
 
 # Sizes of GRBL's line (bytes), receive buffer (bytes) and planner (motions).
 _LINE_BYTES, _BUFFER_BYTES, _PLANNER_BLOCKS = 80, 128, 15
 
-# The work offset is in every 30th report while moving, and in every 10th at rest.
-_OFFSET_EVERY_BUSY, _OFFSET_EVERY_IDLE = 30, 10
 
-_ALARM_DELAY_S = 0.05  # from a critical alarm until a reset is accepted
-
-
-class SimulatedGrbl(SimulatedFirmware):
+class SimulatedGrbl(GrblStates):
     """Firmware, settings and mechanics of a GRBL stage.
 
     Parameters
@@ -39,9 +35,6 @@ class SimulatedGrbl(SimulatedFirmware):
         Play in both drives.
     """
 
-    protocol = "grbl"
-    _line_end = b"\r\n"
-
     def __init__(
         self,
         clock: SimulatedClock,
@@ -51,118 +44,15 @@ class SimulatedGrbl(SimulatedFirmware):
         boot_s: float = 1.0,
         play_mm: float = 0.0,
     ) -> None:
-        self.settings = StoredSettings(settings or {})
-        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in self.settings.travel_mm())
-        mechanics = Mechanics(clock, (x, y), 1.0 / self.settings.number(100), (0.0, 0.0), switch_at_high_end=True)
-        mechanics.on_switch = self._switch_hit
-        self._realtime: dict[int, Callable[[], None]] = {
-            ord("?"): self._report,
-            ord("!"): self._hold,
-            ord("~"): self._resume,
-            0x18: self._reset,
-            0x84: self.open_door,
-            0x85: self._cancel_jog,
-        }
-        super().__init__(clock, wire, mechanics, boot_s)
+        stored = self._stored(settings or {})
+        x, y = (Axis(-length - 5.0, 2.0, -0.5 * length, play_mm) for length in stored.travel_mm())
+        mechanics = Mechanics(clock, (x, y), 1.0 / stored.number(100), (0.0, 0.0), switch_at_high_end=True)
+        super().__init__(clock, wire, mechanics, boot_s, stored)
 
-    def _reset_state(self) -> None:
-        """Lose the work offset, and ignore the host until the banner."""
-        self.work_offset, self._reports_to_offset = (0.0, 0.0, 0.0), 0
-        self.state, self.critical, self._accepts_reset = "Boot", False, True
-
-    def receive(self, data: bytes) -> None:
-        """Take bytes from the host; real-time characters act at once, even inside a line."""
-        for byte in data:
-            if self.state == "Boot":
-                return
-            if act := self._realtime.get(byte):
-                act()
-            elif not self.critical:
-                self._take(byte)
-        self._run_lines()
-
-    def alarm(self, code: int) -> None:
-        """Stop with an alarm."""
-        homing = self.state == "Home"
-        if self.mechanics.moving or homing:
-            self.mechanics.stop_dead()
-            self._cancel_homing()
-        self.state = "Alarm"
-        self._waiting.clear()
-        self.say(f"ALARM:{code}")
-        if code in (1, 2):
-            self.critical, self._accepts_reset = True, False
-            self.clock.after(_ALARM_DELAY_S, self._ask_for_reset)
-        elif homing:
-            self.say("ok")  # the answer to the homing command, sent although it failed
-            self._greet()
-
-    def _booted(self) -> None:
-        """Finish the restart, locked if homing is enabled."""
-        self.state = "Alarm" if self.settings.number(22) else "Idle"
-        self._greet()
-
-    def _greet(self) -> None:
-        """Send the banner, and the message about the lock if there is one."""
-        self.say("Grbl 1.1h ['$' for help]")
-        if self.state == "Alarm":
-            self.say("[MSG:'$H'|'$X' to unlock]")
-
-    def _ask_for_reset(self) -> None:
-        """Accept a reset from now on, as a critical alarm needs."""
-        self.say("[MSG:Reset to continue]")
-        self._accepts_reset = True
-
-    def _reset(self) -> None:
-        """Handle the reset character."""
-        if not self._accepts_reset:
-            return
-        self._line.clear()
-        self._waiting.clear()
-        if self.state == "Home":
-            self.alarm(6)
-            return
-        in_motion = self.mechanics.moving
-        if in_motion:
-            self.mechanics.stop_dead()
-            self.say("ALARM:3")
-        self.critical = False
-        self.state = "Alarm" if in_motion or self.state in ("Alarm", "Sleep") else "Idle"
-        self._greet()
-
-    def _hold(self) -> None:
-        """Handle the feed-hold character: a jog is cancelled, other motion pauses."""
-        if self.state == "Jog":
-            self._cancel_jog()
-        elif self.state == "Run":
-            self.pause()
-
-    def _cancel_jog(self) -> None:
-        """Handle the jog-cancel character."""
-        if self.state == "Jog":
-            self.mechanics.brake()
-
-    def open_door(self) -> None:
-        """Open the safety door, which stops all motion."""
-        self.state = "Door:2" if self.mechanics.moving else "Door:1"
-        self.mechanics.brake()
-
-    def pause(self) -> None:
-        """Press the feed-hold button of the machine, which holds a jog as well."""
-        self.state = "Hold:1" if self.mechanics.moving else "Hold:0"
-        self.mechanics.brake()
-
-    def _motion_ended(self) -> None:
-        """Update the state at the end of the last motion."""
-        self.state = {"Hold:1": "Hold:0", "Door:2": "Door:1"}.get(self.state, self.state)
-        if self.state in ("Jog", "Run"):
-            self.state = "Idle"
-        self._run_lines()
-
-    def _switch_hit(self) -> None:
-        """Raise the hard-limit alarm, if hard limits are enabled."""
-        if self.settings.number(21):
-            self.alarm(1)
+    @staticmethod
+    def _stored(changes: dict[int, str]) -> StoredSettings:
+        """Return the settings in the controller's memory."""
+        return StoredSettings(changes)
 
     def _take(self, byte: int) -> None:
         """Take one ordinary byte; bytes beyond the receive buffer are lost."""
@@ -174,7 +64,7 @@ class SimulatedGrbl(SimulatedFirmware):
 
     def _run_lines(self) -> None:
         """Run waiting lines while the planner has room."""
-        while self._waiting and not self.critical and self._homing is None:
+        while self._waiting and not self._deaf() and self._homing is None:
             if self.mechanics.queued() > _PLANNER_BLOCKS:
                 return
             line = self._waiting.popleft()
@@ -202,8 +92,10 @@ class SimulatedGrbl(SimulatedFirmware):
             return 0
         if self.state not in ("Idle", "Alarm"):
             return 8
-        if line == "$H":
-            return self._home()
+        if found := re.fullmatch(r"\$H([XY]?)", line):
+            if found[1] and not self.settings.homes_singly():
+                return 3
+            return self._home(["XY".index(found[1])] if found[1] else [0, 1])
         answer = self.settings.answer(line)
         if answer is None:
             return 3
@@ -250,47 +142,29 @@ class SimulatedGrbl(SimulatedFirmware):
             values.append(base + axis_words[axis] if axis in axis_words else here)
         return values[0], values[1]
 
-    def _queue(self, target: tuple[float, float], feed_mm_per_min: float, state: str) -> None:
+    def _queue(self, target: Vector, feed_mm_per_min: float, state: str) -> None:
         """Plan a straight motion, which puts GRBL into `state`."""
         start = self.mechanics.planned_mm()
         self.mechanics.queue(target, *self.settings.speed_and_acceleration(start, target, feed_mm_per_min))
         self.state = state if self.mechanics.moving else "Idle"
 
-    def _home(self) -> int | None:
-        """Start homing: both axes seek at once, back off, and find the switch again slowly."""
+    def _home(self, axes: Sequence[int]) -> int | None:
+        """Start homing: the axes seek at once, back off, and find the switch again slowly."""
         if not self.settings.number(22):
             return 5
-        farthest_mm = max(self.mechanics.homing_distances_mm())
+        distances_mm = self.mechanics.homing_distances_mm()
+        farthest_mm = max(distances_mm[axis] for axis in axes)
         reach_mm = 1.5 * max(self.settings.travel_mm())
-        lost = any(axis.stuck for axis in self.mechanics.axes) or farthest_mm > reach_mm
+        lost = any(self.mechanics.axes[axis].stuck for axis in axes) or farthest_mm > reach_mm
         self.state = "Home"
         duration_s = self.settings.homing_s(reach_mm if lost else farthest_mm)
-        self._start_homing(duration_s, (lambda: self.alarm(9)) if lost else self._homed)
+        self._start_homing(duration_s, (lambda: self.alarm(9)) if lost else (lambda: self._homed(axes)))
         return None
 
-    def _homed(self) -> None:
+    def _homed(self, axes: Sequence[int]) -> None:
         """End homing: the axes stand pulled off their switches, which are zero."""
-        self._homing = None
-        for axis in (0, 1):
+        for axis in axes:
             self.mechanics.set_homed(axis, -self.settings.number(27), -self.settings.number(27))
         self.state = "Idle"
         self.say("ok")
         self._run_lines()
-
-    def _report(self) -> None:
-        """Answer a status request, except while homing and after a critical alarm."""
-        if self.critical or self.state == "Home":
-            return
-        tell_offset = self._reports_to_offset == 0
-        if tell_offset:
-            busy = self.state in ("Jog", "Run")
-            self._reports_to_offset = _OFFSET_EVERY_BUSY if busy else _OFFSET_EVERY_IDLE
-        self._reports_to_offset -= 1
-        here, closed = (*self.mechanics.commanded_mm(), 0.0), self.mechanics.switches()
-        is_machine = int(self.settings.number(10)) & 1 == 1
-        self.say(status_report(self.state, here, self.work_offset, closed, is_machine, tell_offset))
-
-    def _resume(self) -> None:
-        """Handle the resume character: a held jog is not resumed, and a closed door is released."""
-        if self.state in ("Hold:0", "Door:0"):
-            self.state = "Idle"

@@ -36,8 +36,17 @@ class StoredSettings(dict[int, str]):
 
     def allows(self, target: Sequence[float]) -> bool:
         """Return whether the soft limits, if enabled, allow a machine position."""
-        inside = all(-length <= value <= 0.0 for length, value in zip(self.travel_mm(), target, strict=True))
-        return inside or not self.number(20)
+        margin = self.margin_mm()
+        ways = zip(self.travel_mm(), target, strict=True)
+        return all(margin - length <= value <= -margin for length, value in ways) or not self.number(20)
+
+    def margin_mm(self) -> float:
+        """Return how far from the ends of the travel the soft limits lie."""
+        return 0.0
+
+    def homes_singly(self) -> bool:
+        """Return whether an axis can be homed by itself."""
+        return False
 
     def speed_and_acceleration(
         self, start: Sequence[float], target: Sequence[float], feed_mm_per_min: float
@@ -77,14 +86,14 @@ def status_report(
     state: str,
     machine_mm: Sequence[float],
     offset_mm: Sequence[float],
-    switches: Sequence[bool],
+    pins: str,
     is_machine: bool,
     with_offset: bool,
 ) -> str:
     """Return a status report with machine or work position, and the work offset if asked for."""
     values = machine_mm if is_machine else [m - o for m, o in zip(machine_mm, offset_mm, strict=True)]
     fields = [state, f"{'MPos' if is_machine else 'WPos'}:{_vector(values)}", "FS:0,0"]
-    if pins := "".join(letter for letter, closed in zip("XY", switches, strict=True) if closed):
+    if pins:
         fields.append(f"Pn:{pins}")
     if with_offset:
         fields.append(f"WCO:{_vector(offset_mm)}")

@@ -193,15 +193,17 @@ class Mechanics:
         """Return the number of motions under way or waiting."""
         return len(self._queue) + (self._motion is not None)
 
-    def brake(self) -> None:
-        """Drop the queue and decelerate at the motion's own acceleration; `on_idle` follows."""
+    def brake(self) -> list[Vector]:
+        """Drop the queue, decelerate at the motion's own acceleration, and return the targets ahead."""
+        waiting = [target for target, _, _ in self._queue]
         self._queue.clear()
         if self._motion is None:
-            return
+            return []
+        ahead = [self._motion.end, *waiting]
         motion, (here, speed) = self._motion, self._motion.at(self.clock.now_s())
         remaining = math.dist(here, motion.end)
         if speed == 0.0 or remaining == 0.0:
-            return
+            return ahead
         stopping_s = speed / motion.acceleration
         share = min(1.0, 0.5 * speed * stopping_s / remaining)
         end = tuple(
@@ -209,6 +211,7 @@ class Mechanics:
         )
         profile = Profile(((stopping_s, speed, -motion.acceleration),))
         self._begin(Motion(here, end, profile, motion.acceleration, self.clock.now_s()))
+        return ahead
 
     def stop_dead(self) -> None:
         """End all motion at once, as a reset does."""

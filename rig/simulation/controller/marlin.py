@@ -75,6 +75,7 @@ class SimulatedMarlin(SimulatedFirmware):
         self.alive, self.homed, self._idle_limit_s = False, [False, False], _RELEASE_AFTER_S
         self._relative, self._last_line = False, 0
         self._awaited: Callable[[], bool] | None = None
+        self._waits_for_button = False
 
     def receive(self, data: bytes) -> None:
         """Take bytes from the host."""
@@ -91,6 +92,15 @@ class SimulatedMarlin(SimulatedFirmware):
             if line:
                 self._waiting.append(line)
         self._run_lines()
+
+    def wait_for_button(self) -> None:
+        """Finish the motions, and then wait until somebody presses the button."""
+        self._waits_for_button = True
+
+    def press_button(self) -> None:
+        """Press the button that is waited for."""
+        self._waits_for_button = False
+        self._motion_ended()
 
     def kill(self, reason: str) -> None:
         """Halt until a restart, as after a failure of the hardware."""
@@ -146,7 +156,7 @@ class SimulatedMarlin(SimulatedFirmware):
         parameters = words(command[len(name) :])
         actions: dict[str, Callable[[], None]] = {
             "G28": lambda: self._home([i for i in (0, 1) if "XY"[i] in command[3:]] or [0, 1]),
-            "M400": lambda: self._await(lambda: not self.mechanics.moving),
+            "M400": lambda: self._await(lambda: not self.mechanics.moving and not self._waits_for_button),
             "G0": lambda: self._move(parameters),
             "G1": lambda: self._move(parameters),
             "G90": lambda: setattr(self, "_relative", False),
@@ -216,7 +226,7 @@ class SimulatedMarlin(SimulatedFirmware):
 
         def again() -> None:
             if self._awaited is not None and self.alive:
-                self.say("echo:busy: processing")
+                self.say(f"echo:busy: {'paused for user' if self._waits_for_button else 'processing'}")
                 self._say_busy()
 
         self.clock.after(_BUSY_EVERY_S, again)

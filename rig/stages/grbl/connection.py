@@ -4,7 +4,8 @@ import re
 
 from faintfield.rig.errors import StageTimeout, WrongFirmware
 from faintfield.rig.stages.grbl.failures import (
-    LOCKED_ERROR,
+    HOMING_REQUIRED_ALARM,
+    LOCKED_ERRORS,
     SOFT_LIMIT_ALARM,
     alarm_failure,
     error_failure,
@@ -12,6 +13,7 @@ from faintfield.rig.stages.grbl.failures import (
 )
 from faintfield.rig.stages.grbl.messages import Alarm, Banner, ErrorCode, Message, Report, parse
 from faintfield.rig.stages.motion import timeout_s
+from faintfield.rig.stages.protocol import AnswerTime
 from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
 
 # GRBL's real-time characters.
@@ -63,11 +65,22 @@ class GrblConnection:
         """Whether the connection was opened and has not been lost since."""
         return self._line.is_open
 
-    def open(self) -> None:
-        """Open the connection and wait for the banner, since most boards restart when the port is opened."""
+    @property
+    def answer_time(self) -> AnswerTime:
+        """Time from the last sending to the last bytes that were read."""
+        return self._line.answer_time
+
+    def open(self, wait_s: float = 0.0) -> None:
+        """Open the connection and wait for the banner, since most boards restart when the port is opened.
+
+        Parameters
+        ----------
+        wait_s : float
+            How long to wait for a port that is missing.
+        """
         self.offset = self.alarm = None
-        self.count_lost = True
-        self._line.open()
+        self.count_lost, self.homing = True, False
+        self._line.open(wait_s)
         if self._await_banner(_BOOT_S):
             return
         # Boards with native USB keep running. The newline makes other firmware answer too; GRBL answers it with an ok,
@@ -77,9 +90,10 @@ class GrblConnection:
         for text in self._line.lines_until(self._clock.now_s() + _FIRST_REPORT_S):
             _refuse_other_firmware(text)
             reported = reported or isinstance(parse(text), Report)
-        if not reported:
+        # A reset ends what an earlier program may have left, and revives a GRBL that an alarm has silenced.
+        if not self.reset(_FIRST_REPORT_S) and not reported:
             raise StageTimeout(
-                f"no answer as from GRBL within {_BOOT_S + _FIRST_REPORT_S:g} s; "
+                f"no answer as from GRBL within {_BOOT_S + 2.0 * _FIRST_REPORT_S:g} s, and none to a reset; "
                 "check power, baud rate and protocol of the controller"
             )
 
@@ -102,7 +116,7 @@ class GrblConnection:
             if isinstance(message, Ok):
                 return messages
             if isinstance(message, ErrorCode):
-                if message.code == LOCKED_ERROR:
+                if message.code in LOCKED_ERRORS:
                     report = self.poll()
                     if report.state not in ("Idle", "Jog", "Run"):
                         raise state_failure(report, self.alarm)
@@ -144,10 +158,10 @@ class GrblConnection:
         while self._receive(deadline_s) is not None:
             pass
 
-    def reset(self) -> None:
-        """Reset GRBL and wait briefly for its banner."""
+    def reset(self, within_s: float = RESET_S) -> bool:
+        """Reset GRBL, and return whether its banner comes within `within_s`."""
         self._line.send(RESET)
-        self._await_banner(RESET_S)
+        return self._await_banner(within_s)
 
     def _read_pending(self) -> None:
         """Read what has arrived unasked, so that it is not taken for the answer to the next command."""
@@ -160,7 +174,8 @@ class GrblConnection:
             return None
         message = parse(text)
         self._note(message)
-        if isinstance(message, Alarm):
+        # grblHAL raises the alarm that it must be homed whenever it has started: that is no failure
+        if isinstance(message, Alarm) and message.code != HOMING_REQUIRED_ALARM:
             raise alarm_failure(message.code)
         if isinstance(message, Banner):
             raise restart_failure()

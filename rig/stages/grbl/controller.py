@@ -8,16 +8,17 @@ coordinates, whatever work offset is stored in the controller.
 from collections.abc import Sequence
 from contextlib import suppress
 
-from faintfield.rig.errors import StageLost, StageTimeout, WrongFirmware
-from faintfield.rig.stages.grbl.connection import CANCEL_JOG, HOLD, POLL_INTERVAL_S, RESET, RESET_S, GrblConnection
+from faintfield.rig.errors import StageError, StageLost, StageTimeout, WrongFirmware
+from faintfield.rig.stages.grbl.connection import CANCEL_JOG, RESET, GrblConnection
 from faintfield.rig.stages.grbl.failures import SOFT_LIMIT_ALARM, state_failure
 from faintfield.rig.stages.grbl.messages import Feedback, GrblSetting, Report
+from faintfield.rig.stages.grbl.recovery import bring_to_rest
 from faintfield.rig.stages.grbl.settings import GrblSettings
 from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import AxisIndex, Identity, Point
+from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Identity, Point
 from faintfield.rig.stages.transport import LineTransport
 
-# Longest recovery, in s: enough for three resets, each with its wait for the banner.
+# Longest recovery besides slowing down, in s: enough for three resets, each with its wait for the banner.
 _RECOVERY_S = 2.0
 
 # GRBL reports the work offset in at least every 30th report.
@@ -42,9 +43,9 @@ class GrblController:
         self._index = tuple("XYZ".index(axis) for axis in axes)
         self._braking_s = 0.0
 
-    def connect(self) -> None:
-        """Open the connection and wait until the controller answers."""
-        self._grbl.open()
+    def connect(self, wait_s: float = 0.0) -> None:
+        """Open the connection, waiting up to `wait_s` for its port, and wait until the controller answers."""
+        self._grbl.open(wait_s)
 
     def identify(self) -> Identity:
         """Read build information and settings, the settings twice since the line has no checksum."""
@@ -61,14 +62,13 @@ class GrblController:
         self._await_offset()
         return identity
 
-    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
+    def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home within `bound_s`: GRBL answers nothing until the switches are found."""
-        started_s = self._clock.now_s()
         self._grbl.command("$H" if axis is None else f"$H{self._axes[axis]}", bound_s)
-        taken_s = self._clock.now_s() - started_s
+        time = self._grbl.answer_time
         self._wait_until_still(0.0)
         self._grbl.alarm, self._grbl.count_lost = None, False
-        return taken_s
+        return time
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Queue one jog per point and wait for the last to end."""
@@ -102,50 +102,28 @@ class GrblController:
         return True
 
     def abort(self) -> bool:
-        """Cancel the jog, or reset while homing, which nothing else interrupts."""
-        with suppress(StageLost):  # a stage that cannot be reached cannot be stopped
+        """Cancel the jog, or reset while homing, which nothing else interrupts; reset what does not end."""
+        with suppress(StageError):  # a stage that cannot be reached cannot be stopped
             self._grbl.send(RESET if self._grbl.homing else CANCEL_JOG)
-        return not self._grbl.homing
+            if not self._grbl.homing:
+                bring_to_rest(self._grbl, self._clock, _RECOVERY_S + self._braking_s)
+                return not self._grbl.count_lost
+        return False
 
-    def recover(self) -> bool:
+    def recover(self, wait_s: float) -> bool:
         """Bring GRBL to a state that accepts commands; a lock is cleared only if the position was kept."""
         if not self._grbl.is_open:
-            self.connect()
+            self.connect(wait_s)
             return False
         self._grbl.send(b"\n")  # ends a damaged line, which would otherwise be joined to the next
-        deadline_s = self._clock.now_s() + _RECOVERY_S
-        while self._clock.now_s() + POLL_INTERVAL_S + RESET_S < deadline_s:
-            report = self._grbl.poll_despite_failures()
-            if report is None:
-                # After alarms 1 and 2 GRBL answers nothing but a reset, and ignores one that comes too early.
-                self._grbl.reset()
-            elif report.state == "Idle":
-                return not self._grbl.count_lost
-            elif report.state == "Alarm":
-                return self._unlock_if_kept(self._machine_point(report))
-            else:
-                self._leave(report)
-        raise StageTimeout(
-            f"the controller is not ready {_RECOVERY_S:g} s after a reset; switch it off and on, then home it"
-        )
+        report = bring_to_rest(self._grbl, self._clock, _RECOVERY_S + self._braking_s)
+        if report.state == "Alarm":
+            return self._unlock_if_kept(self._machine_point(report))
+        return not self._grbl.count_lost
 
     def close(self) -> None:
         """Close the connection."""
         self._grbl.close()
-
-    def _leave(self, report: Report) -> None:
-        """Take the next step from the state of `report` towards one that accepts commands."""
-        match report.state, report.substate:
-            case "Jog", _:
-                self._grbl.send(CANCEL_JOG)
-            case "Run", _:
-                self._grbl.send(HOLD)
-            case "Door", 1:
-                raise state_failure(report, self._grbl.alarm)
-            case ("Hold", 1) | ("Door", 2 | 3):
-                pass  # still slowing down; a reset now would lose the position
-            case _:
-                self._grbl.reset()
 
     def _unlock_if_kept(self, here: Point) -> bool:
         """Clear the lock if the alarm kept the position; return whether it did."""

@@ -1,4 +1,4 @@
-"""Explains every alarm, error and state of GRBL: what it means, whether the position is kept, and what to do."""
+"""Explains alarms, errors and states of GRBL and grblHAL: what they mean, if the position is kept, and what to do."""
 
 from faintfield.rig.errors import StageAlarm, StageRejected
 from faintfield.rig.stages.grbl.messages import Report
@@ -6,10 +6,18 @@ from faintfield.rig.stages.grbl.messages import Report
 SOFT_LIMIT_ALARM = 2
 """The only alarm that keeps the position."""
 
-LOCKED_ERROR = 9
-"""The error of a command that the present state does not allow."""
+CRITICAL_ALARMS = (1, 2, 10, 17)
+"""The alarms after which the controller obeys nothing but a reset; those above 2 are grblHAL's."""
 
-# ALARM:N → meaning
+HOMING_REQUIRED_ALARM = 11
+"""The alarm of a grblHAL that has started and must be homed."""
+
+LOCKED_ERRORS = (9, 45, 46, 50, 51, 79)
+"""The errors of a command that the present state does not allow; those above 9 are grblHAL's."""
+
+_LOOK = "look for the cause, then recover and home it"
+
+# ALARM:N → meaning; those from 10 on are grblHAL's, and GRBL has another 10
 _ALARMS = {
     1: "a limit switch was hit; the position is lost",
     2: "a target was outside the soft limits; the position is kept",
@@ -20,7 +28,26 @@ _ALARMS = {
     7: "homing failed: safety door opened",
     8: "homing failed: a switch did not open on pulling off",
     9: "homing failed: no switch was found",
-    10: "homing failed: the second motor's switch was not found",
+    10: "the emergency stop is pressed (or GRBL found no switch of the second motor when homing)",
+    11: "homing is required",
+    12: "a limit switch is closed",
+    13: "the probe was touched",
+    14: "the spindle did not reach its speed",
+    15: "homing failed: the second motor's switch was not found",
+    16: "the controller failed its test of itself",
+    17: "a motor driver reports a fault",
+    18: "homing failed: it is not set up",
+}
+
+# ALARM:N → remedy, where looking for the cause is not enough
+_ALARM_REMEDIES = {
+    SOFT_LIMIT_ALARM: "recover it",
+    10: "release the emergency stop, then recover and home it",
+    HOMING_REQUIRED_ALARM: "home it",
+    12: "move the carriage off its switch by hand, then recover and home it",
+    16: "switch the controller off and on, then recover and home it",
+    17: "switch the controller off, look at motors and drivers, then recover and home it",
+    18: "correct $22 and $44 to $46, then recover and home it",
 }
 
 # error:N → meaning, remedy
@@ -31,10 +58,19 @@ _ERRORS = {
     8: ("only allowed when idle", "wait until the stage stands, then try again"),
     9: ("locked by an alarm or a jog in progress", "recover and home it"),
     11: ("line too long", "check the serial line"),
+    13: ("the safety door is open", "close it, then recover"),
     15: ("jog target outside the travel", "choose one inside, or correct $130 and $131"),
     16: ("bad jog command", "check the serial line"),
     20: ("unsupported command", "flash GRBL 1.1 or grblHAL"),
     22: ("no feed rate", "set stage.feed_mm_per_min"),
+    45: ("a limit switch is closed, which allows nothing but homing", "recover and home it"),
+    46: ("homing is required", "home it"),
+    50: ("the emergency stop is pressed", "release it, then recover and home it"),
+    51: ("a motor driver reports a fault", "look at motors and drivers, then recover and home it"),
+    53: ("the setting does not exist here", "flash GRBL 1.1 or grblHAL"),
+    55: ("homing is not set up", "correct $22 and $44 to $46"),
+    77: ("a password is needed", "switch off authentication in the controller"),
+    79: ("not allowed before the alarm is cleared", "recover and home it"),
 }
 
 # State of a report → meaning, remedy, whether the position is kept
@@ -54,8 +90,7 @@ def alarm_failure(code: int) -> StageAlarm:
     """Return the exception for an alarm."""
     kept = code == SOFT_LIMIT_ALARM
     meaning = _ALARMS.get(code, "see the firmware's list of alarms")
-    remedy = "recover it" if kept else "look for the cause, then recover and home it"
-    return StageAlarm(f"ALARM:{code}: {meaning}; {remedy}", code=code, position_kept=kept)
+    return StageAlarm(f"ALARM:{code}: {meaning}; {_ALARM_REMEDIES.get(code, _LOOK)}", code=code, position_kept=kept)
 
 
 def error_failure(command: str, code: int) -> StageRejected:
@@ -72,11 +107,12 @@ def state_failure(report: Report, alarm: int | None) -> StageAlarm:
     report : Report
         The report with that state.
     alarm : int or None
-        Code of the last alarm.
+        Code of the last alarm, for controllers that do not report it with their state.
     """
     if report.state != "Alarm":
         meaning, remedy, kept = _STATES[report.state]
         return StageAlarm(f"the controller {meaning}; {remedy}", position_kept=kept)
+    alarm = 10 if report.emergency_stop else report.substate or alarm
     if alarm is not None:
         return alarm_failure(alarm)
     return StageAlarm("the controller is locked: it has restarted or was never homed; home the stage")

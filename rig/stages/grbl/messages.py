@@ -76,6 +76,11 @@ class Report(Struct, frozen=True):
     offset: tuple[float, ...] | None
     pins: str
 
+    @property
+    def emergency_stop(self) -> bool:
+        """Whether the emergency stop is pressed, which grblHAL tells among the inputs."""
+        return "E" in self.pins
+
 
 type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report | Unknown
 

@@ -14,6 +14,9 @@ _ROUNDING_MM = 0.001
 # Homing may take this long (s) even where the settings predict less: a slow stage must not fail half way.
 _MIN_HOMING_BOUND_S = 240.0
 
+# The soft limits of jogs, in the settings of grblHAL only.
+_HAL_SETTING = 40
+
 # The value of $1 that keeps the motors on between motions.
 _KEEP_MOTORS_ON = 255
 
@@ -53,7 +56,7 @@ class GrblSettings(Struct, frozen=True):
         self._refuse_unsafe()
         x, y = axes
         return Identity(
-            firmware=f"Grbl {version.rstrip(':')}",
+            firmware=f"{'grblHAL' if self._is_hal() else 'Grbl'} {version.rstrip(':')}",
             travel_mm=Box(self._travel(x), self._travel(y)),
             motion=MotionLimits(
                 rate_mm_per_s=(self._number(110 + x) / 60.0, self._number(110 + y) / 60.0),
@@ -88,11 +91,15 @@ class GrblSettings(Struct, frozen=True):
 
         Homing sets the end with the switch to zero, and the travel extends to negative coordinates from there. It
         extends to positive ones if the firmware was built with the switch as origin (option Z) and homes to the lower
-        end ($23).
+        end ($23). The soft limits of grblHAL keep the pull-off from the switches, if these stop motion ($21), and as
+        much from the other end.
         """
         length_mm = self._number(130 + axis)
+        margin_mm = self._number(27) if self._is_hal() and int(self._number(21)) & 1 else 0.0
         homes_low = bool(int(self._number(23)) >> axis & 1)
-        return (0.0, length_mm) if "Z" in self._options() and homes_low else (-length_mm, 0.0)
+        if "Z" not in self._options():
+            return margin_mm - length_mm, 0.0 - margin_mm  # not -0.0, which reads badly
+        return (0.0, length_mm - margin_mm) if homes_low else (margin_mm - length_mm, 0.0)
 
     def _tolerance(self, axis: int) -> float:
         """Return half a motor step plus the rounding of reports, in mm."""
@@ -103,6 +110,10 @@ class GrblSettings(Struct, frozen=True):
         seek_s = 60.0 * max(self._number(130 + axis) for axis in axes) / self._number(25)
         locate_s = 4.0 * 60.0 * self._number(27) / self._number(24)
         return max(_MIN_HOMING_BOUND_S, timeout_s(seek_s + locate_s))
+
+    def _is_hal(self) -> bool:
+        """Return whether the firmware is grblHAL: it says so, or has a setting that GRBL does not have."""
+        return self.build.get("FIRMWARE") == "grblHAL" or _HAL_SETTING in self.values
 
     def _options(self) -> str:
         """Return the letters of the compile-time options."""

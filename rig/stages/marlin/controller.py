@@ -11,7 +11,7 @@ from faintfield.rig.errors import StageAlarm, StageLost, StageRejected, StageTim
 from faintfield.rig.stages.marlin import messages as marlin
 from faintfield.rig.stages.marlin.settings import MarlinSettings
 from faintfield.rig.stages.motion import timeout_s
-from faintfield.rig.stages.protocol import AxisIndex, Box, Identity, Point
+from faintfield.rig.stages.protocol import AnswerTime, AxisIndex, Box, Identity, Point
 from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
 
 # Waits in s: for the first line after the port was opened and the boot loader has run; for the answer to a command; for
@@ -19,6 +19,11 @@ from faintfield.rig.stages.transport import LineTransport, Ok, restart_failure
 _BOOT_S = 3.0
 _ANSWER_S = timeout_s(0.0)
 _ECHO_S = 0.7
+
+# How much longer (s) a command may take while Marlin says every two seconds that it is busy, or that it waits for its
+# button to be pressed; and how long after each such message the next one is waited for.
+_MAX_BUSY_S, _MAX_PAUSED_S = 15.0, 600.0
+_BUSY_S = 5.0
 
 # A controller that has sent nothing for this long (s) has finished its greeting.
 _QUIET_S = 0.2
@@ -52,9 +57,9 @@ class MarlinController:
         self._line_number = 0
         self._markers = 0
 
-    def connect(self) -> None:
+    def connect(self, wait_s: float = 0.0) -> None:
         """Open the connection and wait for the end of the greeting, since most boards restart when it is opened."""
-        self._line.open()
+        self._line.open(wait_s)
         self._await_start()
         self._start_counting()
 
@@ -66,14 +71,13 @@ class MarlinController:
             raise StageLost("the settings read differently twice in a row: the line is disturbed; try a shorter cable")
         return MarlinSettings((*about, *first)).identity(self._axes, self._travel_mm)
 
-    def home(self, axis: AxisIndex | None, bound_s: float) -> float:
+    def home(self, axis: AxisIndex | None, bound_s: float) -> AnswerTime:
         """Home the named axis or both, and no others, such as a focus drive."""
-        started_s = self._clock.now_s()
         axes = self._axes if axis is None else (self._axes[axis],)
         self._command(f"G28 {' '.join(axes)}", bound_s)
-        taken_s = self._clock.now_s() - started_s
+        time = self._line.answer_time
         self._command("M400")
-        return taken_s
+        return time
 
     def follow(self, path: Sequence[Point], feed_mm_per_s: float, predicted_s: float) -> Point:
         """Queue one motion per point, wait for the last to end, and read the position."""
@@ -120,7 +124,7 @@ class MarlinController:
             self._discard_input()
         return False
 
-    def recover(self) -> bool:
+    def recover(self, wait_s: float) -> bool:
         """Make Marlin answer again; a killed controller restarts when the port is opened again."""
         if self._line.is_open:
             self._discard_input()
@@ -128,7 +132,7 @@ class MarlinController:
             if keeps_count is not None:
                 self._start_counting()
                 return keeps_count
-        self.connect()
+        self.connect(wait_s)
         return False
 
     def close(self) -> None:
@@ -211,12 +215,18 @@ class MarlinController:
 
     def _await_ok(self, command: str, bound_s: float) -> list[marlin.Message] | None:
         """Return the messages up to the `ok`, or None if the controller asks for the line again."""
-        deadline_s = self._clock.now_s() + bound_s
+        started_s = self._clock.now_s()
+        deadline_s = started_s + bound_s
         messages: list[marlin.Message] = []
+        why = ""
         while (text := self._line.next_line(deadline_s)) is not None:
             message = marlin.parse(text)
             self._check(message, command)
             messages.append(message)
+            if isinstance(message, marlin.Busy):
+                limit_s = started_s + bound_s + (_MAX_PAUSED_S if message.for_user else _MAX_BUSY_S)
+                deadline_s = max(deadline_s, min(self._clock.now_s() + _BUSY_S, limit_s))
+                why = "it waits for its button to be pressed" if message.for_user else "it says that it is busy"
             if isinstance(message, Ok) or (isinstance(message, marlin.PositionReport) and message.is_ok):
                 if any(isinstance(earlier, marlin.Resend) for earlier in messages):
                     return None
@@ -225,8 +235,8 @@ class MarlinController:
                     raise StageRejected(f"the controller refused {command!r}: {refusals[0].text}; home the stage first")
                 return messages
         raise StageTimeout(
-            f"no answer to {command!r} within {bound_s:.1f} s; look whether the stage still moves, "
-            "check cable and power, then recover and home it"
+            f"no answer to {command!r} within {self._clock.now_s() - started_s:.1f} s{why and ', ' + why}; "
+            "look whether the stage still moves, check cable and power, then recover and home it"
         )
 
     def _check(self, message: marlin.Message, command: str) -> None:

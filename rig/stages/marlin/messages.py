@@ -33,7 +33,9 @@ class Resend(Struct, frozen=True):
 
 
 class Busy(Struct, frozen=True):
-    """The controller is still executing the last command."""
+    """The controller is still executing the last command, or waits for somebody to press its button."""
+
+    for_user: bool
 
 
 class Start(Struct, frozen=True):
@@ -126,7 +128,7 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] =
     (re.compile(r"ok(?: N\d+| P\d+| B\d+)*"), lambda _: Ok()),
     (re.compile(rf"(ok )?({_AXES})(?: E:{_NUMBER})?(?: Count:? .*)?"), _position),
     (re.compile(r"Resend: ?(\d{1,9})"), lambda found: Resend(int(found[1]))),
-    (re.compile(r"(?:echo:)?busy: ?(.*)"), lambda _: Busy()),
+    (re.compile(r"(?:echo:)?busy: ?(.*)"), lambda found: Busy("paused" in found[1])),
     (re.compile(r"start"), lambda _: Start()),
     (re.compile(r"echo:(Unknown command:.*|Home .*First.*)", re.IGNORECASE), lambda found: Refusal(found[1])),
     (re.compile(r"(?:Error: ?|!! ?)(.+)"), lambda found: ErrorText(found[1], bool(_TRANSMISSION.search(found[1])))),

@@ -2,13 +2,14 @@
 
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import StageSettings
 
 type Controller = type[SimulatedGrbl] | type[SimulatedMarlin]
 
-CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedMarlin]
+CONTROLLERS: list[Controller] = [SimulatedGrbl, SimulatedGrblHal, SimulatedMarlin]
 
 
 class Traffic:
@@ -32,6 +33,11 @@ def homed(bench: Bench, traffic: Traffic | None = None, settings: StageSettings 
     stage.connect()
     stage.home()
     return stage
+
+
+def hal(bench: Bench) -> SimulatedGrblHal:
+    assert isinstance(bench.firmware, SimulatedGrblHal)
+    return bench.firmware
 
 
 def grbl(bench: Bench) -> SimulatedGrbl:

@@ -3,16 +3,18 @@
 import re
 from collections.abc import Iterator
 from functools import partial
+from unittest import mock
 
 import pytest
 
 from faintfield.rig.devices import open_stage
+from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.protocol import Point, StageSettings
+from faintfield.testing import stage_contract
 from tests.rig.stages.benches import CONTROLLERS, Controller, Traffic, grbl
-from tests.rig.stages.contract import check_stage
 from tests.rig.stages.socket_link import SocketLink
 
 LINKS = [DirectLink, PtyLink, SocketLink]
@@ -28,19 +30,19 @@ def link(request: pytest.FixtureRequest) -> Iterator[Link]:
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_contract(controller: Controller, link: Link) -> None:
-    check_stage(Bench(controller, link).stage())
+    stage_contract(Bench(controller, link).stage())
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_contract_with_a_board_that_keeps_running(
     controller: Controller,
 ) -> None:
-    check_stage(Bench(controller, resets_on_open=False).stage())
+    stage_contract(Bench(controller, resets_on_open=False).stage())
 
 
 @pytest.mark.parametrize("port", ["simulated:grbl", "simulated:marlin"])
 def test_contract_of_what_open_stage_returns(port: str) -> None:
-    check_stage(open_stage(StageSettings(protocol="grbl", port=port)))
+    stage_contract(open_stage(StageSettings(protocol="simulated", port=port)))
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -136,3 +138,24 @@ def test_the_checks_move_within_the_middle_of_the_travel() -> None:
     assert {(-280.0, -280.0), (-120.0, -120.0), (-280.0, -120.0), (-120.0, -280.0), (-200.0, -200.0)} <= corners
     approach_mm = stage.settings.approach_mm
     assert all(-280.0 - approach_mm <= value <= -120.0 for corner in corners for value in corner)
+
+
+def test_the_port_is_closed_even_if_a_stage_cannot_be_told_to_stop() -> None:
+    """A plug-in may raise what no controller should."""
+    stage = Bench(SimulatedGrbl).stage()
+    stage.connect()
+    controller = stage._controller  # noqa: SLF001 - what a plug-in would be
+    with (
+        mock.patch.object(controller, "read_position", side_effect=StageLost("unplugged; plug it in")),
+        pytest.raises(StageLost),
+    ):
+        stage.position()
+    with (
+        mock.patch.object(controller, "abort", side_effect=ZeroDivisionError),
+        mock.patch.object(controller, "close", wraps=controller.close) as close,
+        pytest.raises(ZeroDivisionError),
+    ):
+        stage.close()
+    assert close.called
+    stage.connect()
+    stage.close()

@@ -1,12 +1,13 @@
 """Homing again finds lost steps, and what was recorded before stays doubtful."""
 
+from collections.abc import Callable
 from functools import partial
 
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from faintfield.rig.errors import NotHomed, PlanRefused, PositionDrifted, StageAlarm
+from faintfield.rig.errors import DriftUnknown, NotHomed, PlanRefused, PositionDrifted, StageAlarm
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
@@ -84,24 +85,107 @@ def test_a_check_without_begin_is_refused() -> None:
     assert watch.unchecked == ("frame",)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_disturbance_while_homing_was_timed_is_found_at_once(controller: Controller) -> None:
-    bench = Bench(controller)
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
+def on_homing(bench: Bench, act: Callable[[int], None]) -> None:
+    """Call `act` with the number of each homing from now on, as it begins."""
     homings: list[bool] = []
 
-    def late_on_the_third(data: bytes) -> bytes:
+    def count(data: bytes) -> bytes:
         if b"$H" in data or b"G28" in data:
             homings.append(True)
-            if len(homings) == 3:
-                bench.clock.after(1.0, lambda: bench.wire.hold_up(8.0))
+            act(len(homings))
         return data
 
-    bench.wire.filters_to_controller.append(late_on_the_third)
+    bench.wire.filters_to_controller.append(count)
+
+
+def delay_line(bench: Bench, for_s: float = 3.0) -> None:
+    """Hold back answers for a while, from soon on."""
+    bench.clock.after(0.3, lambda: bench.wire.hold_up(for_s))
+
+
+def keep_host_busy(bench: Bench, for_s: float = 3.0) -> None:
+    """Let the driver read nothing for a while, from soon on."""
+    bench.clock.after(0.3, lambda: setattr(bench, "host_busy_until_s", bench.clock.now_s() + for_s))
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("delay", [delay_line, keep_host_busy])
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_a_delay_while_homing_was_timed_does_not_falsify_the_checks(
+    controller: Controller, delay: Callable[[Bench], None], number: int
+) -> None:
+    bench = Bench(controller)
+    on_homing(bench, lambda homing: delay(bench) if homing == number else None)
+    stage, watch = watched(bench)
+    for drift_mm in (0.3, -0.3):
+        stage.move_to(*_middle(stage))
+        bench.firmware.mechanics.axes[0].slip_mm += drift_mm
+        watch.check()
+    stage.move_to(*_middle(stage))
+    bench.firmware.mechanics.axes[0].slip_mm += 0.7
     with pytest.raises(PositionDrifted):
-        DriftWatch(stage).begin()
+        watch.check()
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("delay", [delay_line, keep_host_busy])
+def test_times_that_are_never_the_same_are_refused(
+    controller: Controller, delay: Callable[[Bench, float], None]
+) -> None:
+    bench = Bench(controller)
+    on_homing(bench, lambda homing: delay(bench, 3.0 + 0.5 * homing))
+    with pytest.raises((PositionDrifted, DriftUnknown)):
+        watched(bench)
+    assert bench.clock.now_s() < 1000.0
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("busy_s", [2.0, 8.0])
+def test_a_busy_computer_is_no_drift(controller: Controller, busy_s: float) -> None:
+    bench = Bench(controller)
+    stage, watch = watched(bench)
+    watch.note("frame")
+    stage.move_to(*_middle(stage))
+    on_homing(bench, lambda homing: keep_host_busy(bench, busy_s) if homing == 1 else None)
+    with pytest.raises(DriftUnknown, match=r"answers were delayed; 1 positions .* in doubt") as caught:
+        watch.check()
+    assert caught.value.suspect == watch.doubtful == ("frame",)
+    assert stage.trusted
+    watch.note("again")
+    stage.move_to(*_middle(stage))
+    assert watch.check().passed
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("drift_mm", [0.7, -0.7, 3.0, -3.0])
+@pytest.mark.parametrize("late_s", [0.02, 0.03, 0.06, 1.0])
+def test_no_delay_hides_a_drift(controller: Controller, drift_mm: float, late_s: float) -> None:
+    bench = Bench(controller)
+    stage, watch = watched(bench)
+    watch.note("frame")
+    stage.move_to(*_middle(stage))
+    bench.firmware.mechanics.axes[0].slip_mm += drift_mm
+
+    def read_late(data: bytes) -> bytes:
+        if b"ok" in data:
+            bench.host_busy_until_s = bench.clock.now_s() + late_s
+        return data
+
+    on_homing(bench, lambda homing: bench.wire.filters_to_host.append(read_late) if homing == 1 else None)
+    with pytest.raises((DriftUnknown, PositionDrifted)):
+        watch.check()
+    assert watch.doubtful == ("frame",)
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_a_line_that_always_delays_is_no_drift(controller: Controller) -> None:
+    bench = Bench(controller)
+    stage, watch = watched(bench)
+    watch.note("frame")
+    stage.move_to(*_middle(stage))
+    on_homing(bench, lambda homing: delay_line(bench))
+    with pytest.raises(DriftUnknown):
+        watch.check()
 
 
 def test_limits_that_cannot_be_kept_are_refused() -> None:
@@ -122,14 +206,8 @@ def test_homing_that_takes_no_longer_from_farther_away_is_refused() -> None:
     bench = Bench(SimulatedGrbl)
     stage = bench.stage()
     stage.connect()
-    homings: list[bool] = []
-
-    def slow_on_the_second(data: bytes) -> bytes:
-        homings.extend([True] * data.count(b"$H"))
-        bench.firmware.homing_slowdown = 5.0 if len(homings) == 2 else 1.0
-        return data
-
-    bench.wire.filters_to_controller.append(slow_on_the_second)
+    # After the first homing, each pair begins at the nearer distance
+    on_homing(bench, lambda homing: setattr(bench.firmware, "homing_slowdown", 1.0 if homing % 2 else 5.0))
     with pytest.raises(PlanRefused, match="no longer from farther away"):
         DriftWatch(stage).begin()
 

@@ -16,6 +16,8 @@ from tests.rig.stages.benches import grbl, homed
     [
         (1, "limit switch"), (2, "soft limits"), (3, "reset while moving"), (4, "probe"), (5, "probe"),
         (6, "reset during homing"), (7, "door"), (8, "pulling off"), (9, "no switch was found"), (10, "second motor"),
+        (10, "release the emergency stop"), (11, "homing is required"), (12, "off its switch"), (17, "motor driver"),
+        (18, "$22"),
         (99, "firmware's list of alarms"),
     ],
 )  # fmt: skip
@@ -35,7 +37,8 @@ def test_the_message_of_an_alarm_says_what_it_means_and_only_soft_limits_keep_th
     [
         (2, "number format"), (3, "unknown $ command"), (5, "homing is not enabled"), (8, "only allowed when idle"),
         (9, "locked"), (11, "line too long"), (15, "target outside the travel"), (16, "bad jog"), (20, "unsupported"),
-        (22, "no feed rate"), (99, "firmware's list of errors"),
+        (22, "no feed rate"), (13, "door"), (45, "limit switch"), (46, "homing is required"), (50, "release it"),
+        (79, "before the alarm is cleared"), (99, "firmware's list of errors"),
     ],
 )  # fmt: skip
 def test_the_message_of_a_refusal_names_the_command_and_the_reason(code: int, words: str) -> None:

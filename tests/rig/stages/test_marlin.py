@@ -307,3 +307,55 @@ def test_a_refusal_half_way_along_a_path_loses_the_position_because_stopping_doe
     assert not stage.trusted
     with pytest.raises(NotHomed):
         stage.verify_at(*bench.true_position())
+
+
+def paused(bench: Bench) -> SimulatedMarlin:
+    """Let a controller wait for its button from half a second on."""
+    assert isinstance(bench.firmware, SimulatedMarlin)
+    bench.clock.after(0.5, bench.firmware.wait_for_button)
+    return bench.firmware
+
+
+def test_a_controller_that_waits_for_its_button_is_waited_for() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.clock.after(300.0, paused(bench).press_button)
+    target = Point(100.0, 100.0)
+    assert stage.move_to(*target).is_at(target)
+    assert bench.clock.now_s() > 300.0
+    assert stage.trusted
+
+
+def test_a_button_that_nobody_presses_is_not_waited_for_longer_than_ten_minutes() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    paused(bench)
+    begun_s = bench.clock.now_s()
+    with pytest.raises(StageTimeout, match=r"'M400' within 60\d\.\d s, it waits for its button to be pressed; "):
+        stage.move_to(100.0, 100.0)
+    assert 600.0 < bench.clock.now_s() - begun_s < 620.0
+    assert not stage.trusted
+
+
+def test_a_motion_slower_than_predicted_is_waited_for_while_busy_is_told_but_not_for_ever() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bound_s = 1.5 * 200.0 / 100.0 + 2.5
+    assert isinstance(bench.firmware, SimulatedMarlin)
+    bench.firmware.settings["M203"] = 20.0
+    assert stage.move_to(200.0, 0.0).trusted, "10 s, where 2.2 s were predicted"
+    bench.firmware.mechanics.endless = True
+    begun_s = bench.clock.now_s()
+    with pytest.raises(StageTimeout, match="it says that it is busy; "):
+        stage.move_to(200.0, 200.0)
+    assert bound_s + 10.0 < bench.clock.now_s() - begun_s < bound_s + 16.0
+
+
+def test_a_mute_controller_is_not_waited_for_longer_than_before() -> None:
+    bench = Bench(SimulatedMarlin)
+    stage = homed(bench)
+    bench.wire.filters_to_host.append(lambda data: b"")
+    begun_s = bench.clock.now_s()
+    with pytest.raises(StageTimeout, match=r"no answer to 'G1 .*' within 2\.0 s; look"):
+        stage.move_to(100.0, 100.0)
+    assert bench.clock.now_s() - begun_s < 3.0

@@ -11,7 +11,7 @@ from faintfield.rig.devices import open_stage
 from faintfield.rig.errors import StageAlarm, StageLost, StageTimeout
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
-from tests.rig.stages.contract import check_stage
+from faintfield.testing import stage_contract
 
 PYTHON = Path(__file__).parents[3] / "build" / "octoprint" / "bin" / "python"
 SERVER = Path(__file__).with_name("octoprint_server.py")
@@ -48,7 +48,7 @@ def printer(request: pytest.FixtureRequest) -> Iterator[tuple[Gantry, Command]]:
 
 
 def test_contract(printer: tuple[Gantry, Command]) -> None:
-    check_stage(printer[0])
+    stage_contract(printer[0])
 
 
 @pytest.mark.parametrize("printer", [{}, {"simulated_errors": ["20:resend", "30:checksum_mismatch"]}], indirect=True)

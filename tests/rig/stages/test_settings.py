@@ -174,3 +174,25 @@ def test_marlin_without_limits_or_emergency_parser_is_driven_with_a_warning() ->
 def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], message: str) -> None:
     with pytest.raises(WrongFirmware, match=message):
         of_marlin(change)
+
+
+@pytest.mark.parametrize("told", [{"FIRMWARE": "grblHAL"}, {}])
+@pytest.mark.parametrize(
+    ("options", "homes_low", "hard_limits", "travel_x_mm"),
+    [
+        ("V", "0", "1", (-397.0, -3.0)),
+        ("V", "1", "1", (-397.0, -3.0)),
+        ("V", "0", "0", (-400.0, 0.0)),
+        ("VZ", "0", "3", (-397.0, 0.0)),
+        ("VZ", "1", "1", (0.0, 397.0)),
+        ("VZ", "1", "2", (0.0, 400.0)),
+    ],
+)
+def test_the_travel_of_grblhal_is_shorter_by_the_pull_off_if_hard_limits_are_on(
+    told: dict[str, str], options: str, homes_low: str, hard_limits: str, travel_x_mm: tuple[float, float]
+) -> None:
+    # By limits_set_work_envelope() of grblHAL; without its name it is known by a setting that GRBL lacks
+    values = {**GRBL, 23: homes_low, 21: hard_limits, 27: "3.000", 130: "400.000", **({} if told else {40: "0"})}
+    found = GrblSettings(values, {**BUILD, **told, "OPT": f"{options},15,128"}).identity((0, 1))
+    assert found.travel_mm.x_mm == travel_x_mm
+    assert found.firmware.startswith("grblHAL ")

@@ -9,8 +9,19 @@ from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
 
 
-def check_stage(stage: Gantry) -> None:
-    """Check an unconnected stage, from connecting to closing."""
+def stage_contract(stage: Gantry) -> None:
+    """Check an unconnected stage, from connecting to closing; it homes five times and moves in a half of its travel.
+
+    Parameters
+    ----------
+    stage : Gantry
+        The stage; around a `Controller` of your own, `Gantry(controller, settings, clock)`.
+
+    Raises
+    ------
+    AssertionError
+        The stage does not meet the contract.
+    """
     _check_unconnected(stage)
     stage.connect()
     _check_identity(stage)
@@ -23,7 +34,7 @@ def check_stage(stage: Gantry) -> None:
     _check_close(stage)
 
 
-def inside(stage: Gantry, share_x: float, share_y: float) -> Point:
+def _inside(stage: Gantry, share_x: float, share_y: float) -> Point:
     """Return the point at these fractions of the travel, rounded to 0.01 mm."""
     (x0, x1), (y0, y1) = stage.travel().x_mm, stage.travel().y_mm
     return Point(round(x0 + share_x * (x1 - x0), 2), round(y0 + share_y * (y1 - y0), 2))
@@ -49,7 +60,7 @@ def _check_identity(stage: Gantry) -> None:
 
 def _check_unhomed(stage: Gantry) -> None:
     assert not stage.trusted
-    target = inside(stage, 0.5, 0.5)
+    target = _inside(stage, 0.5, 0.5)
     with pytest.raises(NotHomed):
         stage.move_to(*target)
     with pytest.raises(NotHomed):
@@ -68,7 +79,7 @@ def _check_homed(stage: Gantry) -> None:
 
 def _check_moves(stage: Gantry) -> None:
     for shares in ((0.25, 0.25), (0.5, 0.25), (0.25, 0.5), (0.26, 0.26)):
-        target = inside(stage, *shares)
+        target = _inside(stage, *shares)
         assert stage.move_to(*target).is_at(target)
         assert stage.verify_at(*target).is_at(target)
         assert stage.position().is_at(target)
@@ -105,7 +116,7 @@ def _check_hold_and_recover(stage: Gantry) -> None:
     stage.hold()
     if not stage.trusted:
         stage.home()
-    assert stage.move_to(*inside(stage, 0.3, 0.3)).trusted
+    assert stage.move_to(*_inside(stage, 0.3, 0.3)).trusted
 
 
 def _check_close(stage: Gantry) -> None:

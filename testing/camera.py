@@ -6,10 +6,20 @@ from faintfield.rig.cameras.protocol import Camera
 from faintfield.rig.errors import CameraError
 
 
-def check_camera(camera: Camera, exposure_s: float) -> None:
-    """Check a closed camera, from opening to closing.
+def camera_contract(camera: Camera, exposure_s: float) -> None:
+    """Check a closed camera, from opening to closing; it takes six frames.
 
-    `exposure_s` must be one of its exposure times.
+    Parameters
+    ----------
+    camera : Camera
+        The camera, not yet opened.
+    exposure_s : float
+        One of its exposure times; a short one will do.
+
+    Raises
+    ------
+    AssertionError
+        The camera does not meet the contract.
     """
     _check_closed(camera, exposure_s)
     camera.open()

@@ -1,0 +1,227 @@
+"""Cameras and stages from other packages, found by their entry points; docs/plugins.md shows one."""
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from faintfield.rig.cameras.protocol import Camera, CameraReport, Exposure, Thermometer
+from faintfield.rig.cameras.settings import BUILT_IN_BACKENDS, CoolingSettings, PluginSettings
+from faintfield.rig.clock import Clock
+from faintfield.rig.errors import CameraError, PlanRefused, PluginFailed, RigError, UnknownPlugin, in_one_line
+from faintfield.rig.stages.protocol import BUILT_IN_PROTOCOLS, WITHOUT_OPTIONS, Controller, StageSettings
+
+CAMERAS = "faintfield.cameras"
+STAGES = "faintfield.stages"
+
+# Key in rig.toml, and built-in drivers, of each group.
+_BUILT_IN = {CAMERAS: ("camera.backend", BUILT_IN_BACKENDS), STAGES: ("stage.protocol", BUILT_IN_PROTOCOLS)}
+
+# Keys of `[camera]` that are not the plug-in's own.
+_COMMON = ("mosaic", *CoolingSettings.__struct_fields__)
+
+
+@dataclass(frozen=True)
+class CameraPlugin[T: Struct]:
+    """What an entry point of the group `faintfield.cameras` names.
+
+    Parameters
+    ----------
+    settings : type
+        Struct of the keys of `[camera]`, besides `backend`, `mosaic` and those that begin with `settle_`; it forbids
+        unknown fields.
+    make : callable
+        Makes the camera, closed, from its settings and the clock of its waits.
+    """
+
+    settings: type[T]
+    make: Callable[[T, Clock], Camera]
+
+
+@dataclass(frozen=True)
+class StagePlugin[T: Struct]:
+    """What an entry point of the group `faintfield.stages` names.
+
+    Parameters
+    ----------
+    settings : type
+        Struct of the keys of `[stage]` that `StageSettings` does not have; it forbids unknown fields.
+    make : callable
+        Makes the controller, unconnected, from these, the whole `[stage]` table, and the clock of its waits.
+    """
+
+    settings: type[T]
+    make: Callable[[T, StageSettings, Clock], Controller]
+
+
+def fold_plugins(content: Any) -> Any:
+    """Return the content of a rig.toml as `RigSettings` takes it: with what no built-in driver reads as `options`.
+
+    Raises
+    ------
+    UnknownPlugin
+        A driver is neither built in nor installed.
+    """
+    if not isinstance(content, dict):
+        return content
+    camera, stage = content.get("camera"), content.get("stage")
+    if isinstance(camera, dict) and isinstance(name := camera.get("backend"), str) and name not in BUILT_IN_BACKENDS:
+        _entry_points(CAMERAS, name)
+        options = {key: value for key, value in camera.items() if key not in ("backend", *_COMMON)}
+        common = {key: value for key, value in camera.items() if key in _COMMON}
+        content = content | {"camera": {"backend": "plugin", "name": name, "options": options, **common}}
+    if isinstance(stage, dict) and isinstance(name := stage.get("protocol"), str) and name not in WITHOUT_OPTIONS:
+        if name not in BUILT_IN_PROTOCOLS:
+            _entry_points(STAGES, name)
+        known = set(StageSettings.__struct_fields__) - {"options"}
+        options = {key: value for key, value in stage.items() if key not in known}
+        common = {key: value for key, value in stage.items() if key in known}
+        content = content | {"stage": {**common, "options": options}}
+    return content
+
+
+def plugin_camera(settings: PluginSettings, clock: Clock) -> Camera:
+    """Return the camera that a plug-in makes.
+
+    Raises
+    ------
+    UnknownPlugin
+        No plug-in of this name is installed; the message lists those that are, and those that are built in.
+    PluginFailed
+        The plug-in cannot be used.
+    PlanRefused
+        Its settings are wrong.
+    """
+    plugin = _load(CAMERAS, settings.name, CameraPlugin)
+    options = checked_options(settings.options, plugin.settings, f"[camera] with backend = {settings.name!r}")
+    return PluginCamera(settings.name, _made(settings.name, lambda: plugin.make(options, clock)))
+
+
+class PluginCamera:
+    """A camera of another package, whose failures all become `CameraError`.
+
+    Parameters
+    ----------
+    name : str
+        Name of the plug-in.
+    camera : Camera
+        Its camera.
+    """
+
+    def __init__(self, name: str, camera: Camera) -> None:
+        self._name = name
+        self._camera = camera
+
+    def open(self) -> None:
+        """Connect to the camera."""
+        self._named(self._camera.open)
+
+    def report(self) -> CameraReport:
+        """Return the camera's name, limits and settings."""
+        return self._named(self._camera.report)
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        """Take one frame."""
+        return self._named(lambda: self._camera.expose(exposure_s, number))
+
+    def temperature_c(self) -> float | None:
+        """Return the temperature of the sensor in °C, None if the camera reports none."""
+        camera = self._camera
+        return self._named(camera.temperature_c) if isinstance(camera, Thermometer) else None
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._named(self._camera.close)
+
+    def _named[T](self, call: Callable[[], T]) -> T:
+        """Call the plug-in; what it raises besides `RigError` becomes a `CameraError` that names it."""
+        try:
+            return call()
+        except RigError:
+            raise
+        except Exception as failure:  # a plug-in may raise anything
+            raise CameraError(
+                f"the plug-in {self._name!r} failed with {type(failure).__name__}: {in_one_line(failure)}; tell "
+                "its maintainers"
+            ) from failure
+
+
+def plugin_controller(settings: StageSettings, clock: Clock) -> Controller:
+    """Return the controller that a plug-in makes; raises as `plugin_camera` does."""
+    name = settings.protocol
+    plugin = _load(STAGES, name, StagePlugin)
+    options = checked_options(settings.options, plugin.settings, f"[stage] with protocol = {name!r}")
+    return _made(name, lambda: plugin.make(options, settings, clock))
+
+
+def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) -> T:
+    """Return `options` as the Struct `kind`; raises `PlanRefused` for keys and values that it does not take."""
+    try:
+        return msgspec.convert(dict(options), kind)
+    except msgspec.ValidationError as failure:
+        raise PlanRefused(f"{place}: {failure}; correct it in rig.toml") from None
+
+
+def _entry_points(group: str, name: str) -> list[EntryPoint]:
+    """Return the entry points `name` of a group; raises `UnknownPlugin` if there are none."""
+    installed = entry_points(group=group)
+    found = [it for it in installed if it.name == name]
+    if not found:
+        key, built_in = _BUILT_IN[group]
+        names = sorted({it.name for it in installed})
+        near = difflib.get_close_matches(name, [*built_in, *names], n=1, cutoff=0.5)
+        others = f"or of the plug-ins {', '.join(map(repr, names))}" if names else "no plug-in is installed"
+        raise UnknownPlugin(
+            f"{key} = {name!r}; choose from {', '.join(map(repr, built_in))}, {others}"
+            + (f"; did you mean {near[0]!r}?" if near else "")
+        )
+    return found
+
+
+def _load[T](group: str, name: str, kind: type[T]) -> T:
+    """Return what the entry point `name` of a group holds, which must be a `kind`."""
+    found, key = _entry_points(group, name), _BUILT_IN[group][0]
+    packages = sorted({_package(it) for it in found})
+    if len(packages) > 1:
+        raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
+    try:
+        plugin = found[0].load()
+    except Exception as failure:
+        raise PluginFailed(
+            f"the plug-in {name!r} of {packages[0]} cannot be imported: {type(failure).__name__}: "
+            f"{in_one_line(failure)}; install what it needs, or another version of it"
+        ) from failure
+    if not isinstance(plugin, kind) or not _forbids_unknown(plugin):
+        raise PluginFailed(
+            f"the plug-in {name!r} of {packages[0]} is no {kind.__name__} whose settings forbid unknown fields; "
+            "install a version of it that fits this version of faintfield"
+        )
+    return plugin
+
+
+def _forbids_unknown(plugin: object) -> bool:
+    """Return whether the settings of a plug-in are a Struct that takes no mistyped keys."""
+    settings = getattr(plugin, "settings", None)
+    return (
+        isinstance(settings, type) and issubclass(settings, Struct) and settings.__struct_config__.forbid_unknown_fields
+    )
+
+
+def _package(entry: EntryPoint) -> str:
+    """Return name and version of the package of an entry point."""
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else entry.value
+
+
+def _made[T](name: str, make: Callable[[], T]) -> T:
+    """Return what a plug-in makes; raises `PluginFailed` if it raises what no camera or stage may."""
+    try:
+        return make()
+    except Exception as failure:
+        raise PluginFailed(
+            f"the plug-in {name!r} failed: {type(failure).__name__}: {in_one_line(failure)}; correct its settings, or "
+            "tell its authors"
+        ) from failure

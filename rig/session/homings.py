@@ -1,0 +1,110 @@
+"""Homing groups: which frames of a session share one homing, and how well the switches repeat."""
+
+from pathlib import Path
+from statistics import stdev
+
+from msgspec import Struct
+
+from faintfield.rig.session.journal import CommittedFrame, Journal
+from faintfield.rig.session.session import open_journal, read_plan
+
+# Spread of homings that matters no more than that of a good drive.
+NEGLIGIBLE_MM = 0.02
+
+# Drift checks that tell the spread: switches of 0.05 mm pass for ones of 0.02 mm in 2 % of the cases.
+MIN_CHECKS = 6
+
+
+class Homed(Struct, frozen=True):
+    """Detail of an event `homed`: the stage was homed, and its positions may differ from those before.
+
+    Parameters
+    ----------
+    group : int
+        Number of the homing group, from 1 on.
+    first_intent : int
+        Number of the first exposure of the group.
+    """
+
+    group: int
+    first_intent: int
+
+
+class DriftCheck(Struct, frozen=True):
+    """Detail of an event `drift_check`: a check that passed; see `rig.stages.drift.Drift`."""
+
+    away_mm: tuple[float, ...]
+
+
+class HomingGroups(Struct, frozen=True):
+    """The homing groups of a session.
+
+    Within a group, positions repeat as well as the drive does; between groups they may differ by as much as the
+    switches do.
+
+    Parameters
+    ----------
+    groups : dict
+        Homing group of each committed frame, by the number of its exposure (`CommittedFrame.intent`); None in sessions
+        that do not record homing.
+    spread_mm : tuple of float, optional
+        Standard deviation of where the switches close, per axis or one number if the axes home together, from the
+        drift checks that passed; it contains the jitter of their timing. None with fewer than two such checks.
+    checks : int
+        Number of these checks.
+    """
+
+    groups: dict[int, int | None]
+    spread_mm: tuple[float, ...] | None
+    checks: int
+
+    def repeat(self) -> bool:
+        """Return whether the switches are known to repeat so well that groups need not be told apart."""
+        known = self.spread_mm is not None and self.checks >= MIN_CHECKS
+        return known and max(self.spread_mm or ()) <= NEGLIGIBLE_MM
+
+
+def begin_group(journal: Journal) -> None:
+    """Record that the frames from here on belong to a new homing group."""
+    earlier = journal.details("homed", Homed)
+    group = earlier[-1].group + 1 if earlier else 1
+    journal.event("homed", group=group, first_intent=journal.next_intent())
+
+
+def unchecked_frames(journal: Journal) -> list[CommittedFrame]:
+    """Return the frames of the newest group that count, if no drift check confirms them."""
+    homed = journal.events("homed")
+    if not homed or any(check.id > homed[-1].id for check in journal.events("drift_check")):
+        return []
+    first_intent = journal.details("homed", Homed)[-1].first_intent
+    return [it for it in journal.committed() if it.void is None and it.intent >= first_intent]
+
+
+def homing_groups(journal: Journal) -> HomingGroups:
+    """Return the homing groups that a journal records."""
+    homings = journal.details("homed", Homed)
+    groups = {
+        it.intent: max((homed.group for homed in homings if homed.first_intent <= it.intent), default=None)
+        for it in journal.committed()
+    }
+    away_mm = [check.away_mm for check in journal.details("drift_check", DriftCheck)]
+    return HomingGroups(groups, _spread_mm(away_mm), len(away_mm))
+
+
+def read_homing_groups(folder: Path) -> HomingGroups:
+    """Return the homing groups of the session in `folder`.
+
+    Raises
+    ------
+    SessionCorrupt
+        Plan or journal cannot be read.
+    """
+    with open_journal(folder, read_plan(folder), read_only=True) as journal:
+        return homing_groups(journal)
+
+
+def _spread_mm(checks: list[tuple[float, ...]]) -> tuple[float, ...] | None:
+    """Return the standard deviation of the measured drifts, per axis."""
+    if len(checks) < 2 or len({len(away_mm) for away_mm in checks}) != 1:
+        return None
+    return tuple(stdev(axis) for axis in zip(*checks, strict=True))

@@ -1,0 +1,141 @@
+"""A simulated grblHAL controller: what it does otherwise than GRBL, as far as a driver notices.
+
+With hard limits on, its soft limits keep away from the switches by the pull-off. A critical alarm does not silence it:
+it answers status requests, and refuses commands with error:79. A safety door during a jog freezes it in the state
+`Jog`: it ignores a cancel, and a resume runs the rest of the jog. An emergency stop is ALARM:10, and no reset is
+accepted while it is pressed. After power-up it raises ALARM:11 until it is homed, if `$22` asks for that.
+"""
+
+from typing import ClassVar
+
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.grbl_settings import StoredSettings
+
+_HOMING_REQUIRED = 11
+
+# Commands that are allowed during a critical alarm.
+_HARMLESS = ("", "$I", "$$")
+
+
+class HalSettings(StoredSettings):
+    """The `$` settings of grblHAL."""
+
+    def __init__(self, changes: dict[int, str]) -> None:
+        super().__init__({22: "7", 40: "0", **changes})
+
+    def margin_mm(self) -> float:
+        """Return how far from the ends of the travel the soft limits lie."""
+        return self.number(27) if int(self.number(21)) & 1 else 0.0
+
+    def homes_singly(self) -> bool:
+        """Return whether an axis can be homed by itself."""
+        return bool(int(self.number(22)) & 2)
+
+    def answer(self, command: str) -> list[str] | None:
+        """Return the lines that answer `$I`, `$$` or `$N=value`, which is stored; None for other commands."""
+        if command != "$I":
+            return super().answer(command)
+        single = "H" if self.homes_singly() else ""
+        return ["[VER:1.1f.20250225:]", f"[OPT:VNM{single}L,100,1024,3,0]", "[AXS:3:XYZ]", "[FIRMWARE:grblHAL]"]
+
+
+class SimulatedGrblHal(SimulatedGrbl):
+    """Firmware, settings and mechanics of a grblHAL stage; the parameters are those of `SimulatedGrbl`."""
+
+    _critical_alarms: ClassVar[tuple[int, ...]] = (1, 2, 10, 17)
+
+    @staticmethod
+    def _stored(changes: dict[int, str]) -> StoredSettings:
+        """Return the settings in the controller's memory."""
+        return HalSettings(changes)
+
+    def _reset_state(self) -> None:
+        """Forget alarms, too; the emergency stop stays as it is."""
+        super()._reset_state()
+        self._alarm, self._frozen = 0, False
+
+    # Pressed by `press_emergency_stop`; a class attribute, since the first restart comes before any instance has it.
+    emergency_stop = False
+
+    def press_emergency_stop(self) -> None:
+        """Press the emergency stop."""
+        self.emergency_stop = True
+        self.alarm(10)
+
+    def release_emergency_stop(self) -> None:
+        """Release the emergency stop; the alarm stays until a reset."""
+        self.emergency_stop = False
+
+    def alarm(self, code: int) -> None:
+        """Stop with an alarm."""
+        self._alarm, self._frozen = code, False
+        super().alarm(code)
+
+    def open_door(self) -> None:
+        """Open the safety door, which freezes a jog."""
+        if self.state == "Jog":
+            self._held = self.mechanics.brake() or self._held
+            self._frozen = True
+        else:
+            super().open_door()
+
+    def _booted(self) -> None:
+        """Finish the restart, locked if homing is required."""
+        self.state = "Idle"
+        self._greet()
+        if int(self.settings.number(22)) & 4:
+            self.alarm(_HOMING_REQUIRED)
+        if self.emergency_stop:
+            self.alarm(10)
+
+    def _greet(self) -> None:
+        """Send the banner."""
+        self.say("GrblHAL 1.1f ['$' or '$HELP' for help]")
+
+    def _deaf(self) -> bool:
+        """Return whether nothing but a reset is heard."""
+        return False
+
+    def _told_state(self) -> str:
+        """Return the state with the number of the alarm."""
+        return f"Alarm:{self._alarm}" if self.state == "Alarm" and self._alarm else self.state
+
+    def _pins(self) -> str:
+        """Return the letters of the active inputs, with E for the emergency stop."""
+        return super()._pins() + ("E" if self.emergency_stop else "")
+
+    def _reset(self) -> None:
+        """Handle the reset character: ignored under the emergency stop, an abort in a frozen jog."""
+        if self.emergency_stop or not self._accepts_reset:
+            return
+        if self._frozen and not self.mechanics.moving:
+            self.alarm(3)
+        self._frozen = False
+        super()._reset()
+
+    def _cancel_jog(self) -> None:
+        """Handle the jog-cancel character, which a frozen jog ignores."""
+        if not self._frozen:
+            super()._cancel_jog()
+
+    def _motion_ended(self) -> None:
+        """Update the state at the end of the last motion; a frozen jog stays."""
+        if not self._frozen:
+            super()._motion_ended()
+
+    def _resume(self) -> None:
+        """Handle the resume character: a frozen jog runs on."""
+        if self._frozen:
+            self._frozen, self.state = False, "Hold:0"
+        super()._resume()
+
+    def _run_lines(self) -> None:
+        """Run waiting lines, but none while a jog is frozen."""
+        if not self._frozen:
+            super()._run_lines()
+
+    def _run(self, line: str) -> int | None:
+        """Run one line; during a critical alarm nearly all are refused."""
+        if self.critical and line not in _HARMLESS:
+            return 79 if line.startswith("$") else 9
+        return super()._run(line)

@@ -1,0 +1,1 @@
+"""XY stages for which Micro-Manager has a device adapter."""

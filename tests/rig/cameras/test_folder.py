@@ -1,0 +1,347 @@
+"""The watched folder: which file is the frame that was asked for, and when it is complete."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.live.guided import read_pixels
+from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.protocol import Decode, Exposure
+from faintfield.rig.cameras.settings import FolderSettings
+from faintfield.rig.errors import CameraError, CameraTimeout
+from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.testing import camera_contract
+
+
+class Program(SimulatedClock):
+    """A camera's program, and the clock by which it writes: files change at given times after a request."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+        self.asked_s = 0.0
+        self.due: list[tuple[float, Callable[[], object]]] = []
+
+    def sleep_s(self, duration_s: float) -> None:
+        super().sleep_s(duration_s)
+        after_s = self.now_s() - self.asked_s
+        due = [action for at_s, action in self.due if at_s <= after_s]
+        self.due = [it for it in self.due if it[0] > after_s]
+        for action in due:
+            action()
+
+    def ask(self) -> None:
+        """Note that a frame is asked for now; what comes is timed from here."""
+        self.asked_s, self.due = self.now_s(), []
+
+    def at(self, after_s: float, name: str, content: bytes, changed_s: float | None = None) -> None:
+        """Let a file have `content` from `after_s` on, changed then, or at `changed_s` after the request."""
+
+        def write() -> None:
+            (self.folder / name).write_bytes(content)
+            changed = time.time() + (after_s if changed_s is None else changed_s)
+            os.utime(self.folder / name, (changed, changed))
+
+        self.due.append((after_s, write))
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Program:
+    return Program(tmp_path)
+
+
+def watching(
+    program: Program, decode: Decode = lambda path: None, *, quiet_s: float = 5.0, file_times: bool = True
+) -> FolderCamera:
+    settings = FolderSettings(str(program.folder), frame_mb=1.0, arrival_s=20.0, quiet_s=quiet_s, file_times=file_times)
+    camera = FolderCamera(settings, program, decode)
+    camera.open()
+    program.ask()
+    return camera
+
+
+def tiff(rows: int = 12) -> bytes:
+    """Return the file of a frame without compression, whose pixels come last."""
+    buffer = BytesIO()
+    tifffile.imwrite(buffer, np.arange(1, 1 + 16 * rows, dtype=np.uint16).reshape(rows, 16) * 300)
+    return buffer.getvalue()
+
+
+class TriggeredFolder(FolderCamera):
+    """A folder whose program saves a file at each exposure."""
+
+    program: Program
+    files = 0
+
+    def expose(self, exposure_s: float, number: int) -> Exposure:
+        self.files += 1
+        self.program.ask()
+        self.program.at(exposure_s + 1.0, f"IMG_{self.files}.NEF", b"RAW ")
+        self.program.at(exposure_s + 2.0, f"IMG_{self.files}.NEF", b"RAW FILE")
+        return super().expose(exposure_s, number)
+
+
+def test_the_contract(program: Program) -> None:
+    camera = TriggeredFolder(FolderSettings(str(program.folder), frame_mb=1.0), program)
+    camera.program = program
+    camera_contract(camera, 0.1)
+
+
+def test_a_file_that_comes_before_the_exposure_can_end_is_refused(program: Program) -> None:
+    camera = watching(program)
+    program.at(0.3, "early.nef", b"begun before")
+    with pytest.raises(
+        CameraError, match=r"early\.nef: came 0\.50 s after .* exposed for 2 s, .*; .* take this frame again"
+    ):
+        camera.expose(2.0, 1)
+    program.ask()
+    program.at(2.5, "right.nef", b"as asked for")
+    assert camera.expose(2.0, 2).content == b"as asked for"  # the early file is not taken for it
+
+
+def test_a_file_that_comes_right_at_the_end_of_the_exposure_is_taken(program: Program) -> None:
+    camera = watching(program)
+    program.at(2.0, "right.nef", b"as asked for")
+    assert camera.expose(2.0, 1).metadata["camera_file"] == "right.nef"
+
+
+def test_a_file_that_was_last_changed_before_the_exposure_could_end_is_refused(program: Program) -> None:
+    camera = watching(program)
+    program.at(6.0, "moved.nef", b"of an hour ago", changed_s=-3600.0)
+    with pytest.raises(
+        CameraError, match=r"moved\.nef: was last changed at .* UTC, 3605\.\d s before .* 5 s .*file_times"
+    ):
+        camera.expose(5.0, 1)
+    program.ask()
+    program.at(6.0, "coarse.nef", b"on FAT", changed_s=3.5)  # rounded down to 2 s
+    assert camera.expose(5.0, 2).content == b"on FAT"
+    camera = watching(program, file_times=False)
+    program.at(6.0, "camera's time.nef", b"kept", changed_s=-3600.0)
+    assert camera.expose(5.0, 3).content == b"kept"
+
+
+def test_times_of_files_are_compared_with_the_clock_of_the_folder(program: Program) -> None:
+    camera = watching(program)
+    program.at(6.0, "right.nef", b"of a server whose clock is an hour behind", changed_s=6.0 - 3600.0)
+    with mock.patch.object(FolderCamera, "_folder_time_s", return_value=time.time() - 3600.0):
+        assert camera.expose(5.0, 1).metadata["camera_file"] == "right.nef"
+
+
+def test_the_probe_for_the_folder_s_clock_is_removed(program: Program) -> None:
+    camera = watching(program)
+    program.at(0.5, "one.nef", b"one")
+    camera.expose(0.1, 1)
+    assert [it.name for it in program.folder.iterdir()] == ["one.nef"]
+
+
+def test_a_folder_that_cannot_be_written_to_is_watched_without_its_clock(program: Program) -> None:
+    camera = watching(program)
+    program.at(6.0, "one.nef", b"one", changed_s=-3600.0)
+    with mock.patch.object(Path, "write_bytes", side_effect=PermissionError):
+        request = camera._request(5.0)  # noqa: SLF001
+    assert request.folder_time_s is None
+
+
+def test_a_half_written_picture_is_waited_for(program: Program) -> None:
+    camera = watching(program, read_pixels)
+    whole = tiff()
+    program.at(1.0, "one.tif", whole[: len(whole) // 2])
+    program.at(9.0, "one.tif", whole)  # after 8 s of quiet
+    assert camera.expose(0.5, 1).content == whole
+
+
+def test_a_picture_that_was_given_its_size_before_its_pixels_is_waited_for(program: Program) -> None:
+    camera = watching(program, read_pixels)
+    whole = tiff(rows=200)
+    half = whole[: len(whole) // 2] + bytes(len(whole) - len(whole) // 2)
+    program.at(1.0, "one.tif", half)
+    program.at(5.0, "one.tif", whole)  # after 4 s of quiet
+    assert read_pixels_of(half) is not None  # it decodes
+    assert camera.expose(0.5, 1).content == whole
+
+
+def read_pixels_of(content: bytes) -> object:
+    return tifffile.imread(BytesIO(content))
+
+
+def test_a_picture_that_ends_in_black_is_taken_when_it_has_not_changed_for_long(program: Program) -> None:
+    buffer = BytesIO()
+    tifffile.imwrite(buffer, np.zeros((100, 100), np.uint16))
+    camera = watching(program, read_pixels, quiet_s=5.0)
+    program.at(1.0, "black.tif", buffer.getvalue())
+    assert camera.expose(0.5, 1).content == buffer.getvalue()
+    assert 6.0 <= program.now_s() - program.asked_s <= 6.5
+
+
+def test_a_whole_picture_is_taken_soon(program: Program) -> None:
+    camera = watching(program, read_pixels)
+    program.at(1.0, "one.tif", tiff())
+    assert camera.expose(0.5, 1).content == tiff()
+    assert program.now_s() - program.asked_s <= 1.75
+
+
+def test_a_picture_that_stays_damaged_is_no_frame(program: Program) -> None:
+    camera = watching(program, read_pixels)
+    program.at(1.0, "one.tif", tiff()[:-100])
+    with pytest.raises(CameraTimeout, match=r"one\.tif is not complete \(.*cannot be decoded.* within 20\.5 s; "):
+        camera.expose(0.5, 1)
+
+
+def test_a_file_that_cannot_be_decoded_here_is_taken_when_it_has_been_quiet_for_long(program: Program) -> None:
+    camera = watching(program, quiet_s=5.0)
+    for after_s, content in ((1.0, b"one"), (5.5, b"one two"), (9.0, b"one two three"), (15.0, b"too late")):
+        program.at(after_s, "IMG.NEF", content)
+    exposure = camera.expose(0.1, 1)
+    assert exposure.content == b"one two three"
+    assert exposure.suffix == ".nef"
+    assert exposure.metadata["camera_file"] == "IMG.NEF"
+
+
+def test_a_file_that_changes_within_is_not_quiet(program: Program) -> None:
+    camera = watching(program, quiet_s=5.0)
+    for after_s in range(1, 10):
+        program.at(after_s, "IMG.NEF", b"%d of 9" % after_s)  # its size stays the same
+    assert camera.expose(0.1, 1).content == b"9 of 9"
+
+
+def test_files_that_came_before_or_too_late_are_no_frames(program: Program) -> None:
+    (program.folder / "old.nef").write_bytes(b"old")
+    camera = watching(program)
+    with pytest.raises(CameraTimeout, match=r"no file came within 20\.1 s; "):
+        camera.expose(0.1, 1)
+    (program.folder / "late.nef").write_bytes(b"of the frame before")
+    program.ask()
+    program.at(0.5, "new.nef", b"new")
+    program.at(0.5, "notes.txt", b"no frame")
+    assert camera.expose(0.1, 2).content == b"new"
+
+
+@pytest.mark.parametrize("opened_again", [False, True])
+def test_the_first_file_after_a_timeout_may_be_the_late_one(program: Program, opened_again: bool) -> None:
+    camera = watching(program)
+    with pytest.raises(CameraTimeout):
+        camera.expose(0.1, 1)
+    if opened_again:  # as a capture does after a failure
+        camera.close()
+        camera.open()
+    program.ask()
+    program.at(2.0, "late.nef", b"of the frame before")
+    with pytest.raises(CameraError, match=r"late\.nef: may be the frame before, .*; take this frame again"):
+        camera.expose(0.1, 2)
+    program.ask()
+    program.at(2.0, "right.nef", b"as asked for")
+    assert camera.expose(0.1, 3).content == b"as asked for"
+
+
+def test_a_late_file_that_came_between_two_requests_is_owed_no_more(program: Program) -> None:
+    camera = watching(program)
+    with pytest.raises(CameraTimeout):
+        camera.expose(0.1, 1)
+    camera.close()
+    (program.folder / "late.nef").write_bytes(b"of the frame before")
+    camera.open()
+    program.ask()
+    program.at(2.0, "right.nef", b"as asked for")
+    assert camera.expose(0.1, 2).content == b"as asked for"
+
+
+def test_a_file_that_never_ends_and_two_files_at_once(program: Program) -> None:
+    camera = watching(program)
+    for second in range(1, 30):
+        program.at(second, "endless.nef", b"more " * second)
+    with pytest.raises(CameraTimeout, match=r"endless\.nef never stopped growing"):
+        camera.expose(0.1, 1)
+    program.ask()
+    program.at(1.0, "a.nef", b"a")
+    program.at(1.0, "b.nef", b"b")
+    with pytest.raises(CameraError, match=r"2 files came for one frame \(a.nef, b.nef\); "):
+        camera.expose(0.1, 2)
+
+
+def test_a_file_that_is_renamed_when_it_is_whole(program: Program) -> None:
+    camera = watching(program)
+    program.at(1.0, "part.nef", b"whole")
+    program.due.append((2.0, lambda: (program.folder / "part.nef").rename(program.folder / "IMG.NEF")))
+    assert camera.expose(0.1, 1).metadata["camera_file"] == "IMG.NEF"
+
+
+def test_a_folder_that_is_none(tmp_path: Path) -> None:
+    with pytest.raises(CameraError, match="is not a folder; create it"):
+        FolderCamera(FolderSettings(str(tmp_path / "absent")), SimulatedClock()).open()
+
+
+def test_a_folder_that_vanishes(tmp_path: Path) -> None:
+    folder = tmp_path / "incoming"
+    folder.mkdir()
+    program = Program(folder)
+    camera = watching(program)
+    program.due.append((3.0, lambda: shutil.rmtree(folder)))
+    with pytest.raises(CameraError, match=r"incoming: the folder is gone; mount it again"):
+        camera.expose(0.1, 1)
+    assert program.now_s() - program.asked_s < 4.0
+    # A capture closes and opens the camera after a failure, and then goes on whether it could
+    camera.close()
+    with pytest.raises(CameraError, match=r"incoming: is not a folder"):
+        camera.open()
+    with pytest.raises(CameraError, match=r"incoming: the folder is gone; mount it again"):
+        camera.expose(0.1, 2)
+    folder.mkdir()
+    camera.open()
+    program.ask()
+    program.at(1.0, "one.nef", b"one")
+    assert camera.expose(0.1, 3).content == b"one"
+
+
+def test_an_empty_folder_where_a_disk_was_mounted_is_not_waited_for(program: Program) -> None:
+    camera = watching(program)
+    camera._device += 1  # noqa: SLF001 - a mount needs privileges
+    with pytest.raises(CameraError, match=r"the folder is gone; mount it again"):
+        camera.expose(0.1, 1)
+
+
+def test_a_file_that_cannot_be_read(program: Program) -> None:
+    camera = watching(program)
+    program.at(1.0, "one.nef", b"one")
+    with (
+        mock.patch.object(Path, "read_bytes", side_effect=OSError(5, "Input/output error")),
+        pytest.raises(CameraError, match=r"cannot be read \(Input/output error\); check the disk"),
+    ):
+        camera.expose(0.1, 1)
+
+
+@pytest.mark.parametrize("quiet_s", [-1.0, 60.0])
+def test_a_quiet_time_beyond_the_limit_is_refused(quiet_s: float) -> None:
+    with pytest.raises(ValueError, match=r"quiet_s = .*; give less than arrival_s = 60"):
+        FolderSettings("incoming", quiet_s=quiet_s)
+
+
+@pytest.fixture
+def dng() -> bytes:
+    """Return a raw file of a real camera."""
+    if "FAINTFIELD_DATA" not in os.environ:
+        pytest.skip("FAINTFIELD_DATA does not name the folder of real data")
+    return (Path(os.environ["FAINTFIELD_DATA"]) / "raw" / "colorchart.dng").read_bytes()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.99, 0.9999])
+def test_a_raw_file_that_is_cut_short_is_damaged(tmp_path: Path, dng: bytes, share: float) -> None:
+    path = tmp_path / "cut.dng"
+    path.write_bytes(dng[: int(share * len(dng))])
+    with pytest.raises(CameraError, match=r"cannot be decoded"):
+        read_pixels(path)
+
+
+def test_a_raw_file_with_zeros_for_its_end_is_waited_for(program: Program, dng: bytes) -> None:
+    camera = watching(program, read_pixels)
+    half = len(dng) // 2
+    program.at(1.0, "one.dng", dng[:half] + bytes(len(dng) - half))  # LibRaw decodes it
+    program.at(5.0, "one.dng", dng)
+    assert camera.expose(0.5, 1).content == dng

@@ -1,0 +1,84 @@
+"""The camera of docs/plugins.md runs, and meets the contract."""
+
+import re
+import socketserver
+import struct
+import threading
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from faintfield.rig.clock import WallClock
+from faintfield.rig.errors import CameraError
+from faintfield.testing import camera_contract
+
+_DOCUMENT = Path(__file__).parents[3] / "docs" / "plugins.md"
+_PICTURE = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
+
+
+class Server(socketserver.StreamRequestHandler):
+    """The server that the document's camera talks to."""
+
+    def handle(self) -> None:
+        for line in self.rfile:
+            request, *_ = line.decode().split()
+            if request == "REPORT":
+                self.wfile.write(b"Sky-1 4 3".ljust(64))
+            elif request == "EXPOSE":
+                self.wfile.write(struct.pack(">II", 4, 3))
+            elif request == "FETCH":
+                self.wfile.write(_PICTURE.astype(">u2").tobytes())
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Server) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_address[1]
+        server.shutdown()
+
+
+@pytest.fixture
+def module() -> types.ModuleType:
+    """Return the module that the document's first Python block is."""
+    block = re.search(r"^```python\n(.*?)^```$", _DOCUMENT.read_text(), flags=re.DOTALL | re.MULTILINE)
+    assert block is not None
+    module = types.ModuleType("faintfield_sky")
+    exec(compile(block[1], _DOCUMENT, "exec"), module.__dict__)
+    return module
+
+
+def camera(module: types.ModuleType, **settings: Any) -> Any:
+    plugin = module.PLUGIN
+    return plugin.make(plugin.settings(**settings), WallClock())
+
+
+def test_the_document_s_camera_meets_the_contract(module: types.ModuleType, port: int) -> None:
+    camera_contract(camera(module, host="127.0.0.1", port=port), 0.01)
+
+
+def test_its_frames_are_those_of_the_server(module: types.ModuleType, port: int) -> None:
+    sky = camera(module, host="127.0.0.1", port=port)
+    sky.open()
+    assert sky.report().name == "Sky-1"
+    np.testing.assert_array_equal(sky.expose(0.01, 1).pixels, _PICTURE)
+    sky.close()
+
+
+def test_a_server_that_is_not_there_is_a_failure_of_the_camera(module: types.ModuleType, port: int) -> None:
+    with pytest.raises(CameraError, match="; start it"):
+        camera(module, host="127.0.0.1", port=1).open()
+    sky = camera(module, host="127.0.0.1", port=port, answer_s=0.2)
+    sky.open()
+    with pytest.raises(CameraError, match="sent 0 of 9 bytes"):
+        sky._ask("NOTHING", 9)  # noqa: SLF001 - a request that the server does not answer
+
+
+def test_the_class_is_as_short_as_the_document_says() -> None:
+    text = _DOCUMENT.read_text()
+    assert "some forty lines" in text
+    assert text[text.index("class SkyCamera") : text.index("\n\n\nPLUGIN")].count("\n") < 50

@@ -1,0 +1,182 @@
+"""Which settings a session keeps, which may change before it is resumed, and what is recorded of it."""
+
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import msgspec
+import pytest
+
+from faintfield.rig.cameras.settings import FolderSettings, GPhoto2Settings, SimulatedSettings
+from faintfield.rig.errors import PlanRefused, SessionCorrupt
+from faintfield.rig.plan import CapturePlan
+from faintfield.rig.session.changes import adopt_settings, check_same_rig, find_changes, present_settings
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.resume import open_session
+from faintfield.rig.session.session import FrozenPlan, taken_frames
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import CheckSettings, RigSettings, SceneSettings, StepSettings
+from faintfield.rig.stages.protocol import StageSettings
+from tests.faults.capturing import SMALL_RIG
+from tests.rig.capture.test_layout import Stopping, capture
+from tests.rig.session.forging import chain_again, edit
+
+replace = msgspec.structs.replace
+
+
+def frozen(rig: RigSettings = SMALL_RIG) -> FrozenPlan:
+    return FrozenPlan(CapturePlan.of(rig.grid, rig.steps(), approach_mm=1.0, frame_bytes=1), rig)
+
+
+def with_checks(**values: float) -> RigSettings:
+    return replace(SMALL_RIG, checks=CheckSettings(**values))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of which four frames are taken."""
+    folder = tmp_path_factory.mktemp("begun") / "session"
+    capture(folder, Stopping(4))
+    return folder
+
+
+@pytest.fixture
+def session(begun: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(begun, tmp_path / "session"))
+
+
+@pytest.mark.parametrize(
+    ("now", "words"),
+    [
+        (replace(SMALL_RIG, camera=replace(SMALL_RIG.camera, seed=2)), ["camera.seed was 1 and is 2"]),
+        (
+            replace(SMALL_RIG, grid=replace(SMALL_RIG.grid, pitch_mm=49.0), step=SMALL_RIG.step[:2]),
+            ["grid.pitch_mm was 50.0 and is 49.0", 'step[2].kind was "dark" and is not set', "step[2].exposure_s was"],
+        ),
+        (
+            replace(SMALL_RIG, step=(StepSettings("bright", 0.2), *SMALL_RIG.step[1:])),
+            ["step[0].exposure_s was 0.1 and is 0.2"],
+        ),
+        (
+            replace(SMALL_RIG, stage=replace(SMALL_RIG.stage, approach_mm=1.0), checks=CheckSettings(leak_dn=9.0)),
+            ["stage.approach_mm was 2.0 and is 1.0"],
+        ),
+        (
+            replace(SMALL_RIG, camera=FolderSettings("incoming")),
+            ['camera.backend was "simulated" and is "folder"', 'camera.folder was not set and is "incoming"'],
+        ),
+    ],
+)  # fmt: skip
+def test_what_a_session_keeps_is_named_with_both_values(now: RigSettings, words: list[str]) -> None:
+    with pytest.raises(PlanRefused, match=r"; set it back, or begin a new session") as refused:
+        check_same_rig(frozen(), now)
+    for each in words:
+        assert each in str(refused.value)
+    assert "checks" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "keys"),
+    [
+        (SMALL_RIG, with_checks(leak_dn=9.0, saturation_dn=4000.0), ["checks.saturation_dn", "checks.leak_dn"]),
+        (SMALL_RIG, replace(SMALL_RIG, scene=SceneSettings((500.0,))), ["scene.depth_mm"]),
+        (
+            SMALL_RIG,
+            replace(SMALL_RIG, stage=replace(SMALL_RIG.stage, port="simulated:grbl", baud=9600)),
+            ["stage.port", "stage.baud"],
+        ),
+        (
+            replace(SMALL_RIG, camera=GPhoto2Settings(port="usb:001,004")),
+            replace(SMALL_RIG, camera=GPhoto2Settings(port="usb:001,009", answer_s=60.0)),
+            ["camera.port", "camera.answer_s"],
+        ),
+        (
+            replace(SMALL_RIG, camera=FolderSettings("in")),
+            replace(SMALL_RIG, camera=FolderSettings("in", arrival_s=90.0, quiet_s=9.0, file_times=False)),
+            ["camera.arrival_s", "camera.quiet_s", "camera.file_times"],
+        ),
+        (SMALL_RIG, SMALL_RIG, []),
+    ],
+)
+def test_what_no_frame_depends_on_may_change(then: RigSettings, now: RigSettings, keys: list[str]) -> None:
+    check_same_rig(frozen(then), now)
+    changes = find_changes(then, now)
+    assert [change.key for change in changes] == keys
+    assert not any(change.frozen for change in changes)
+
+
+@pytest.mark.parametrize(("then", "now"), [("/dev/ttyUSB0", "simulated:grbl"), ("simulated:grbl", "/dev/ttyUSB0")])
+def test_a_port_does_not_turn_a_real_stage_into_a_simulated_one_or_back(then: str, now: str) -> None:
+    """Protocol grbl takes either port."""
+    before, after = (replace(SMALL_RIG, stage=StageSettings("grbl", port)) for port in (then, now))
+    with pytest.raises(PlanRefused, match=r"stage\.port \(simulated\) was \w+ and is \w+; set it back"):
+        check_same_rig(frozen(before), after)
+    check_same_rig(frozen(before), replace(before, stage=replace(before.stage, port=f"{then}2")))
+
+
+def test_changes_are_recorded_together_or_not_at_all(session: Path) -> None:
+    """One without the others may be a combination that no rig.toml can have."""
+    times = ["2030-01-01T00:00:00.000+00:00", KeyboardInterrupt]  # killed at the second change
+    with open_session(session, None) as opened:
+        with mock.patch("faintfield.rig.session.journal._now", side_effect=times), pytest.raises(KeyboardInterrupt):
+            adopt_settings(opened, with_checks(leak_dn=9.0, saturation_dn=4000.0))
+    assert present_settings(session) == SMALL_RIG
+    with open_session(session, None) as opened:
+        adopt_settings(opened, with_checks(leak_dn=9.0, saturation_dn=4000.0))
+    assert present_settings(session) == with_checks(leak_dn=9.0, saturation_dn=4000.0)
+
+
+def test_changes_are_recorded_and_apply_from_then_on(session: Path) -> None:
+    assert isinstance(SMALL_RIG.camera, SimulatedSettings)
+    # Every pixel is above this: the offset is 100 DN
+    strict = with_checks(saturation_dn=1.0)
+    with open_session(session, None) as opened:
+        assert opened.rig == SMALL_RIG
+        adopt_settings(opened, strict)
+        assert opened.rig == strict
+    capture(session, Stopping(2))
+    assert present_settings(session) == strict
+    with Journal(session / "journal.sqlite", read_only=True) as journal:
+        events = [event.detail for event in journal.events("setting_changed")]
+    assert events == [{"key": "checks.saturation_dn", "old": None, "new": 1.0}]
+    warned = [bool(it.record.warnings) for _, it, _ in taken_frames(session)]
+    shares = [it.record.checks["saturated_share"] for _, it, _ in taken_frames(session)]
+    assert shares == [0.0] * 4 + [1.0] * 2
+    assert warned[4:] == [True, True]
+    assert verify(session).problems == ()
+
+
+def test_a_change_back_is_recorded_too_and_no_change_is_not(session: Path) -> None:
+    for now in (with_checks(leak_dn=9.0), with_checks(leak_dn=9.0), SMALL_RIG):
+        with open_session(session, None) as opened:
+            adopt_settings(opened, now)
+    with Journal(session / "journal.sqlite", read_only=True) as journal:
+        events = [(event.detail["old"], event.detail["new"]) for event in journal.events("setting_changed")]
+    assert events == [(8.0, 9.0), (9.0, 8.0)]
+    assert present_settings(session) == SMALL_RIG
+
+
+def test_what_is_refused_changes_nothing(session: Path) -> None:
+    wrong = replace(with_checks(leak_dn=9.0), camera=SimulatedSettings(size_px=(16, 12), seed=2))
+    with open_session(session, None) as opened:
+        with pytest.raises(PlanRefused):
+            adopt_settings(opened, wrong)
+        assert opened.rig == SMALL_RIG
+        assert opened.journal.events("setting_changed") == []
+
+
+@pytest.mark.parametrize(
+    ("key", "new"),
+    [("camera.seed", "7"), ("checks.new", "7"), ("checks", "7"), ("none.leak_dn", "7"), ("checks.leak_dn", '"much"'),
+     ("checks.sharpness_share", "2.0"), ("scene.depth_mm", "[1e300]"), ("camera.answer_s", "7")],
+)  # fmt: skip
+def test_forged_changes_are_refused(session: Path, key: str, new: str) -> None:
+    detail = f'{{"key":"{key}","old":null,"new":{new}}}'
+    journal = session / "journal.sqlite"
+    edit(journal, f"INSERT INTO event VALUES (NULL, '2030-01-01', 'setting_changed', NULL, '{detail}')")
+    chain_again(journal)
+    with pytest.raises(SessionCorrupt, match=r"journal\.sqlite: .*; restore the journal from a copy"):
+        present_settings(session)
+    with pytest.raises(SessionCorrupt, match=r"restore the journal from a copy"), open_session(session, None):
+        pass
+    assert len(taken_frames(session)) == 4

@@ -1,0 +1,520 @@
+"""XY stages of Micro-Manager: the contract on its demonstration stage, and a core that fails when it is told to."""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+from msgspec.structs import replace
+
+from faintfield.rig.cameras.micromanager import MicroManagerCamera
+from faintfield.rig.cameras.settings import MicroManagerSettings, SimulatedSettings
+from faintfield.rig.clock import WallClock
+from faintfield.rig.devices import open_rig, open_stage
+from faintfield.rig.errors import (
+    CameraError,
+    NotHomed,
+    PlanRefused,
+    PositionLost,
+    StageLost,
+    StageTimeout,
+    StageUnfit,
+    WrongFirmware,
+)
+from faintfield.rig.micromanager import SharedCore
+from faintfield.rig.plan import Grid
+from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
+from faintfield.rig.simulation.controller.wire import SimulatedClock
+from faintfield.rig.stages.conformance import check_conformance
+from faintfield.rig.stages.gantry import Gantry
+from faintfield.rig.stages.micromanager.controller import MicroManagerController
+from faintfield.rig.stages.micromanager.settings import MicroManagerStage
+from faintfield.rig.stages.protocol import Box, Point, StageSettings
+from faintfield.testing import stage_contract
+
+TRAVEL = Box((0.0, 12.0), (0.0, 12.0))
+REST_S = 0.05
+
+
+class Core:
+    """As much of a core as a stage uses, on a simulated clock: axes of 5 mm/s that answer in micrometres."""
+
+    def __init__(self, clock: SimulatedClock) -> None:
+        self.clock = clock
+        self.at_um = [0.0, 0.0]
+        self.target_um = [0.0, 0.0]
+        self.arrives_s = 0.0
+        self.timeout_s = 5.0
+        self.calls: list[str] = []
+        self.fails: dict[str, Callable[[], object]] = {}
+        self.creep_um_per_s = 0.0
+        self.off_um = 0.0
+
+    def __getattr__(self, name: str) -> Any:
+        def call(*arguments: Any) -> Any:
+            self.calls.append(name)
+            if name in self.fails:
+                self.fails[name]()
+            return getattr(self, f"on_{name}")(*arguments)
+
+        return call
+
+    def on_getXYStageDevice(self) -> str:
+        return "XY"
+
+    def on_getLoadedDevicesOfType(self, kind: int) -> list[str]:
+        return ["XY"] if kind == 6 else ["Camera", "Z"]
+
+    def on_getAllowedPropertyValues(self, label: str, name: str) -> list[str]:
+        return ["1", "5"]
+
+    def on_setProperty(self, label: str, name: str, value: str) -> None:
+        assert (label, name) == ("XY", "Speed")
+
+    def on_setXYPosition(self, label: str, x_um: float, y_um: float) -> None:
+        self.settle()
+        far_um = max(abs(x_um - self.at_um[0]), abs(y_um - self.at_um[1]))
+        self.arrives_s = self.clock.now_s() + far_um / 5000.0
+        self.target_um = [x_um + self.off_um, y_um]
+
+    def on_setRelativeXYPosition(self, label: str, dx_um: float, dy_um: float) -> None:
+        self.on_setXYPosition(label, self.at_um[0] + dx_um, self.at_um[1] + dy_um)
+
+    def on_home(self, label: str) -> None:
+        self.on_setXYPosition(label, 0.0, 0.0)
+
+    def on_stop(self, label: str) -> None:
+        self.arrives_s = self.clock.now_s()
+
+    def on_getTimeoutMs(self) -> int:
+        return round(1000.0 * self.timeout_s)
+
+    def on_setTimeoutMs(self, bound_ms: int) -> None:
+        self.timeout_s = bound_ms / 1000.0
+
+    def on_waitForDevice(self, label: str) -> None:
+        left_s = self.arrives_s - self.clock.now_s()
+        self.clock.sleep_s(max(0.0, min(left_s, self.timeout_s)))
+        if left_s > self.timeout_s:
+            raise RuntimeError(f'Wait for device "{label}" timed out')
+        self.settle()
+
+    def on_deviceBusy(self, label: str) -> bool:
+        return self.clock.now_s() < self.arrives_s
+
+    def on_getXYPosition(self, label: str) -> tuple[float, float]:
+        self.settle()
+        return self.at_um[0] + self.creep_um_per_s * self.clock.now_s(), self.at_um[1]
+
+    def on_getDevicePropertyNames(self, label: str) -> list[str]:
+        return ["Speed", "Position"]
+
+    def on_isPropertyReadOnly(self, label: str, name: str) -> bool:
+        return name == "Position"
+
+    def on_getProperty(self, label: str, name: str) -> str:
+        return "5"
+
+    def on_getDeviceLibrary(self, label: str) -> str:
+        return "Rehearsed"
+
+    def on_getDeviceName(self, label: str) -> str:
+        return "XYStage"
+
+    def on_getVersionInfo(self) -> str:
+        return "MMCore 0"
+
+    def on_unloadAllDevices(self) -> None:
+        pass
+
+    def settle(self) -> None:
+        if self.clock.now_s() >= self.arrives_s:
+            self.at_um = list(self.target_um)
+
+
+class RehearsedCore(SharedCore):
+    """A shared core whose core is a `Core`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.clock = SimulatedClock()
+        self.cores: list[Core] = []
+
+    def import_package(self) -> None:
+        pass
+
+    def _loaded(self) -> Core:
+        self.cores.append(Core(self.clock))
+        return self.cores[-1]
+
+    @property
+    def core(self) -> Core:
+        return self.cores[-1]
+
+
+def rehearsed(origin: Any = "home", **options: Any) -> tuple[RehearsedCore, Gantry]:
+    """Return a stage on a rehearsed core, connected."""
+    shared = RehearsedCore()
+    settings = StageSettings("micromanager", travel_mm=TRAVEL)
+    controller = MicroManagerController(shared, MicroManagerStage(origin=origin, **options), TRAVEL, shared.clock)
+    stage = Gantry(controller, settings, shared.clock)
+    stage.connect()
+    return shared, stage
+
+
+def test_contract_of_the_rehearsed_stage() -> None:
+    shared = RehearsedCore()
+    controller = MicroManagerController(shared, MicroManagerStage(), TRAVEL, shared.clock)
+    stage_contract(Gantry(controller, StageSettings("micromanager", travel_mm=TRAVEL), shared.clock))
+
+
+def test_positions_are_micrometres_of_the_adapter() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+    stage.move_to(7.25, 3.5)
+    assert shared.core.at_um == [7250.0, 3500.0]
+    assert stage.position().point == Point(7.25, 3.5)
+    assert stage.identify().settings == {"Speed": "5"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"device": "Camera"}, r"no XY stage 'Camera'; choose from XY$"),
+        ({"properties": {"Velocity": "1"}}, r"no property 'Velocity'; choose from Speed, Position$"),
+        ({"properties": {"Speed": "5", "Position": "1"}}, r"'Position' of XY cannot be set; remove it$"),
+        ({"properties": {"Speed": "2"}}, r"'Speed' of XY cannot be '2'; choose from 1, 5$"),
+    ],
+)
+def test_what_the_configuration_does_not_offer_is_refused_with_what_it_does(options: Any, message: str) -> None:
+    shared = RehearsedCore()
+    controller = MicroManagerController(shared, MicroManagerStage(**options), TRAVEL, shared.clock)
+    with pytest.raises(PlanRefused, match=rf"^\[stage\]: .*{message}"):
+        controller.connect()
+    assert "setProperty" not in shared.core.calls
+    assert "unloadAllDevices" in shared.core.calls
+
+
+def test_properties_are_set_when_the_stage_is_connected() -> None:
+    shared, _ = rehearsed(properties={"Speed": "1"})
+    assert shared.core.calls.count("setProperty") == 1
+
+
+def test_each_position_is_approached_from_below() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+    stage.move_to(8.0, 8.0)
+    shared.core.calls.clear()
+    stage.move_to(5.0, 8.0)
+    assert shared.core.calls.count("setXYPosition") == 2
+
+
+def test_a_report_counts_only_when_the_next_is_equal() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+    shared.core.creep_um_per_s = 0.4 / REST_S  # the limit is a tenth of 5 micrometres between two reports
+    stage.position()
+    shared.core.creep_um_per_s = 0.6 / REST_S
+    with pytest.raises(StageTimeout, match="does not come to rest"):
+        stage.position()
+    assert not stage.trusted
+
+
+def test_a_report_counts_only_when_the_adapter_is_not_busy() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+    shared.core.arrives_s = shared.clock.now_s() + 0.4  # it settles, and its reports do not show it
+    stage.position()
+    assert shared.clock.now_s() >= shared.core.arrives_s
+    shared.core.arrives_s = shared.clock.now_s() + 60.0
+    with pytest.raises(StageTimeout, match="does not come to rest"):
+        stage.position()
+
+
+def test_a_stage_that_stops_beside_its_target_is_lost() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+    shared.core.off_um = 6.0
+    with pytest.raises(PositionLost, match=r"instead of \(5\.000, 5\.000\) mm"):
+        stage.move_to(5.0, 5.0)
+    assert not stage.trusted
+    assert "stop" in shared.core.calls
+
+
+def test_a_motion_that_takes_too_long_is_stopped_and_named() -> None:
+    shared, stage = rehearsed(rate_mm_per_s=100.0, acceleration_mm_per_s2=1000.0)
+    stage.home()
+    with pytest.raises(
+        StageTimeout, match=r"moving to \(11\.900, 0\.000\) mm within 2\.\d s .*lower stage.rate_mm_per_s"
+    ):
+        stage.move_to(11.9, 0.0)
+    assert "stop" in shared.core.calls
+    assert not stage.trusted
+    assert shared.core.timeout_s == 5.0  # which the camera may rely on
+
+
+def test_what_an_adapter_reports_loses_the_position() -> None:
+    shared, stage = rehearsed()
+    stage.home()
+
+    def unplugged() -> None:
+        raise RuntimeError("Error in device XY:\n(serial port error)")
+
+    shared.core.fails["getXYPosition"] = unplugged
+    with pytest.raises(StageLost, match=r"failed at its report: Error in device XY: \(serial port error\); check"):
+        stage.verify_at(0.0, 0.0)
+    assert not stage.trusted
+    shared.core.fails.clear()
+    stage.recover()
+    assert not stage.trusted
+    stage.home()
+    assert stage.trusted
+
+
+def test_an_adapter_that_hangs_is_left_behind_and_loaded_anew() -> None:
+    shared, stage = rehearsed(answer_s=0.5)
+    stage.home()
+    end = threading.Event()
+    shared.core.fails["getXYPosition"] = lambda: end.wait(30.0)
+    with pytest.raises(StageTimeout, match=r"did not finish its report within 0\.5 s, and its adapter hangs"):
+        stage.position()
+    end.set()
+    with pytest.raises(StageLost, match="not connected"):
+        stage.switches() or stage.position()
+    stage.recover()
+    assert len(shared.cores) == 2
+    assert not stage.trusted
+    stage.home()
+
+
+def test_a_motion_that_hangs_is_stopped_at_once_and_when_it_returns() -> None:
+    shared, stage = rehearsed(answer_s=0.1)
+    stage.home()
+    core, end = shared.core, threading.Event()
+    core.fails["setXYPosition"] = lambda: end.wait(30.0)
+    core.calls.clear()
+    with pytest.raises(StageTimeout, match="its adapter hangs"):
+        stage.move_to(1.0, 1.0)
+    assert core.calls == ["setXYPosition", "stop"]
+    end.set()
+    deadline_s = time.monotonic() + 10.0
+    while core.calls.count("stop") < 2 and time.monotonic() < deadline_s:
+        time.sleep(0.01)
+    assert core.calls[-1] == "stop"
+    assert core.calls.count("stop") == 2  # the motion began only when the call returned
+
+
+def test_a_confirmed_origin_is_good_for_one_homing_of_a_connection() -> None:
+    shared, stage = rehearsed(origin="confirmed")
+    with pytest.raises(NotHomed):
+        stage.move_to(1.0, 1.0)
+    stage.home()
+    assert "home" not in shared.core.calls
+    stage.move_to(1.0, 1.0)
+    with pytest.raises(PositionLost):
+        stage.verify_at(2.0, 2.0)
+    with pytest.raises(StageUnfit, match=r"find the origin with the stage's own program"):
+        stage.home()
+    assert not stage.trusted
+    stage.close()
+    stage.connect()
+    stage.home()
+    assert stage.trusted
+
+
+def test_a_confirmed_origin_is_not_confirmed_again_by_a_recovery() -> None:
+    shared, stage = rehearsed(origin="confirmed", answer_s=0.5)
+    stage.home()
+    end = threading.Event()
+    shared.core.fails["getXYPosition"] = lambda: end.wait(30.0)
+    with pytest.raises(StageTimeout, match="its adapter hangs"):
+        stage.position()
+    end.set()
+    stage.recover()
+    with pytest.raises(StageUnfit, match="the position is lost"):
+        stage.home()
+    assert not stage.trusted
+
+
+def test_a_stop_counts_as_loss_of_the_position() -> None:
+    _, stage = rehearsed()
+    stage.home()
+    stage.hold()
+    assert not stage.trusted
+
+
+def test_what_is_missing_or_wrong_is_said_before_anything_moves() -> None:
+    with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
+        Gantry(
+            MicroManagerController(RehearsedCore(), MicroManagerStage(), None, SimulatedClock()),
+            StageSettings("micromanager"),
+            SimulatedClock(),
+        ).connect()
+    for changes in ({"rate_mm_per_s": 0.0}, {"tolerance_mm": -1.0}, {"answer_s": float("nan")}):
+        with pytest.raises(ValueError, match="give more than 0"):
+            MicroManagerStage(**changes)  # type: ignore[arg-type]
+    with pytest.raises(PlanRefused, match="unknown field `rate`"):
+        open_stage(StageSettings("micromanager", options={"rate": 3.0}))
+
+
+def rig(**options: Any) -> RigSettings:
+    """Return a rig whose camera and stage are Micro-Manager's."""
+    return RigSettings(
+        stage=StageSettings("micromanager", travel_mm=TRAVEL, options=options),
+        camera=MicroManagerSettings(),
+        grid=Grid(rows=2, columns=2, pitch_mm=2.0, origin_mm=Point(1.0, 1.0)),
+        step=(StepSettings("bright", 0.01),),
+        drift=DriftSettings(check=False),
+    )
+
+
+def test_camera_and_stage_share_one_core() -> None:
+    made = open_rig(rig())
+    camera, stage = made.camera, made.stage
+    assert isinstance(camera, MicroManagerCamera)
+    assert camera._shared is stage._controller._shared  # type: ignore[attr-defined]  # noqa: SLF001 - it is behind them
+    with pytest.raises(PlanRefused, match=r"stage\.configuration = 'other\.cfg', or .*; Micro-Manager loads one"):
+        open_rig(rig(configuration="other.cfg"))
+
+
+def test_a_drift_check_by_the_switches_is_refused() -> None:
+    with pytest.raises(PlanRefused, match=r"drift\.check = true times homing .*; set it to false"):
+        open_rig(replace(rig(), drift=DriftSettings()))
+    with pytest.raises(PlanRefused, match=r"needs stage\.protocol = 'simulated'"):
+        open_rig(replace(rig(), camera=SimulatedSettings()))
+
+
+def test_devices_are_loaded_once_and_unloaded_after_the_last_user() -> None:
+    shared = RehearsedCore()
+    first, second = shared.acquire("camera"), shared.acquire("stage")
+    assert first is second
+    shared.release("camera")
+    assert "unloadAllDevices" not in shared.core.calls
+    assert shared.acquire("camera") is first
+    shared.release("stage")
+    shared.release("camera")
+    assert shared.core.calls.count("unloadAllDevices") == 1
+    shared.release("camera")
+    assert shared.core.calls.count("unloadAllDevices") == 1
+    assert shared.acquire("stage") is not first
+
+
+def test_a_camera_that_hangs_does_not_take_the_core_from_the_stage() -> None:
+    shared = RehearsedCore()
+    core = shared.acquire("stage")
+    shared.acquire("camera")
+    shared.abandon("camera")
+    with pytest.raises(
+        RuntimeError, match="a call of the camera hangs in Micro-Manager, which stage uses as well; end"
+    ):
+        shared.acquire("camera")
+    core.getXYPosition("XY")
+    shared.release("stage")
+    assert "unloadAllDevices" not in shared.core.calls  # it would wait for the call that hangs
+
+
+def test_a_load_that_was_given_up_and_returns_late_is_unloaded() -> None:
+    shared = RehearsedCore()
+    begun, end = threading.Event(), threading.Event()
+    load = RehearsedCore._loaded  # noqa: SLF001 - where a real one hangs
+
+    def slow(self: RehearsedCore) -> Core:
+        core = load(self)
+        begun.set()
+        end.wait(30.0)
+        return core
+
+    outcome: list[BaseException] = []
+
+    def acquire_late() -> None:
+        try:
+            shared.acquire("stage")
+        except RuntimeError as failure:
+            outcome.append(failure)
+
+    late = threading.Thread(target=acquire_late)
+    with mock.patch.object(RehearsedCore, "_loaded", slow):
+        late.start()
+        assert begun.wait(30.0)
+    shared.abandon("stage")
+    second = shared.acquire("camera")
+    end.set()
+    late.join(30.0)
+    assert "too late" in str(outcome)
+    assert "unloadAllDevices" in shared.cores[0].calls
+    assert shared.acquire("camera") is second
+    shared.release("camera")
+    assert "unloadAllDevices" in shared.cores[1].calls  # the late one is not its user
+
+
+@pytest.fixture
+def adapters() -> str:
+    """Return the folder of Micro-Manager's demonstration devices."""
+    why = "pymmcore-plus and mm-test-adapters are not installed here: their stage is not tried"
+    pytest.importorskip("pymmcore_plus", reason=why)
+    return str(pytest.importorskip("mm_test_adapters", reason=why).device_adapter_path())
+
+
+def demo(adapters: str, **options: Any) -> Gantry:
+    """Return the demonstration stage, which moves at 10 mm/s in real time."""
+    options = {"adapters": adapters, "rate_mm_per_s": 10.0, "acceleration_mm_per_s2": 1000.0} | options
+    return open_stage(StageSettings("micromanager", approach_mm=0.2, travel_mm=TRAVEL, options=options))
+
+
+def test_contract_of_the_demonstration_stage(adapters: str) -> None:
+    stage_contract(demo(adapters))
+
+
+def test_conformance_of_the_demonstration_stage(adapters: str) -> None:
+    """All that a Micro-Manager stage can show; its drift cannot be timed."""
+    stage = demo(adapters)
+    stage.connect()
+    found = list(check_conformance(stage))
+    stage.close()
+    assert [(it.name, it.passed) for it in found] == [
+        (name, True) for name in ("settings", "homing", "limits", "speed", "arrival", "report rate")
+    ], found
+
+
+def test_faults_of_the_demonstration_stage(adapters: str, tmp_path: Path) -> None:
+    empty = tmp_path / "empty.cfg"
+    empty.write_text("Property,Core,Initialize,0\nProperty,Core,Initialize,1\n")
+    with pytest.raises(PlanRefused, match="the configuration has no XY stage; name another"):
+        demo(adapters, configuration=str(empty)).connect()
+    with pytest.raises(PlanRefused, match=r"no XY stage 'Camera'; choose from XY$"):
+        demo(adapters, device="Camera").connect()
+    with pytest.raises(PlanRefused, match=r"no property 'Speed'; choose from .*Velocity"):
+        demo(adapters, properties={"Speed": "1"}).connect()
+    stage = demo(adapters, properties={"Velocity": "0.5"}, rate_mm_per_s=50.0)
+    stage.connect()
+    stage.home()
+    begun_s = time.monotonic()
+    with pytest.raises(StageTimeout, match=r"did not finish moving to \(3\.000, 0\.000\) mm within 2\.\d s"):
+        stage.move_to(3.0, 0.0)
+    assert time.monotonic() - begun_s < 8.0
+    stage.close()
+
+
+def test_a_camera_of_the_same_core_works_beside_the_stage(adapters: str) -> None:
+    shared = SharedCore(adapters=adapters)
+    camera = MicroManagerCamera(MicroManagerSettings(adapters=adapters), shared)
+    options = MicroManagerStage(adapters=adapters, rate_mm_per_s=10.0)
+    clock = WallClock()
+    stage = Gantry(
+        MicroManagerController(shared, options, TRAVEL, clock), StageSettings("micromanager", travel_mm=TRAVEL), clock
+    )
+    stage.connect()
+    camera.open()
+    stage.home()
+    here = stage.move_to(1.0, 0.5).point
+    camera.close()
+    with pytest.raises(CameraError, match="open it first"):
+        camera.expose(0.01, 1)
+    camera.open()
+    assert camera.expose(0.01, 1).pixels is not None
+    assert stage.verify_at(*here).trusted  # closing the camera did not unload the stage
+    camera.close()
+    stage.close()

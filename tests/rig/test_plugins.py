@@ -1,0 +1,260 @@
+"""Drivers of other packages are found by their names, checked as they are made, and fail by name."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.rig_file import read_rig
+from faintfield.rig import plugins
+from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.settings import (
+    BUILT_IN_BACKENDS,
+    AravisSettings,
+    CameraSettings,
+    FolderSettings,
+    PluginSettings,
+)
+from faintfield.rig.capture.temperature import require_temperature
+from faintfield.rig.devices import open_rig, open_stage
+from faintfield.rig.errors import PlanRefused, PluginFailed, UnknownPlugin
+from faintfield.rig.settings import RigSettings
+from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.stages.grbl.controller import GrblController
+from faintfield.rig.stages.protocol import BUILT_IN_PROTOCOLS, Box, StageSettings
+from faintfield.rig.stages.transport import LineTransport
+from faintfield.testing import stage_contract
+
+MODULE = """
+from msgspec import Struct
+from faintfield.rig.cameras.folder import FolderCamera
+from faintfield.rig.cameras.settings import FolderSettings
+from faintfield.rig.plugins import CameraPlugin, StagePlugin
+
+class Sky(Struct, frozen=True, forbid_unknown_fields=True):
+    folder: str
+    wait_s: float = 60.0
+
+class Lax(Struct):
+    folder: str = ""
+
+def fail(settings, clock):
+    raise KeyError("no driver")
+
+def make(settings, clock):
+    return FolderCamera(FolderSettings(settings.folder, arrival_s=settings.wait_s), clock)
+
+SKY = CameraPlugin(Sky, make)
+LAX = CameraPlugin(Lax, lambda settings, clock: None)
+FAILING = CameraPlugin(Sky, fail)
+STAGE = StagePlugin(Sky, lambda options, settings, clock: (options, settings, clock))
+NONE = 7
+"""
+POINTS = {
+    "cameras": {
+        "sky": "sky_drivers:SKY",
+        "lax": "sky_drivers:LAX",
+        "failing": "sky_drivers:FAILING",
+        "none": "sky_drivers:NONE",
+        "gone": "sky_drivers:GONE",
+        "broken": "broken_drivers:SKY",
+        "wrong_kind": "sky_drivers:STAGE",
+        "gphoto2": "sky_drivers:SKY",
+    },
+    "stages": {"moon": "sky_drivers:STAGE"},
+}
+RIG = """
+[stage]
+protocol = "simulated"
+[camera]
+backend = "sky"
+folder = "frames"
+mosaic = ["RG", "GB"]
+[grid]
+rows = 2
+columns = 2
+pitch_mm = 50.0
+origin_mm = [-350.0, -350.0]
+[[step]]
+kind = "bright"
+exposure_s = 0.1
+"""
+
+
+def install(folder: Path, package: str, points: dict[str, dict[str, str]]) -> None:
+    """Write what pip would write of a package with these entry points."""
+    info = folder / f"{package}-1.2.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.2\n")
+    groups = (
+        [f"[faintfield.{group}]", *(f"{name} = {value}" for name, value in names.items())]
+        for group, names in points.items()
+    )
+    (info / "entry_points.txt").write_text("\n".join(line for group in groups for line in group) + "\n")
+
+
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Install packages with drivers, good and bad ones, for the time of a test."""
+    folder = tmp_path / "packages"
+    folder.mkdir()
+    install(folder, "sky-drivers", POINTS)
+    (folder / "sky_drivers.py").write_text(MODULE)
+    (folder / "broken_drivers.py").write_text("raise OSError('libsky.so: no such\\nfile')\n")
+    monkeypatch.syspath_prepend(folder)
+    for name in ("sky_drivers", "broken_drivers"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return folder
+
+
+SKY_TABLE = 'backend = "sky"\nfolder = "frames"\nmosaic = ["RG", "GB"]'
+ARAVIS = 'backend = "aravis"\npixel_format = "BayerRG12p"\nregion_px = [0, 2, 64, 48]'
+
+
+def rig_file(tmp_path: Path, old: str = "", new: str = "", camera: str = SKY_TABLE) -> Path:
+    assert old in RIG
+    path = tmp_path / "rig.toml"
+    path.write_text((RIG.replace(old, new) if old else RIG).replace(SKY_TABLE, camera))
+    return path
+
+
+def test_the_names_of_built_in_drivers_are_those_of_their_settings() -> None:
+    tags = {kind.__struct_config__.tag for kind in CameraSettings.__value__.__args__}
+    assert tags == {*BUILT_IN_BACKENDS, "plugin"}
+    assert {"grbl", "marlin", "simulated", "micromanager"} == set(BUILT_IN_PROTOCOLS)
+
+
+def test_a_camera_of_another_package(packages: Path, tmp_path: Path) -> None:
+    settings = read_rig(rig_file(tmp_path))
+    assert settings.camera == PluginSettings("sky", {"folder": "frames"}, ("RG", "GB"))
+    assert settings.mosaic == ("RG", "GB")
+    guarded = open_rig(settings).camera
+    assert isinstance(guarded, plugins.PluginCamera)
+    camera = guarded._camera  # noqa: SLF001 - what the plug-in made
+    assert isinstance(camera, FolderCamera)
+    assert camera._settings == FolderSettings("frames", arrival_s=60.0)  # noqa: SLF001 - what the plug-in got
+
+
+def test_a_capture_can_wait_for_the_sensor_of_another_package_s_camera(packages: Path, tmp_path: Path) -> None:
+    settings = read_rig(rig_file(tmp_path, camera=f"{SKY_TABLE}\nsettle_temperature_c = -10.0\nsettle_limit_s = 60.0"))
+    assert isinstance(settings.camera, PluginSettings)
+    assert settings.camera.options == {"folder": "frames"}
+    assert (settings.camera.settle_temperature_c, settings.camera.settle_limit_s) == (-10.0, 60.0)
+    camera = open_rig(settings).camera
+    with pytest.raises(PlanRefused, match=r"settle_temperature_c = -10, but the camera reports no temperature"):
+        require_temperature(camera, settings.camera)
+    with pytest.raises(BadValue, match="give degrees Celsius"):
+        read_rig(rig_file(tmp_path, camera=f"{SKY_TABLE}\nsettle_temperature_c = -300.0"))
+
+
+def test_the_keys_of_built_in_drivers_are_read(tmp_path: Path) -> None:
+    stage = 'protocol = "micromanager"\nconfiguration = "rig.cfg"\napproach_mm = 0.2'
+    settings = read_rig(rig_file(tmp_path, 'protocol = "simulated"', stage, camera=ARAVIS))
+    assert settings.stage == StageSettings("micromanager", approach_mm=0.2, options={"configuration": "rig.cfg"})
+    assert settings.camera == AravisSettings("BayerRG12p", region_px=(0, 2, 64, 48))
+    assert settings.mosaic == ("RG", "GB")
+
+
+def test_a_session_keeps_the_settings_and_is_read_without_the_package(packages: Path, tmp_path: Path) -> None:
+    settings = read_rig(rig_file(tmp_path))
+    stored = msgspec.json.encode(settings)
+    sys.path.remove(str(packages))
+    assert msgspec.json.decode(stored, type=RigSettings) == settings
+    with pytest.raises(UnknownPlugin, match=r"camera\.backend = 'sky'; choose from 'gphoto2'.*no plug-in is installed"):
+        open_rig(settings)
+
+
+def test_a_stage_of_another_package(packages: Path, tmp_path: Path) -> None:
+    stage = 'protocol = "moon"\nfolder = "orbit"\napproach_mm = 1.0'
+    settings = read_rig(rig_file(tmp_path, 'protocol = "simulated"', stage)).stage
+    assert settings == StageSettings("moon", approach_mm=1.0, options={"folder": "orbit"})
+    made: Any = open_stage(settings)._controller  # noqa: SLF001 - the plug-in's own
+    options, given, clock = made
+    assert options.folder == "orbit"
+    assert given == settings
+    assert clock.now_s() <= clock.now_s()
+
+
+@pytest.mark.parametrize(
+    ("backend", "failure", "reason"),
+    [
+        ("skye", UnknownPlugin, r"choose from 'gphoto2', .* or of the plug-ins 'broken', .*; did you mean 'sky'\?"),
+        ("plugin", UnknownPlugin, "camera.backend = 'plugin'; choose from"),
+        ("lax", PluginFailed, "of sky-drivers 1.2 is no CameraPlugin whose settings forbid unknown fields"),
+        ("none", PluginFailed, "is no CameraPlugin"),
+        ("wrong_kind", PluginFailed, "is no CameraPlugin"),
+        ("gone", PluginFailed, "cannot be imported: AttributeError: .*GONE"),
+        ("broken", PluginFailed, "of sky-drivers 1.2 cannot be imported: OSError: libsky.so: no such file; install"),
+        ("failing", PluginFailed, "'failing' failed: KeyError: 'no driver'; correct"),
+    ],
+)
+def test_plug_ins_that_cannot_be_used(
+    packages: Path, tmp_path: Path, backend: str, failure: type[Exception], reason: str
+) -> None:
+    with pytest.raises(failure, match=reason) as found:
+        open_rig(read_rig(rig_file(tmp_path, "sky", backend)))
+    assert "\n" not in str(found.value)
+    if "imported" in reason:
+        assert found.value.__cause__ is not None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ('folder = "frames"', 'folder = "frames"\nfoldr = "x"', r"backend = 'sky': .*unknown field `foldr`"),
+        ('folder = "frames"', "", "missing required field `folder`"),
+        ('folder = "frames"', "folder = 3", r"Expected `str`, got `int` - at `\$.folder`"),
+    ],
+)
+def test_keys_that_a_plug_in_does_not_take(packages: Path, tmp_path: Path, old: str, new: str, reason: str) -> None:
+    with pytest.raises(PlanRefused, match=reason):
+        open_rig(read_rig(rig_file(tmp_path, old, new)))
+
+
+def test_two_packages_with_one_name_are_named(packages: Path, tmp_path: Path) -> None:
+    install(packages, "other-sky", {"cameras": {"sky": "sky_drivers:SKY"}})
+    with pytest.raises(UnknownPlugin, match=r"'sky' is offered by other-sky 1\.2 and sky-drivers 1\.2; uninstall"):
+        open_rig(read_rig(rig_file(tmp_path)))
+
+
+def test_a_plug_in_cannot_take_the_name_of_a_built_in_driver(packages: Path, tmp_path: Path) -> None:
+    settings = read_rig(rig_file(tmp_path, 'backend = "sky"\nfolder = "frames"\nmosaic', 'backend = "gphoto2"\n#'))
+    assert type(open_rig(settings).camera).__name__ == "GPhoto2Camera"
+
+
+def test_options_are_not_for_serial_stages() -> None:
+    with pytest.raises(ValueError, match=r"'simulated:marlin' is not of protocol = 'grbl'; set stage\.protocol to"):
+        StageSettings("grbl", port="simulated:marlin")
+    assert StageSettings("grbl", port="simulated:grblhal").simulated
+    with pytest.raises(ValueError, match=r"stage\.options are not for protocol = 'grbl'"):
+        StageSettings("grbl", "/dev/ttyUSB0", options={"a": 1})
+
+
+def test_entry_points_are_not_looked_up_for_built_in_drivers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(**_: Any) -> None:
+        raise AssertionError("looked up")
+
+    monkeypatch.setattr(plugins, "entry_points", forbidden)
+    camera = 'backend = "sky"\nfolder = "frames"\nmosaic'
+    open_rig(read_rig(rig_file(tmp_path, camera, 'backend = "simulated"\nmosaic')))
+
+
+def test_opening_a_rig_imports_no_library_of_a_camera() -> None:
+    program = "import faintfield.rig.devices, sys; print(*sys.modules)"
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not {"pymmcore_plus", "gphoto2"} & set(found)
+
+
+def test_the_stage_contract_holds_for_a_controller_that_a_plug_in_makes(
+    packages: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = Bench(SimulatedGrbl)
+    driver = GrblController(LineTransport(bench.open_port, bench.clock, None), ("X", "Y"))
+    monkeypatch.setattr("faintfield.rig.devices.plugin_controller", lambda settings, clock: driver)
+    monkeypatch.setattr("faintfield.rig.devices.WallClock", lambda: bench.clock)
+    stage_contract(open_stage(StageSettings("moon", travel_mm=Box((-400.0, 0.0), (-400.0, 0.0)))))
