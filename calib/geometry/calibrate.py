@@ -1,13 +1,13 @@
 """Calibrate the geometry of the rig from corners: solve, find the uncertainty, and accept or refuse the result."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.board import Board
-from faintfield.calib.errors import PoorFit, TooFewViews
+from faintfield.calib.errors import CalibrationError, PoorFit, TooFewViews
 from faintfield.calib.geometry.acceptance import (
     find_shortcomings,
     holdout_ratio,
@@ -16,6 +16,7 @@ from faintfield.calib.geometry.acceptance import (
 )
 from faintfield.calib.geometry.bundle import LENS_MODELS, Bundle, BundleProblem, solve
 from faintfield.calib.geometry.covariance import Uncertainty, uncertainty
+from faintfield.calib.geometry.homings import HomingShift, as_one_homing, homing_shifts, interrupted_sweeps
 from faintfield.calib.geometry.observations import BoardObservation, Node, Observations, gather
 from faintfield.calib.geometry.rig_geometry import BoardPose, RigGeometry
 from faintfield.calib.lens import Lens
@@ -98,15 +99,66 @@ def calibrate_geometry(
         mrcal is not installed.
     """
     settings = settings or GeometrySettings()
-    problem = _problem(boards, observations, size_px, reference, settings.lens_model)
-    gathered, bundle = problem.observations, _solve(problem)
-    geometry = _geometry(problem, bundle, inconsistent_views(bundle, gathered), uncertainty(bundle, gathered))
+    solved = _solve_homings(boards, observations, size_px, reference, settings.lens_model)
+    gathered, bundle = solved.problem.observations, solved.bundle
+    geometry = _geometry(solved)
     if not find_shortcomings(geometry, gathered, max(settings.depths_mm)):  # else the solution may be any
         _require_residuals(bundle, gathered)
     require_determined(geometry, gathered, settings.depths_mm, settings.max_transfer_sigma_px)
     geometry = replace(geometry, holdout_ratio=holdout_ratio(bundle, gathered))
     _require_fit(geometry, settings)
     return geometry
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A solution, and what it says of homings within sweeps."""
+
+    problem: BundleProblem
+    bundle: Bundle
+    known: Uncertainty
+    shifts: list[HomingShift] = field(default_factory=list)
+    undetermined: list[int] = field(default_factory=list)
+
+
+def _solve_homings(
+    boards: Mapping[str, Board],
+    observations: Sequence[BoardObservation],
+    size_px: tuple[int, int],
+    reference: Node,
+    lens_model: str,
+) -> _Solved:
+    """Return the solution with a pose of each board before and after a homing, if the homing shifted the stage."""
+    sweeps = interrupted_sweeps(observations)
+    if sweeps:
+        try:
+            apart = _solve_apart(boards, observations, size_px, reference, lens_model)
+        except CalibrationError:  # too few nodes share a board and a homing
+            apart = None
+        if apart is not None and any(shift.is_significant() for shift in apart.shifts):
+            return apart
+        sweeps = [] if apart is not None else sweeps
+    one = _problem(boards, as_one_homing(observations), size_px, reference, lens_model)
+    bundle = _solve(one)
+    return _Solved(one, bundle, uncertainty(bundle, one.observations), undetermined=sweeps)
+
+
+def _solve_apart(
+    boards: Mapping[str, Board],
+    observations: Sequence[BoardObservation],
+    size_px: tuple[int, int],
+    reference: Node,
+    lens_model: str,
+) -> _Solved | None:
+    """Return the solution with a pose of each board after each homing; None if that leaves nodes without a pose."""
+    problem = _problem(boards, observations, size_px, reference, lens_model)
+    joined = _problem(boards, as_one_homing(observations), size_px, reference, lens_model)
+    if set(problem.observations.nodes) != set(joined.observations.nodes):
+        return None
+    bundle = _solve(problem)
+    known = uncertainty(bundle, problem.observations)
+    shifts = homing_shifts(bundle, problem.observations, known.covariance, list(boards.values()))
+    return _Solved(problem, bundle, known, shifts)
 
 
 def _problem(
@@ -158,8 +210,9 @@ def _require_residuals(bundle: Bundle, observations: Observations) -> None:
         )
 
 
-def _geometry(problem: BundleProblem, bundle: Bundle, warnings: list[str], known: Uncertainty) -> RigGeometry:
+def _geometry(solved: _Solved) -> RigGeometry:
     """Return the solution in raster order of the nodes, without a hold-out ratio."""
+    problem, bundle, known = solved.problem, solved.bundle, solved.known
     observations = problem.observations
     order = sorted(range(len(observations.nodes)), key=lambda index: observations.nodes[index])
     squares, inliers = float(np.sum(bundle.residuals() ** 2)), int(bundle.inlier.sum())
@@ -180,7 +233,9 @@ def _geometry(problem: BundleProblem, bundle: Bundle, warnings: list[str], known
         outliers=observations.corner_count - inliers,
         holdout_ratio=None,
         repeatability=known.repeatability,
-        warnings=warnings,
+        warnings=inconsistent_views(bundle, observations),
+        homings=solved.shifts,
+        undetermined_homings=solved.undetermined,
     )
 
 

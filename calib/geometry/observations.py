@@ -16,10 +16,21 @@ _MIN_CORNERS = 6
 
 @dataclass(frozen=True)
 class Target:
-    """One board in one sweep, during which it does not move."""
+    """One board in one sweep, during which it does not move.
+
+    Parameters
+    ----------
+    board : str
+        Its name.
+    sweep : int
+        Number of the sweep.
+    homing : int
+        Number of the stage's homing that the node's position relies on.
+    """
 
     board: str
     sweep: int
+    homing: int = 0
 
 
 @dataclass(frozen=True)
@@ -115,7 +126,7 @@ def gather(
             "take it again with a board in view"
         )
     kept = [seen for seen in useful if seen.node in nodes]
-    targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.board))
+    targets = sorted({seen.target for seen in kept}, key=lambda target: (target.sweep, target.homing, target.board))
     kept.sort(key=lambda seen: (targets.index(seen.target), nodes.index(seen.node)))
     return Observations(
         nodes,

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.observations import Node, Target
 from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
@@ -71,6 +72,10 @@ class RigGeometry:
         Repeatability of the gantry between sweeps; None with a single sweep.
     warnings : list of str
         Views that disagree with the rest, and what to do about them.
+    homings : list of HomingShift
+        Shifts of the stage by homings within sweeps, if they show.
+    undetermined_homings : list of int
+        Sweeps within which the stage homed although no other sweep joins the nodes before and after.
     """
 
     lens: Lens
@@ -89,6 +94,8 @@ class RigGeometry:
     holdout_ratio: float | None
     repeatability: Repeatability | None
     warnings: list[str] = field(default_factory=list)
+    homings: list[HomingShift] = field(default_factory=list)
+    undetermined_homings: list[int] = field(default_factory=list)
 
     def pose_covariance(self, node: int) -> NDArray[np.float64]:
         """Return the covariance (6, 6) of one node's pose, rad² and mm²."""

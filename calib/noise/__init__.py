@@ -5,7 +5,7 @@
 
 from faintfield.calib.noise.calibrate import calibrate
 from faintfield.calib.noise.result import Estimate, NoiseCalibration, NoiseMaps, TransferPoint
-from faintfield.calib.noise.statistics import Conditions, Series, SeriesSums, measure_series
+from faintfield.calib.noise.series.statistics import Conditions, Series, SeriesSums, measure_series
 
 __all__ = [
     "Conditions",

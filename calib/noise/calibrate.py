@@ -1,30 +1,34 @@
 """Calibrate one plane: from series of darks and flats to numbers, maps and warnings."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import fftconvolve
 
-from faintfield.calib.noise.diagnostics import (
+from faintfield.calib.noise.estimates import estimate_all
+from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
+from faintfield.calib.noise.likelihood.marginal import mass_function
+from faintfield.calib.noise.likelihood.response import BENDS
+from faintfield.calib.noise.maps.measure import measure_pixels, noise_maps
+from faintfield.calib.noise.maps.pixels import hot_pixels, outlying_pixels, variance_ratio
+from faintfield.calib.noise.misfit.diagnostics import (
     check_series,
     frame_warnings,
     level_warning,
     noise_warning,
+    odd_light_warnings,
     saturation_warnings,
     scatter_warnings,
 )
-from faintfield.calib.noise.estimates import estimate_all
-from faintfield.calib.noise.fitting import MAX_TABLE_WIDTH_DN, NoiseLikelihood, SeriesFit, collect_counts, fit_series
-from faintfield.calib.noise.goodness import series_goodness
-from faintfield.calib.noise.maps import measure_pixels, noise_maps
-from faintfield.calib.noise.marginal import mass_function
-from faintfield.calib.noise.pixels import hot_pixels, outlying_pixels, variance_ratio
-from faintfield.calib.noise.response import BENDS
+from faintfield.calib.noise.misfit.goodness import series_goodness
+from faintfield.calib.noise.misfit.temperature import settle_temperature, with_doubling_error
 from faintfield.calib.noise.result import Histogram, NoiseCalibration, TransferPoint
-from faintfield.calib.noise.saturation import Saturation, find_saturation
-from faintfield.calib.noise.statistics import Series
+from faintfield.calib.noise.series.flat_levels import check_flat_levels
+from faintfield.calib.noise.series.saturation import Saturation, find_saturation
+from faintfield.calib.noise.series.statistics import Series
 from faintfield.calib.noise_model import BentResponse
 
 # Mean charge in electrons above which the normal law replaces the Poisson sum: as good there, and smaller in memory.
@@ -50,6 +54,8 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         There is no dark.
     TooFewFrames
         No exposure has two frames, a light level has one, or the frames are too small.
+    BadFrame
+        The frames of one series of flats are of different light.
     CopiedFrame
         Two frames are identical.
     SaturatedFlat
@@ -57,15 +63,20 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
     PoorFit
         The likelihood has no maximum.
     """
+    series, warmth = settle_temperature(series)
     darks = [one for one in series if one.conditions.kind == "dark"]
     flats = [one for one in series if one.conditions.kind == "flat"]
     check_series(darks, [])
+    check_flat_levels(darks, flats)
     saturation = find_saturation(darks, flats, saturation_dn)
     # Frames that are saturated all over are identical, which is no fault of theirs.
     check_series(darks, saturation.kept)
     hot = hot_pixels(darks)
     end_dn = saturation_dn if saturation.level_dn is None else saturation.level_dn
-    return _result(*_fit_without_outlying(darks, saturation.kept, hot, end_dn), hot, saturation, end_dn)
+    fitted, outlying = _fit_without_outlying(darks, saturation.kept, hot, end_dn)
+    fitted = replace(fitted, fit=with_doubling_error(fitted.fit, fitted.moments, darks, warmth))
+    result = _result(fitted, outlying, hot, saturation, end_dn)
+    return replace(result, warnings=(*warmth.warnings, *result.warnings))
 
 
 def _result(
@@ -98,6 +109,7 @@ def _result(
             *frame_warnings(fitted),
             *saturation_warnings(saturation),
             *filter(None, (level, noise)),
+            *odd_light_warnings(fitted),
             *scatter_warnings(fitted),
             *pixels.warnings(),
         ),
@@ -139,7 +151,10 @@ def _histograms(fitted: SeriesFit, usable: NDArray[np.bool_]) -> tuple[Histogram
     counts = collect_counts(fitted.darks, usable)
     ends = sorted({int(np.argmin(counts.exposure_s)), int(np.argmax(counts.exposure_s))})
     return tuple(
-        _histogram(counts.values_dn[j], counts.exposure_s[j], fitted, counts.floor_dn)
+        replace(
+            _histogram(counts.values_dn[j], counts.exposure_s[j], fitted, counts.floor_dn),
+            exposure_s=fitted.darks[j].conditions.exposure_s,
+        )
         for j in ends
         if np.ptp(counts.values_dn[j]) < MAX_TABLE_WIDTH_DN
     )

@@ -10,17 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import dark_variances_dn2, main_quantities
+from faintfield.calib.noise.emva.nonuniformity import nonuniformity, temporal_noise
+from faintfield.calib.noise.fitting import MIN_ROUNDED_READ_DN, SeriesFit
 from faintfield.calib.noise.intervals import interval, root
 from faintfield.calib.noise.light_estimates import of_light, why_noise_denies
-from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.moments import Moments
-from faintfield.calib.noise.pixels import Response, quantum_efficiency
-from faintfield.calib.noise.response import charge_dn
+from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, main_quantities
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments
+from faintfield.calib.noise.likelihood.response import charge_dn
+from faintfield.calib.noise.maps.photo_response import Response
+from faintfield.calib.noise.maps.pixels import quantum_efficiency
 from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.saturation import Saturation
-from faintfield.calib.noise.statistics import Series
+from faintfield.calib.noise.series.saturation import Saturation
+from faintfield.calib.noise.series.statistics import Series
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
@@ -51,10 +53,12 @@ def estimate_all(
     levels_hold, noise_holds : bool
         The dark levels lie on a straight line over exposure time; the noise of all series follows eq. (1).
     """
-    fit, darks = fitted.fit, fitted.darks
+    fit = fitted.fit
     quantile, levels_quantile = float(stats.norm.ppf(0.975)), _levels_quantile(fit, fitted.moments)
-    why_no_gain = why_noise_denies(fitted) or _why_no_gain(
-        fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds
+    why_no_gain = (
+        _why_rounded(fitted)
+        or why_noise_denies(fitted)
+        or _why_no_gain(fit, fitted.moments, from_darks=not fitted.flats, holds=levels_hold and noise_holds)
     )
     why_no_current = _why_no_current(fit, fitted.moments, why_no_gain, levels_quantile, levels_hold=levels_hold)
     whys = {
@@ -65,8 +69,8 @@ def estimate_all(
     }
     estimates, covariance = _in_electrons(fit, whys, quantile if fitted.flats else levels_quantile, levels_quantile)
     gain = estimates["gain_dn_per_e"]
-    estimates |= _in_dn(fit, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
-    estimates |= _shared_noise(fitted, quantile) | _profiles(fit, darks, quantile)
+    estimates |= _in_dn(fitted, quantile, levels_quantile) | _spreads(fitted, gain, quantile)
+    estimates |= _shared_noise(fitted, quantile) | _profiles(fitted)
     estimates |= _from_flats(fitted, gain, response, quantile)
     return estimates | of_light(fitted, saturation, gain, estimates["quantum_efficiency"]), covariance
 
@@ -115,6 +119,18 @@ def _why_no_gain(fit: NoiseFit, moments: Moments, *, from_darks: bool, holds: bo
     return None
 
 
+def _why_rounded(fitted: SeriesFit) -> str | None:
+    """Return why rounding to whole DN hides the noise of the darks, None if it does not."""
+    if not fitted.rounding_hides_noise:
+        return None
+    read_dn = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"]))
+    return (
+        f"the read noise is about {read_dn:.2g} DN (limit {MIN_ROUNDED_READ_DN:g} DN), so little that rounding to "
+        "whole DN hides it, and the level of the darks moves too much for the likelihood of whole values; record at a "
+        "higher gain or with more bits, the camera settled"
+    )
+
+
 def _why_no_growth(moments: Moments) -> str:
     """Return why the darks do not determine the growth of noise and pattern with exposure time."""
     return _ONE_EXPOSURE if np.unique(moments.darks.exposure_s).size < 2 else _ONE_REPEATED
@@ -150,11 +166,14 @@ def _why_no_current(
     return None
 
 
-def _in_dn(fit: NoiseFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
+def _in_dn(fitted: SeriesFit, quantile: float, levels_quantile: float) -> dict[str, Estimate]:
     """Return the quantities that need no gain."""
+    fit = fitted.fit
     read_dn = float(np.exp(0.5 * fit.values["log_read_dn2"]))
     half = max(quantile, fit.quantile(_unit(fit, "log_read_dn2")))
     read = interval(read_dn, 0.5 * read_dn * fit.standard_error("log_read_dn2"), half, positive=True)
+    if (why := _why_rounded(fitted)) is not None:
+        read = Estimate(None, why=why)
     signal = Estimate(None, why=_ONE_EXPOSURE)
     if "dark_signal_dn_per_s" in fit.values:
         se = fit.standard_error("dark_signal_dn_per_s")
@@ -172,7 +191,8 @@ def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Es
     """Return the spreads over the pixels: DSNU and DCNU."""
     fit = fitted.fit
     dsnu2, se = fit.values["dsnu_dn2"], fit.standard_error("dsnu_dn2")
-    spreads = {"dsnu_dn": root(dsnu2, se, quantile)}
+    why = _why_rounded(fitted)
+    spreads = {"dsnu_dn": root(dsnu2, se, quantile) if why is None else Estimate(None, why=why)}
     if gain.value is None:
         return spreads | {name: Estimate(None, why=gain.why) for name in ("dsnu_e", "dcnu_e_per_s")}
     spreads["dsnu_e"] = root(dsnu2, se, quantile, 1 / gain.value)
@@ -189,7 +209,7 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
         return dict.fromkeys(("frame_jitter_dn", "row_noise_dn", "column_noise_dn"), unknown)
     rows, columns = darks[0].pattern_dn.shape
-    noise = np.array(dark_variances_dn2(fit.values, np.array([one.conditions.exposure_s for one in darks])))
+    noise = np.array(dark_variances_dn2(fit.values, np.array([one.conditions.dark_time_s for one in darks])))
     freedom = np.array([one.frames - 1.0 for one in darks])
 
     def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
@@ -207,27 +227,18 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
     }
 
 
-def _profiles(fit: NoiseFit, darks: Sequence[Series], quantile: float) -> dict[str, Estimate]:
+def _profiles(fitted: SeriesFit) -> dict[str, Estimate]:
     """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, in DN."""
-    dark = max(darks, key=lambda one: one.frames)
-    rows, columns = dark.pattern_dn.shape
-    noise = dark_variances_dn2(fit.values, np.array([dark.conditions.exposure_s]))[0]
-
-    def pattern(profile: NDArray[np.float64], along: int, shared_dn2: float) -> Estimate:
-        chance = (max(float(noise) / along, shared_dn2) / dark.frames) + fit.values["dsnu_dn2"] / along
-        return root(float(profile.var()) - chance, float(profile.var()) * np.sqrt(2 / profile.size), quantile)
-
-    return {
-        "dsnu_row_dn": pattern(dark.row_dn, columns, dark.row_noise_dn2),
-        "dsnu_column_dn": pattern(dark.column_dn, rows, dark.column_noise_dn2),
-    }
+    dark = max(fitted.darks, key=lambda one: one.frames)
+    parts = nonuniformity(dark.mean_dn, fitted.used, temporal_noise(dark, fitted.used))
+    return {"dsnu_row_dn": parts.row, "dsnu_column_dn": parts.column}
 
 
 def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, quantile: float) -> dict[str, Estimate]:
     """Return the quantities that only flats determine."""
     prnu = Estimate(None, why=_NO_FLATS)
     if response is not None:
-        prnu = interval(response.prnu, response.prnu_se, quantile)
+        prnu = response.prnu_estimate(quantile)
     nonlinearity = Estimate(None, why="flats of at least 3 light levels are needed")
     if (bend := fitted.bend) is not None:
         se = bend.standard_error("nonlinearity_per_dn")
@@ -235,9 +246,11 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
         nonlinearity = interval(bend.values["nonlinearity_per_dn"], se, half)
     efficiency = Estimate(None, why=_NO_PHOTONS)
     if gain.value is not None:
+        odd = {index for index, _ in fitted.moments.flats.light.odd}
         means_dn = fitted.moments.flats.mean_dn
-        charges = [_light_e(fitted.fit, one, mean) for one, mean in zip(fitted.flats, means_dn, strict=True)]
-        found = quantum_efficiency(fitted.flats, charges, fitted.fit.standard_error("log_gain"))
+        even = [(one, mean) for j, (one, mean) in enumerate(zip(fitted.flats, means_dn, strict=True)) if j not in odd]
+        charges = [_light_e(fitted.fit, one, mean) for one, mean in even]
+        found = quantum_efficiency([one for one, _ in even], charges, fitted.fit.standard_error("log_gain"))
         if found is not None:
             efficiency = interval(*found, quantile, positive=True)
     elif fitted.flats:

@@ -11,24 +11,32 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.exact import Bent, fit_exact
-from faintfield.calib.noise.gaussian import dark_variances_dn2, flat_variances_dn2
-from faintfield.calib.noise.marginal import Counts
-from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.moments import Moments, gather_moments, rounding_error
-from faintfield.calib.noise.response import (
+from faintfield.calib.noise.likelihood.exact import Bent, fit_exact
+from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2
+from faintfield.calib.noise.likelihood.marginal import Counts
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments, gather_moments
+from faintfield.calib.noise.likelihood.response import (
     BENDS,
     MEASURED_BEND_SE,
     UNKNOWN_BEND_SE,
     bend_range_dn,
     choose_bends,
 )
-from faintfield.calib.noise.scatter import fit_with_excess
-from faintfield.calib.noise.starts import censored_start, gaussian_start
-from faintfield.calib.noise.statistics import Series, sample_index
+from faintfield.calib.noise.likelihood.starts import censored_start, gaussian_start
+from faintfield.calib.noise.misfit.odd_light import without_odd
+from faintfield.calib.noise.misfit.scatter import fit_with_excess
+from faintfield.calib.noise.series.statistics import Series, sample_index
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
 _MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
+
+# Read noise in DN below which the Gaussian cannot tell the noise from the rounding, unless the
+# phases of the pixels average out.
+MIN_ROUNDED_READ_DN = 0.35
+
+# Largest error that rounding may make of the noise of a series of darks with so little read noise.
+_MAX_ROUNDING_ERROR = 0.05
 
 # Largest noise that pixels share, as a fraction of the read noise variance, for the exact likelihood; more blurs single
 # electrons.
@@ -97,6 +105,15 @@ class SeriesFit:
         return self.moments.flats.bend_se == UNKNOWN_BEND_SE
 
     @property
+    def rounding_hides_noise(self) -> bool:
+        """Whether the read noise is too small for the Gaussian, and the drift of the level too large for the values."""
+        rounding2 = self.moments.darks.rounding2
+        if self.likelihood is not NoiseLikelihood.GAUSSIAN or rounding2 is None:
+            return False
+        read_dn = float(np.exp(0.5 * self.fit.values["log_read_dn2"]))
+        return read_dn < MIN_ROUNDED_READ_DN and float(rounding2.max()) > _MAX_ROUNDING_ERROR**2
+
+    @property
     def profiles_dn2(self) -> float:
         """Variance that the fixed patterns of rows and columns add to the offsets of the pixels."""
         return float(self.darks[0].row_dn.var() + self.darks[0].column_dn.var())
@@ -140,7 +157,8 @@ def fit_series(
         if exact:
             fit = grown_like(gaussian, fit)
     if flats or likelihood is NoiseLikelihood.GAUSSIAN:
-        fit = with_rounding(fit, max(rounding_error(one, used) for one in darks))
+        rounding2 = moments.darks.rounding2
+        fit = with_rounding(fit, 0.0 if rounding2 is None else float(np.sqrt(rounding2.max())))
     return SeriesFit(darks, flats, moments, likelihood, fit, bend, used)
 
 
@@ -169,13 +187,15 @@ def _fit_gaussian(
     light = moments.flats.light
     chance = moments.flats.within_dn2 / np.maximum(moments.flats.frames - 1, 1) / moments.freedom
     level_dn2 = (chance / moments.pixels + moments.darks.level_scatter_dn2.mean()) / moments.flats.frames
+    light = without_odd(light, signal, level_dn2, choose_bends(light, signal, level_dn2))
+    moments = replace(moments, flats=replace(moments.flats, light=light))
     bends = choose_bends(light, signal, level_dn2)
     measured = replace(moments, flats=replace(moments.flats, range_dn=range_dn, bend_se=MEASURED_BEND_SE))
     if bends:
         fit, grown = fit_with_excess(measured, darks, flats, used, bends)
         if grown.excess.light2 < MAX_LIGHT_ERROR**2:
             return fit, fit, grown
-    dark = replace(light, group=np.full(light.group.shape, -1))
+    dark = replace(light, group=np.full(light.group.shape, -1), odd=())
     unknown = replace(measured.flats, light=dark)
     free = None
     if np.unique(np.round(moments.flats.mean_dn, -1)).size >= 3:
@@ -211,12 +231,12 @@ def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
     pooled = np.concatenate([v.ravel() for v in values])
     at_floor, above = (pooled == floor).mean(), (pooled == floor + 1).mean()
     cut_off = at_floor > max(_MAX_FRACTION_AT_FLOOR, above)
-    return Counts(tuple(s.conditions.exposure_s for s in darks), values, floor if cut_off else None)
+    return Counts(tuple(s.conditions.dark_time_s for s in darks), values, floor if cut_off else None)
 
 
 def _shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
     """Return the variance of the noise that pixels of a frame, row or column share, in the quietest series."""
-    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.exposure_s for one in darks]))
+    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.dark_time_s for one in darks]))
     variance, quietest = min(
         (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
     )

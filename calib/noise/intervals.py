@@ -6,6 +6,9 @@ from faintfield.calib.noise.result import Estimate
 
 _NO_SPREAD = "the values are not much likelier with a spread, so that none was fitted; record more darks"
 
+# Standard errors by which a variance is negative beyond chance: once in a thousand sound measurements, or less.
+_HIDDEN_SIGMA = 3.2
+
 # Largest exponent of an interval's end over its value; nothing beyond is of use.
 _MAX_EXPONENT = 50.0
 
@@ -19,15 +22,19 @@ def interval(value: float, se: float, quantile: float, *, positive: bool = False
 
 
 def root(variance: float, se: float, quantile: float, scale: float = 1.0) -> Estimate:
-    """Return the root of a variance, times a scale; no value if the variance is significantly negative."""
+    """Return the root of a variance, times a scale; no value if the variance is significantly negative.
+
+    Where it is negative by chance, the interval is from 0 to the root of one standard error at least.
+    """
     if not se:
         return Estimate(None, why=_NO_SPREAD)
-    if variance + quantile * se <= 0:
+    if variance < -_HIDDEN_SIGMA * se:
         return Estimate(
             None,
-            why=f"there is less scatter than the pixels' noise alone makes (by {-variance / se:.2g} standard errors), "
-            "so that a spread would be hidden: pickup whose phase turns from frame to frame does that; record more "
-            "frames, away from what may disturb them",
+            why=f"there is less scatter than the pixels' noise alone makes, by {-variance / se:.2g} standard errors "
+            f"(limit {_HIDDEN_SIGMA:g}), so that a spread would be hidden; the noise of the frames is not independent, "
+            "as when pickup changes its phase from frame to frame, which means of 10 frames or more show less",
         )
-    low, high = (float(np.sqrt(max(variance + sign * quantile * se, 0.0))) * scale for sign in (-1, 1))
+    low = float(np.sqrt(max(variance - quantile * se, 0.0))) * scale
+    high = float(np.sqrt(max(variance + quantile * se, se))) * scale
     return Estimate(float(np.sqrt(max(variance, 0.0))) * scale, (high - low) / (2 * quantile), (low, high))

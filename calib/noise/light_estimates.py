@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from faintfield.calib.noise.drift import lamp_flicker2
 from faintfield.calib.noise.fitting import SeriesFit
-from faintfield.calib.noise.gaussian import level_variances_dn2
-from faintfield.calib.noise.goodness import series_goodness
 from faintfield.calib.noise.intervals import root
-from faintfield.calib.noise.response import BENDS, FittedLevels, charge_dn
+from faintfield.calib.noise.likelihood.gaussian import level_variances_dn2
+from faintfield.calib.noise.likelihood.response import BENDS, FittedLevels, charge_dn
+from faintfield.calib.noise.misfit.drift import lamp_flicker2
+from faintfield.calib.noise.misfit.goodness import series_goodness
 from faintfield.calib.noise.result import Estimate
-from faintfield.calib.noise.saturation import Saturation
+from faintfield.calib.noise.series.saturation import Saturation
 
 # Largest scatter of the noise of series about the model, and largest departure of one, as fractions of the variance.
 MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
@@ -19,6 +19,13 @@ MAX_NOISE_ERROR, _MAX_DEPARTURE, _MIN_SIGMAS = 0.05, 0.1, 6.0
 # Draws of the response from its covariance, for the error of the linearity error.
 _DRAWS = 200
 
+# Largest share of draws that no response can have; with more the linearity error has no value.
+_MAX_IMPOSSIBLE = 0.05
+
+_POOR_RESPONSE = (
+    "the levels of the flats leave the response open, so that it might even fall; record more frames of each level, "
+    "and the levels in one go"
+)
 _NO_LIGHT = (
     "the light of the flats is not known: state the photons of at least 3 light levels over a factor of 2, or record 3 "
     "exposures under one light"
@@ -89,13 +96,18 @@ def _linearity(fitted: SeriesFit, saturation: Saturation) -> Estimate:
     variance = np.array(level_variances_dn2(fit.values, fitted.moments), float)
     levels = FittedLevels(fitted.moments.flats.light, signal, variance, full)
     value = levels.linearity(fit.values)
+    if value is None and levels.linearity({}) is not None:
+        return Estimate(None, why=_POOR_RESPONSE)
     if value is None:
         return Estimate(None, why="fewer than 3 levels are within 5 to 95 % of saturation; record more light levels")
     names = [name for name in fit.values if name in BENDS]
     at = [list(fit.values).index(name) for name in names]
     covariance, bends = fit.covariance[np.ix_(at, at)], np.array([fit.values[name] for name in names])
     drawn = np.random.default_rng(1288).multivariate_normal(bends, covariance, _DRAWS, method="svd")
-    errors = np.array([levels.linearity(dict(zip(names, draw.tolist(), strict=True))) or 0.0 for draw in drawn])
+    found = [levels.linearity(dict(zip(names, draw.tolist(), strict=True))) for draw in drawn]
+    errors = np.array([error for error in found if error is not None])
+    if errors.size < (1 - _MAX_IMPOSSIBLE) * _DRAWS:
+        return Estimate(None, why=_POOR_RESPONSE)
     se = float(np.sqrt(np.mean((errors - value) ** 2)))
     gradient = np.zeros(len(fit.values))
     gradient[at] = _slopes(levels, names, bends, covariance)

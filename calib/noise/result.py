@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.errors import NotIdentifiable
-from faintfield.calib.noise.goodness import SeriesGoodness
-from faintfield.calib.noise.saturation import Saturation
+from faintfield.calib.noise.misfit.goodness import SeriesGoodness
+from faintfield.calib.noise.series.saturation import Saturation
 from faintfield.calib.noise_model import BentResponse, Map, NoiseModel
 
 # Quantities without which there is no noise model.

@@ -91,7 +91,8 @@ def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
     The variance v follows from a smoothed f, the same for all views, so that no view counts more because it is dark by
     chance.
     """
-    f = back_projection(operator, images)
+    sensitivity, coverage = operator.sensitivity(), operator.coverage()
+    f = back_projection(operator, images, coverage=coverage)
     seen, smooth = operator.forward(f), operator.forward(np.maximum(blurred(f, _WINDOW), 0))
     background_e, read_variance_e2 = (
         operator.map_of_views(value, operator.all_views) for value in (images.background_e, images.read_variance_e2)
@@ -103,8 +104,8 @@ def agreement(operator: SceneOperator, images: ElementalImages) -> Agreement:
     np.square(squares, out=squares)
     squares /= variance
     np.minimum(squares, _MAX_SQUARES, out=squares)
-    light_variance = operator.adjoint(variance) / np.maximum(operator.coverage(), 1e-6) ** 2
-    return Agreement(operator.adjoint(squares), operator.sensitivity(), f, light_variance)
+    light_variance = operator.adjoint(variance) / np.maximum(coverage, 1e-6) ** 2
+    return Agreement(operator.adjoint(squares), sensitivity, f, light_variance)
 
 
 def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> DepthEstimate:

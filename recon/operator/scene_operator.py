@@ -195,7 +195,7 @@ class SceneOperator:
             if not sensitivity.any():
                 raise GeometryMismatch(
                     f"no pixel of any of the {len(self.all_views)} views sees the plane of {grid.shape[1]} x "
-                    f"{grid.shape[0]} samples at {grid.pitch_mm:.3g} mm; check its depth, the poses and their signs, "
+                    f"{grid.shape[0]} samples; check its depth, the poses and their signs, "
                     "and that not all pixels are masked (saturated, hot)"
                 )
 

@@ -17,6 +17,10 @@ _MIN_METRIC = 1e-3
 # Smallest light relative to the typical light when the curvature is computed.
 _MIN_LIGHT = 0.01
 
+# Least part of the variance that is not light's, relative to typical light, for samples that may become zero in one
+# step. In brighter scenes the exact likelihood falls off so steeply at zero that its gradient would overflow.
+_MIN_KNOWN = 0.01
+
 
 class DataFit:
     """L(f), the negative log-likelihood of the elemental images of all or some views.
@@ -37,8 +41,8 @@ class DataFit:
     sensitivity : float array (samples)
         s = Hᵀ 1.
     may_reach_zero : bool
-        Whether L is finite wherever f ≥ 0. It is not where all electrons of some pixel are light: a sample for which
-        there are data cannot be zero then.
+        Whether the gradient of L is of use wherever f ≥ 0. It is not where about all electrons of some pixel are light:
+        a sample for which there are data cannot be zero then.
     """
 
     def __init__(
@@ -49,7 +53,7 @@ class DataFit:
         self._min_light_e = _MIN_LIGHT * level_e
         self.sensitivity = operator.sensitivity(views)
         known_e2 = np.asarray(images.known_variance_e2(), np.float64)
-        self.may_reach_zero = bool(known_e2.min() > 0)
+        self.may_reach_zero = bool(known_e2.min() > _MIN_KNOWN * level_e)
         if operator.row_sums_are_response:
             self._coverage = operator.coverage(views)
             self._known_e2 = self._averaged(known_e2, level_e)

@@ -14,14 +14,18 @@ _START_BLUR = (1, 1, 1, 1, 2)
 _MIN_LEVEL_E = 1e-6
 
 
-def back_projection(operator: SceneOperator, images: ElementalImages, views: ViewSelection = None) -> Image:
+def back_projection(
+    operator: SceneOperator, images: ElementalImages, views: ViewSelection = None, *, coverage: Image | None = None
+) -> Image:
     """Return `Hᵀ(g − b) / Hᵀ H 1` (samples): the mean of what the views say of each sample.
 
     It is zero where no view sees the sample. Without flat field the denominator is s, the number of views that
-    contribute, as in the paper.
+    contribute, as in the paper. It is computed unless it is given as `coverage`.
     """
-    light = operator.adjoint(images.electrons, views) - operator.adjoint_of_map(images.background_e, views)
-    coverage = operator.coverage(views)
+    light = operator.adjoint(images.electrons, views)
+    if np.any(images.background_e):
+        light -= operator.adjoint_of_map(images.background_e, views)
+    coverage = operator.coverage(views) if coverage is None else coverage
     return np.divide(light, coverage, out=np.zeros_like(light), where=coverage > 0)
 
 

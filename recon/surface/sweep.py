@@ -51,17 +51,14 @@ def found_range(views: PinholeViews, nodes: NDArray[np.intp], far: float, near: 
         Nowhere do the views agree on anything.
     """
     coarse = views.binned(_BINS)
-    limits, searched_mm = (far, near), f"{1 / near:.4g} and {1 / far:.4g} mm"
+    limits = (far, near)
     for _ in range(_SEARCHES):
         depths = equal_steps(coarse, far, near)
         evidence = DepthEvidence(coarse, depths, halves(nodes))
         index, costs = next_depths(evidence, evidence.explained(first_depths(evidence)))
         likely = confidence(index, costs, depths, explained_share(evidence, index)) >= _LIKELY
         if np.count_nonzero(likely) < _MIN_SAMPLES:
-            raise NothingInFocus(
-                f"between {searched_mm} the views tell the depth of {likely.mean():.1%} "
-                "of the picture; give the range by --depth-range-mm NEAR:FAR, or more light"
-            )
+            raise NothingInFocus(f"the views tell the depth of {likely.mean():.1%} of the picture; give a range")
         first, last = np.quantile(index[likely], _QUANTILES)
         margin = _MARGIN * (last - first) + _MARGIN_STEPS
         before = near - far

@@ -232,6 +232,16 @@ def test_an_objective_that_is_not_finite_is_refused() -> None:
         next(pmlem(Overflowing(posed.operator, posed.images, 1.0), np.ones(SHAPE), penalty_weight=1.0))
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_bright_scenes_of_hardly_any_read_noise_are_solved(dtype: type[np.float32] | type[np.float64]) -> None:
+    """Samples beside a bright box fall towards zero, where the exact likelihood is steeper than numbers can say."""
+    posed = problem("poisson-gaussian", background_e=0.0, variance_e2=0.008, low=5.0, high=16_000.0, dtype=dtype)
+    fit, start = started(posed)
+    *_, last = islice(pmlem(fit, start, penalty_weight=1.0), 30)
+    assert last.certificate.distance < 0.1
+    assert last.plane.max() == pytest.approx(16_000, rel=0.1)
+
+
 def test_without_light_the_optimum_is_black_and_certain() -> None:
     posed = problem()
     images = replace(posed.images, electrons=np.full_like(posed.images.electrons, -1.5))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from faintfield.calib.noise import Estimate
-from faintfield.calib.noise.emva import (
+from faintfield.calib.noise.emva.quantities import (
     Inputs,
     dark_noise_e,
     derived_quantities,

@@ -16,9 +16,9 @@ from faintfield.calib.noise.estimates import (
 )
 from faintfield.calib.noise.fitting import NoiseLikelihood, choose_likelihood
 from faintfield.calib.noise.intervals import interval, root
-from faintfield.calib.noise.marginal import Counts
-from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.likelihood.marginal import Counts
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
 from tests.calib.noise.darkroom import darks, specimen
 
 NAMES = ("offset_dn", "log_read_dn2", "dsnu_dn2", "jitter_dn2", "dark_signal_dn_per_s", "log_gain")
@@ -55,12 +55,13 @@ def test_the_root_of_a_variance_has_the_roots_of_the_ends_as_itsinterval() -> No
 
 
 def test_a_variance_below_zero_is_none_unless_chance_explains_it() -> None:
-    chance = root(-1.0, 1.0, 1.96)
+    chance = root(-0.9, 1.0, 1.96)
     assert chance.value == 0.0
-    assert chance.ci95 == pytest.approx((0.0, np.sqrt(0.96)))
-    hidden = root(-2.0, 1.0, 1.96)
+    assert chance.ci95 == pytest.approx((0.0, np.sqrt(1.06)))
+    assert root(-3.0, 1.0, 1.96).ci95 == (0.0, 1.0), "never shorter than one standard error"
+    hidden = root(-4.0, 1.0, 1.96)
     assert hidden.value is None
-    assert "by 2 standard errors" in str(hidden.why)
+    assert "by 4 standard errors" in str(hidden.why)
     assert root(0.5, 0.0, 1.96).value is None
 
 

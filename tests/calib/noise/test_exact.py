@@ -9,7 +9,7 @@ from scipy import stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.fitting import NoiseLikelihood
-from faintfield.calib.noise.marginal import (
+from faintfield.calib.noise.likelihood.marginal import (
     DARK_LOG_WEIGHTS,
     DARK_NODES,
     PARAMETERS,

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.gaussian import dark_variances_dn2, negative_log_likelihood
-from faintfield.calib.noise.maximum import fit_gaussian
-from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments, gather_moments
+from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, negative_log_likelihood
+from faintfield.calib.noise.likelihood.maximum import GaussianProblem, fit_gaussian
+from faintfield.calib.noise.likelihood.moments import DarkMoments, Excess, FlatMoments, Moments, gather_moments
 from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
@@ -175,3 +175,14 @@ def test_scaling_the_time_unit_changes_nothing_but_the_dark_current() -> None:
         assert a is not None
         assert b is not None
         assert a == pytest.approx(b * factor, rel=1e-5)
+
+
+def test_a_jitter_at_its_bound_leaves_the_other_errors_alone() -> None:
+    """Beside drift the likelihood is curved the wrong way just above zero, where the search ends."""
+    chip, rng = specimen(3)
+    moments = gather_moments(take_darks(chip, rng), [], np.ones(chip.sensor.shape, bool))
+    problem, drift = GaussianProblem(moments), Excess(drift_dn2=0.01)
+    fit = problem.fit(drift)
+    scale = float(moments.darks.level_scatter_dn2.sum()) / 36
+    bound, above = (problem.covariance(fit.values | {"jitter_dn2": share * scale}, drift) for share in (0.0, 5e-6))
+    np.testing.assert_allclose(above, bound, rtol=1e-3, atol=1e-12)

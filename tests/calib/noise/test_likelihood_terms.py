@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise import measure_series
-from faintfield.calib.noise.exact import Bent, _flat_part, _Maximum
-from faintfield.calib.noise.gaussian import main_quantities, negative_log_likelihood
-from faintfield.calib.noise.marginal import PARAMETERS
-from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.moments import DarkMoments, FlatMoments, Moments
-from faintfield.calib.noise.pixels import quantum_efficiency
-from faintfield.calib.noise.statistics import Conditions, Series
+from faintfield.calib.noise.likelihood.exact import Bent, _flat_part, _Maximum
+from faintfield.calib.noise.likelihood.gaussian import main_quantities, negative_log_likelihood
+from faintfield.calib.noise.likelihood.marginal import PARAMETERS
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import DarkMoments, FlatMoments, Moments
+from faintfield.calib.noise.maps.pixels import quantum_efficiency
+from faintfield.calib.noise.series.statistics import Conditions, Series
 from tests.calib.noise.darkroom import darks, specimen
 
 type Function = Callable[[NDArray[np.float64]], NDArray[np.float64]]

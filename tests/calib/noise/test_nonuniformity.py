@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, measure_series
-from faintfield.calib.noise.nonuniformity import (
+from faintfield.calib.noise.emva.nonuniformity import (
     TemporalNoise,
     accumulated_histogram,
     high_pass,
@@ -107,3 +107,29 @@ def test_high_pass_takes_slopes_out_and_leaves_single_pixels() -> None:
     hidden[40, 50] = False
     assert filtered[40, 51] == pytest.approx(-1.0)
     assert high_pass(spot, hidden)[40, 50] == 0
+
+
+def test_clean_frames_are_refused_less_than_once_in_two_hundred_sets_and_their_intervals_hold_zero() -> None:
+    """Of pairs of frames of white noise, the pattern and the noise taken out of it are known equally well."""
+    rng, refused, above, sets = np.random.default_rng(6), dict.fromkeys(("row", "column", "pixel", "total"), 0), 0, 600
+    for _ in range(sets):
+        frames = np.rint(100 + 3 * rng.standard_normal((2, 32, 40)))
+        series = measure_series([(str(k), frame) for k, frame in enumerate(frames)], Conditions("dark", 1.0))
+        used = np.ones(frames[0].shape, bool)
+        found = nonuniformity(series.mean_dn, used, temporal_noise(series, used))
+        for name in refused:
+            refused[name] += getattr(found, name).value is None
+        above += (found.row.ci95 or (0.0, 0.0))[0] > 0
+    assert all(count <= sets / 200 for count in refused.values()), refused
+    assert above < 0.05 * sets
+
+
+def test_rows_whose_pattern_turns_its_sign_are_refused() -> None:
+    rng = np.random.default_rng(7)
+    turning = 2.0 * rng.standard_normal((SHAPE[0], 1))
+    frames = [np.rint(patterned(rng, 1.0, 0.0, 0.0) + sign * turning) for sign in (1, -1, 1, -1)]
+    series = measure_series([(str(k), frame) for k, frame in enumerate(frames)], Conditions("dark", 1.0))
+    found = nonuniformity(series.mean_dn, EVERY, temporal_noise(series, EVERY))
+    assert found.row.value is None
+    assert "less scatter" in str(found.row.why)
+    assert found.column.value is not None

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, NoiseCalibration, Series, calibrate, measure_series
-from faintfield.calib.noise.read_noise_map import PixelReadNoise, kept_variance, line_shifts, measure_read_noise
-from faintfield.calib.noise.seams import find_seams, share_of_seam
+from faintfield.calib.noise.maps.read_noise import PixelReadNoise, kept_variance, line_shifts, measure_read_noise
+from faintfield.calib.noise.maps.seams import find_seams, share_of_seam
 
 type Array = NDArray[np.float64]
 
@@ -157,6 +157,31 @@ def test_gains_of_pixels_and_of_two_taps_are_found_and_not_taken_for_response() 
     model = found.noise_model()
     np.testing.assert_array_equal(model.gain_dn_per_e, maps.gain_dn_per_e)
     assert np.ptp(model.read_variance_e2()) > 1.0
+
+
+@pytest.mark.parametrize("light_e", [300.0, 3000.0])
+def test_a_step_of_gain_is_none_of_the_response_and_dark_noise_is_that_of_each_half(light_e: float) -> None:
+    """Pairs of frames, and dim flats, of which a half of the variance is dark noise that the gain scales, too."""
+    rng, shape = np.random.default_rng(23), (128, 160)
+    gain = np.where(np.arange(shape[1]) < shape[1] // 2, 0.5, 0.55)
+    response = 1 + 0.01 * rng.standard_normal(shape)
+    series = []
+    for level, light in enumerate((0.0, 0.3 * light_e, 0.6 * light_e, light_e)):
+        conditions = Conditions("flat", 0.1, level, light) if light else Conditions("dark", 0.1)
+        frames = [
+            np.rint(100 + gain * (rng.poisson(light * response) + 15.0 * rng.standard_normal(shape))) for _ in range(4)
+        ]
+        series.append(
+            measure_series([(f"{level} {k}", it.astype(np.uint16)) for k, it in enumerate(frames)], conditions)
+        )
+    found = calibrate(series, 65535)
+    assert found.maps.gain_dn_per_e is not None
+    assert found.maps.read_noise_e is not None
+    halves = [found.maps.gain_dn_per_e[:, half].mean() for half in (slice(0, 70), slice(90, 160))]
+    assert halves[1] / halves[0] == pytest.approx(1.1, abs=0.003)
+    assert found.maps.read_noise_e[:, :70].mean() == pytest.approx(found.maps.read_noise_e[:, 90:].mean(), rel=0.03)
+    prnu = found.estimates["prnu"]
+    assert prnu.value == pytest.approx(0.01, abs=4 * (prnu.se or 0.0))
 
 
 def test_pixels_that_see_less_light_have_no_gain_of_their_own() -> None:

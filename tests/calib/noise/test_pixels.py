@@ -5,16 +5,16 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Conditions, Series, measure_series
-from faintfield.calib.noise.pixels import (
+from faintfield.calib.noise.maps.photo_response import measure_response
+from faintfield.calib.noise.maps.pixels import (
     LinePattern,
     hot_pixels,
     line_pattern,
-    measure_response,
     noisy_pixels,
     outlying_pixels,
     pixel_levels,
 )
-from faintfield.calib.noise.statistics import robust_sigma
+from faintfield.calib.noise.series.statistics import robust_sigma
 from tests.calib.noise.darkroom import darks, specimen
 
 
@@ -25,6 +25,20 @@ def test_a_pixel_in_a_hundred_sensors_lies_out_by_chance() -> None:
     ratio = generator.chisquare(20, (200, 200)) / 20
     ratio[3, 4] = 4.5
     assert np.argwhere(outlying_pixels(ratio, 20.0)).tolist() == [[3, 4]]
+
+
+def test_a_population_with_a_tail_towards_much_noise_lies_out_by_chance_only_but_jumping_pixels_do() -> None:
+    """Variances of pixels as of an sCMOS sensor: log-normal, 60 % wide; one jumps and has thirty times the usual."""
+    generator = np.random.default_rng(4)
+    flagged = 0
+    for _ in range(20):
+        own = np.exp(0.6 * generator.standard_normal((60, 80)))
+        ratio = own / own.mean() * generator.chisquare(42, own.shape) / 42
+        ratio[5, 6] = 30.0
+        found = outlying_pixels(ratio, 42.0)
+        assert found[5, 6]
+        flagged += int(found.sum()) - 1
+    assert flagged <= 4
 
 
 def test_outlying_pixels_are_of_no_use_at_five_times_the_usual_noise_or_twice_if_they_jump() -> None:

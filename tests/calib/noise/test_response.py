@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from faintfield.calib.noise.response import (
+from faintfield.calib.noise.likelihood.response import (
     FittedLevels,
     Light,
     charge_dn,
@@ -17,7 +17,7 @@ from faintfield.calib.noise.response import (
     scatter_of_levels,
     signal_of_charge,
 )
-from faintfield.calib.noise.statistics import Conditions, Series, measure_series
+from faintfield.calib.noise.series.statistics import Conditions, Series, measure_series
 
 BENT = {"nonlinearity_per_dn": 2e-5, "nonlinearity_per_dn2": -3e-9}
 
@@ -108,4 +108,14 @@ def test_the_linearity_error_is_the_mean_relative_deviation_from_a_weighted_line
     levels = FittedLevels(Light(amount, np.zeros(20, int)), bent, np.ones(20), float(bent.max()))
     inside = (bent >= 0.05 * bent.max()) & (bent <= 0.95 * bent.max())
     assert levels.linearity(values) == pytest.approx(linearity_error(bent[inside], amount[inside]), rel=1e-6)
+    assert levels.linearity({}) == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("end", [-0.4, -2.0])
+def test_a_response_that_makes_no_signal_has_no_linearity_error(end: float) -> None:
+    """Bends of twice their standard errors may be drawn that turn the charge of every level negative."""
+    signal = np.linspace(100.0, 1500.0, 16)
+    levels = FittedLevels(Light(signal / 1e3, np.zeros(16, int)), signal, np.ones(16), 1500.0)
+    bends = {"nonlinearity_per_dn": end / 500.0, "nonlinearity_per_dn2": -end / 4e7}
+    assert levels.linearity(bends) is None
     assert levels.linearity({}) == pytest.approx(0.0, abs=1e-9)

@@ -1,11 +1,14 @@
 """Where flats saturate, and which of them are left out, on simulated series with known ends."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from faintfield.calib.errors import SaturatedFlat
+from faintfield.calib.errors import BadFrame, SaturatedFlat
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.saturation import find_saturation
+from faintfield.calib.noise.series.flat_levels import check_flat_levels
+from faintfield.calib.noise.series.saturation import find_saturation
 
 OFFSET_DN, GAIN, READ_E = 50.0, 0.5, 6.0
 
@@ -83,3 +86,50 @@ def test_the_capacity_is_the_charge_at_the_end() -> None:
     assert capacity.ci95 is not None
     assert capacity.ci95[0] < 4700 < capacity.ci95[1]
     assert well.estimates["gain_dn_per_e"].value == pytest.approx(GAIN, rel=0.03)
+
+
+def test_one_series_of_too_much_noise_is_left_out_and_is_no_full_well() -> None:
+    flats = take([1000.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0])
+    flats[2] = replace(flats[2], within_dn2=3 * flats[2].within_dn2)
+    found = find_saturation(DARKS, flats, 4095.0)
+    assert (found.limit, found.level_dn) == ("not reached", None)
+    assert [one.conditions.level for one in found.kept] == [0, 1, 3, 4, 5]
+    assert "the only one" in found.left_out[0][1]
+
+
+def test_one_series_of_too_little_noise_gives_no_full_well_but_bright_flats_do_not_count() -> None:
+    flats = take([1000.0, 2000.0, 3000.0, 4000.0, 5000.0, 6000.0])
+    flats[5] = replace(flats[5], within_dn2=np.float32(0.3) * flats[5].within_dn2)
+    found = find_saturation(DARKS, flats, 4095.0)
+    assert (found.limit, found.level_dn) == ("not reached", None)
+    assert [one.conditions.level for one in found.kept] == [0, 1, 2]
+    assert "record two more levels" in found.left_out[0][1]
+
+
+def flat_of(charges_e: list[float], exposure_s: float, seed: int) -> Series:
+    rng = np.random.default_rng(seed)
+    frames = [
+        np.rint(OFFSET_DN + GAIN * (rng.poisson(it, (48, 48)) + rng.normal(0, READ_E, (48, 48)))) for it in charges_e
+    ]
+    named = [(f"{exposure_s:g} s {k}", frame.astype(np.uint16)) for k, frame in enumerate(frames)]
+    return measure_series(named, Conditions("flat", exposure_s))
+
+
+def test_frames_of_two_lights_in_one_series_are_named() -> None:
+    """Twelve exposures of one lamp; of 6 ms one frame too many is stated as 12 ms."""
+    flats = [flat_of([500.0 * k] * 2, 1e-3 * k, k) for k in (1, 2, 3, 4, 5, 7, 8, 9, 10, 11)]
+    mixed = flat_of([6000.0, 6000.0, 3000.0, 3000.0], 12e-3, 20)
+    with pytest.raises(BadFrame, match=r"^0.012 s [01]: mean 30\d\d.* DN, where 0.012 s [23] .* 15\d\d.*limit 5%"):
+        calibrate([*DARKS, *flats, mixed], 4095.0)
+    with pytest.raises(BadFrame, match="limit 50%"):
+        calibrate([*DARKS, mixed], 4095.0)
+
+
+@pytest.mark.parametrize("flicker", [0.0, 0.03])
+def test_a_lamp_that_flickers_in_all_series_is_no_fault_of_one(flicker: float) -> None:
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        flats = [
+            flat_of((500.0 * k * (1 + flicker * rng.standard_normal(2))).tolist(), 1e-3 * k, k) for k in range(1, 8)
+        ]
+        check_flat_levels(DARKS, flats)

@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.maximum import NoiseFit
-from faintfield.calib.noise.scatter import block_scatter
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.misfit.scatter import block_scatter
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 CHIP = {"gain_dn_per_e": 0.5, "read_noise_e": 8.0, "dsnu_e": 3.0, "shape": (40, 40)}

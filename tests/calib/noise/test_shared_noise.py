@@ -5,7 +5,7 @@ import pytest
 
 from faintfield.calib.noise import Conditions, calibrate, measure_series
 from faintfield.calib.noise.fitting import NoiseLikelihood, _shared_noise_dn2
-from faintfield.calib.noise.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise import Conditions, measure_series
-from faintfield.calib.noise.outliers import MAX_CHANCE, outlier
+from faintfield.calib.noise.series.outliers import MAX_CHANCE, outlier
 from tests.calib.noise.darkroom import darks, expose, specimen
 
 DARK = Conditions("dark", 1.0)

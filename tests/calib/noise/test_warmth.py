@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.warmth import dark_current_doubling
+from faintfield.calib.noise.emva.warmth import dark_current_doubling
 
 T = np.tile([0.1, 10.0, 60.0], 12)
 WARMTH = np.repeat([10.0, 15.0, 20.0, 25.0], 9)

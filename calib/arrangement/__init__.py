@@ -1,0 +1,1 @@
+"""What the pictures of a grid of views say of their arrangement."""

@@ -1,0 +1,194 @@
+"""How pixels differ, as EMVA 1288 release 4.0 shows it: row, column and pixel parts, spectrograms and histograms.
+
+All functions take the mean image of a series (row, column) and the pixels to use. What temporal noise is left in a mean
+over frames is known from the scatter of the frames, and is taken out.
+"""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+
+from faintfield.calib.noise.intervals import root
+from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.series.statistics import Series
+
+type Array = NDArray[np.float64]
+type Mask = NDArray[np.bool_]
+
+# Width of the box whose mean is subtracted from bright images before their histogram is taken.
+_BOX_PX = 5
+
+# Largest number of steps of an accumulated histogram.
+_MAX_STEPS = 256
+
+_QUANTILE = float(stats.norm.ppf(0.975))
+
+
+@dataclass(frozen=True)
+class TemporalNoise:
+    """Variances of what temporal noise leaves in a mean image: of each pixel, and of the mean of a row and a column.
+
+    Those that end in `_se` are their standard errors: of few frames, the noise is known no better than the pattern.
+    """
+
+    pixel: float
+    row: float
+    column: float
+    pixel_se: float = 0.0
+    row_se: float = 0.0
+    column_se: float = 0.0
+
+    def scaled(self, factor: float) -> "TemporalNoise":
+        """Return the variances of an image that is multiplied by √factor."""
+        return TemporalNoise(*(getattr(self, it.name) * factor for it in fields(self)))
+
+    def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
+        """Return the variances of a sum or difference of images."""
+        return TemporalNoise(
+            self.pixel + other.pixel,
+            self.row + other.row,
+            self.column + other.column,
+            math.hypot(self.pixel_se, other.pixel_se),
+            math.hypot(self.row_se, other.row_se),
+            math.hypot(self.column_se, other.column_se),
+        )
+
+
+@dataclass(frozen=True)
+class Nonuniformity:
+    """Standard deviations of an image: of its row, column and pixel parts, and of all, the root of their squares."""
+
+    total: Estimate
+    row: Estimate
+    column: Estimate
+    pixel: Estimate
+
+
+def temporal_noise(series: Series, used: Mask) -> TemporalNoise:
+    """Return what temporal noise leaves in the mean image of a series of at least two frames."""
+    pixels, again = used.sum() * _freedom_share(used), series.frames - 1
+    within = float(series.within_dn2.sum(where=used)) / (again * pixels)
+    # The level of a frame is subtracted from its rows, and takes one degree of freedom of each set of means
+    rows, columns = (size - 1 for size in used.shape)
+    row, column = series.row_noise_dn2 * (1 + 1 / rows), series.column_noise_dn2 * (1 + 1 / columns)
+    variances = np.array([within, row, column]) / series.frames
+    errors = variances * np.sqrt(2 / (again * np.array([pixels, rows, columns])))
+    return TemporalNoise(*variances.tolist(), *errors.tolist())
+
+
+def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: float = 1.0) -> Nonuniformity:
+    """Return the spreads of an image times a scale, each an unbiased difference of variances under its root.
+
+    With the means of M rows and N columns subtracted, the rest has the variance s_pixel² + σ², where σ² is the temporal
+    noise that is left; the means of rows have s_row² + s_pixel²/N and theirs. A difference has the errors of both.
+    """
+    rows, columns, rest = _parts(np.asarray(image, np.float64), used)
+    freedom = used.sum() * _freedom_share(used)
+    across = used.sum() / rows.size, used.sum() / columns.size
+    scatter = float((rest**2).sum() / freedom)
+    pixel, pixel_se = scatter - noise.pixel, math.hypot(scatter * math.sqrt(2 / freedom), noise.pixel_se)
+    row, row_se = _of_means(rows, noise.row + pixel / across[0], noise.row_se)
+    column, column_se = _of_means(columns, noise.column + pixel / across[1], noise.column_se)
+    total_se = float(np.sqrt(pixel_se**2 + row_se**2 + column_se**2))
+    return Nonuniformity(
+        total=root(pixel + row + column, total_se, _QUANTILE, scale),
+        row=root(row, row_se, _QUANTILE, scale),
+        column=root(column, column_se, _QUANTILE, scale),
+        pixel=root(pixel, pixel_se, _QUANTILE, scale),
+    )
+
+
+def _of_means(means: Array, noise: float, noise_se: float) -> tuple[float, float]:
+    """Return the variance of means beyond their noise, with its standard error."""
+    variance = float(means.var(ddof=1))
+    # Means that happen to scatter little are known no better than those that scatter as their noise does
+    se = max(variance, noise) * math.sqrt(2 / (means.size - 1))
+    return variance - noise, math.hypot(se, noise_se)
+
+
+def _freedom_share(used: Mask) -> float:
+    """Return the share of degrees of freedom left when rows and columns are taken out."""
+    return max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
+
+
+def _parts(image: Array, used: Mask) -> tuple[Array, Array, Array]:
+    """Return the means of rows and columns with pixels in use, and the rest (row, column), 0 for unused pixels."""
+    deviation = np.where(used, image - image.mean(where=used), 0.0)
+    per_row, per_column = used.sum(1), used.sum(0)
+    row = deviation.sum(1) / np.maximum(per_row, 1)
+    column = deviation.sum(0) / np.maximum(per_column, 1)
+    rest = np.where(used, deviation - row[:, None] - column, 0.0)
+    return row[per_row > 0], column[per_column > 0], rest
+
+
+@dataclass(frozen=True)
+class Spectrogram:
+    """Mean power spectrum of the lines of an image.
+
+    Attributes
+    ----------
+    frequency : array (bin,)
+        In cycles per pixel, from above 0 to 1/2.
+    power : array (bin,)
+        In the image's unit squared: where there is no pattern, the variance of the pixels.
+    """
+
+    frequency: Array
+    power: Array
+
+    @property
+    def white(self) -> float:
+        """Variance without its patterns: the median of the power."""
+        return float(np.median(self.power))
+
+
+def spectrogram(image: NDArray[Any], used: Mask, axis: int) -> Spectrogram:
+    """Return the spectrogram along an axis: 1 is the horizontal one, of the rows, 0 the vertical one.
+
+    With ŷ the discrete Fourier transform of a line of N pixels, the mean subtracted, the power is the mean of |ŷ|²/N
+    over the lines. Pixels that are not used count as the mean.
+    """
+    deviation = np.where(used, image - np.mean(image, where=used), 0.0)
+    length = image.shape[axis]
+    power = (np.abs(np.fft.rfft(deviation, axis=axis)) ** 2 / length).mean(axis=1 - axis) / float(used.mean())
+    return Spectrogram(np.fft.rfftfreq(length)[1:], power[1:])
+
+
+@dataclass(frozen=True)
+class AccumulatedHistogram:
+    """Percentage of the pixels that deviate at least so far.
+
+    Attributes
+    ----------
+    deviation : array (step,)
+        Absolute deviation from the mean, in the image's unit, ascending from 0.
+    percent : array (step,)
+        Percentage of the pixels.
+    sigma : float
+        Robust standard deviation, that of the normal law to compare with.
+    """
+
+    deviation: Array
+    percent: Array
+    sigma: float
+
+
+def accumulated_histogram(image: NDArray[Any], used: Mask) -> AccumulatedHistogram:
+    """Return the accumulated histogram, which shows few outlying pixels on a logarithmic axis as well as many."""
+    values = np.asarray(image, np.float64)[used]
+    deviation = np.sort(np.abs(values - values.mean()))
+    steps = np.linspace(0.0, deviation[-1], min(_MAX_STEPS, deviation.size))
+    beyond = deviation.size - np.searchsorted(deviation, steps, side="left")
+    # Half of a normal law lies within 0.6745 standard deviations
+    return AccumulatedHistogram(steps, 100.0 * beyond / deviation.size, float(np.median(deviation)) / 0.6745)
+
+
+def high_pass(image: NDArray[Any], used: Mask) -> Array:
+    """Return an image less its mean over 5 × 5 pixels, so that uneven light does not count as a deviation."""
+    share = ndimage.uniform_filter(used.astype(np.float64), _BOX_PX, mode="nearest")
+    mean = ndimage.uniform_filter(np.where(used, image, 0.0).astype(np.float64), _BOX_PX, mode="nearest")
+    return np.asarray(np.where(used, image - mean / np.maximum(share, 1e-6), 0.0))

@@ -1,0 +1,203 @@
+"""Fit of the marginal likelihood of single values, for frames that no Gaussian describes.
+
+Where values are cut off at the black level, or read noise is below an electron so that single electrons show, means
+and variances lose or distort information. The likelihood of the values themselves keeps it
+(`calib.noise.likelihood.marginal`). Its maximum is found by scoring with the sum over pixels of s_i s_iᵀ,
+s_i = ∇ ln L_i; Berndt, Hall, Hall and Hausman, Annals of Economic and Social Measurement 3/4, 653 (1974).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.errors import PoorFit
+from faintfield.calib.noise.likelihood.gaussian import flat_log_likelihood
+from faintfield.calib.noise.likelihood.marginal import PARAMETERS, Counts, MarginalLikelihood
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments
+
+type Array = NDArray[np.float64]
+
+# The log-likelihood of darks and flats together at given parameters, with gradient and information.
+type _Objective = Callable[[Array], tuple[float, Array, Array]]
+
+_IS_DCNU = np.array([name == "dcnu" for name in PARAMETERS])
+
+# Largest number of scoring steps; the climb ends long before if it converges at all.
+_MAX_STEPS = 80
+
+# The climb ends when a step promises to raise ln L by less than this, and steps are halved down to this length.
+_MIN_GAIN, _MIN_STEP_LENGTH = 1e-3, 1e-4
+
+# Relative spreads of the dark current that are tried, and the rise of ln L from which one is accepted.
+_TRIED_DCNU, _MIN_RISE = (0.08, 0.3), 4.0
+
+
+@dataclass(frozen=True)
+class Bent:
+    """The bend of the response: its coefficients, and their covariance."""
+
+    values: dict[str, float]
+    covariance: Array
+
+
+def fit_exact(
+    counts: Counts, start: dict[str, float], moments: Moments, bent: Bent, *, exact: bool, try_spread: bool
+) -> NoiseFit:
+    """Maximize the likelihood (4), times that of the flats' photon transfer if there are flats.
+
+    All pixels have the same dark current unless a spread makes the values much likelier.
+
+    Parameters
+    ----------
+    counts : Counts
+        Dark values.
+    start : dict
+        Initial values of `PARAMETERS`; they also decide the grids.
+    moments : Moments
+        Statistics of the flat series, if there are any, with the scatter of their noise.
+    bent : Bent
+        Response of the flats, which darks do not reach.
+    exact : bool
+        Use the Poisson sum, eq. (2), rather than the censored normal law, eq. (3).
+    try_spread : bool
+        Try dark currents that differ from pixel to pixel, which takes five times as long.
+
+    Returns
+    -------
+    NoiseFit
+        Parameters of the Gaussian fit; the covariance is the inverse of Σ s_i s_iᵀ.
+
+    Raises
+    ------
+    PoorFit
+        The steps do not converge.
+    """
+
+    def objective(*, spread: bool) -> _Objective:
+        darks = MarginalLikelihood(counts, start, exact=exact, spread=spread)
+
+        def evaluate(x: Array) -> tuple[float, Array, Array]:
+            dark, flat = darks.evaluate(x), _flat_part(x, moments, bent)
+            return dark[0] + flat[0], dark[1] + flat[1], dark[2] + flat[2]
+
+        return evaluate
+
+    even = _maximize(objective(spread=False), np.array([start[name] for name in PARAMETERS]), ~_IS_DCNU)
+    if not try_spread:
+        return _with_bend(even.fit(), bent)
+    spread = objective(spread=True)
+    tried = [np.where(_IS_DCNU, dcnu, even.x) for dcnu in _TRIED_DCNU]
+    rises = [spread(x)[0] - even.log_likelihood for x in tried]
+    if max(rises) < _MIN_RISE:
+        return _with_bend(even.fit(), bent)
+    return _with_bend(_maximize(spread, tried[int(np.argmax(rises))], np.ones_like(_IS_DCNU)).fit(), bent)
+
+
+def _with_bend(fit: NoiseFit, bent: Bent) -> NoiseFit:
+    """Return a fit with the bend of the response among its values."""
+    size = len(fit.values)
+    covariance = np.zeros((size + len(bent.values),) * 2)
+    covariance[:size, :size], covariance[size:, size:] = fit.covariance, bent.covariance
+    return NoiseFit(fit.values | bent.values, covariance, fit.log_likelihood)
+
+
+@dataclass(frozen=True)
+class _Maximum:
+    """Maximum of the likelihood, in the order of `PARAMETERS`."""
+
+    x: Array
+    covariance: Array
+    log_likelihood: float
+
+    def fit(self) -> NoiseFit:
+        """Return the maximum in the parameters of the Gaussian fit."""
+        log_gain, log_read_e, log_dark, dcnu, offset, log_dsnu = self.x.tolist()
+        slope, dsnu2 = float(np.exp(log_gain + log_dark)), float(np.exp(2 * log_dsnu))
+        spread2 = (dcnu * slope) ** 2
+        values = {
+            "offset_dn": offset,
+            "log_read_dn2": 2 * (log_gain + log_read_e),
+            "dsnu_dn2": dsnu2,
+            "dark_signal_dn_per_s": slope,
+            "dcnu_dn2_per_s2": spread2,
+            "log_gain": log_gain,
+        }
+        jacobian = np.array(
+            [
+                [0, 0, 0, 0, 1, 0],
+                [2, 2, 0, 0, 0, 0],
+                [0, 0, 0, 0, 0, 2 * dsnu2],
+                [slope, 0, slope, 0, 0, 0],
+                [2 * spread2, 0, 2 * spread2, 2 * dcnu * slope**2, 0, 0],
+                [1, 0, 0, 0, 0, 0],
+            ]
+        )
+        return NoiseFit(values, jacobian @ self.covariance @ jacobian.T, self.log_likelihood)
+
+
+def _maximize(objective: _Objective, begin: Array, free: NDArray[np.bool_]) -> _Maximum:
+    """Climb over the free parameters by scoring steps, halved where they overshoot; the others are zero."""
+    x = np.where(free, begin, 0.0)
+    best = objective(x)
+    for _ in range(_MAX_STEPS):
+        step = np.zeros_like(x)
+        step[free] = np.linalg.lstsq(best[2][np.ix_(free, free)], best[1][free])[0]
+        step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
+        if best[1] @ step < _MIN_GAIN:
+            covariance = np.zeros_like(best[2])
+            covariance[np.ix_(free, free)] = _inverse(best[2][np.ix_(free, free)])
+            return _Maximum(x, covariance, best[0])
+        length = 1.0
+        while (tried := objective(x + length * step))[0] < best[0] and length > _MIN_STEP_LENGTH:
+            length /= 2
+        x, best = x + length * step, tried
+    raise PoorFit(
+        f"the likelihood of the dark values did not settle in {_MAX_STEPS} steps; check that the darks were taken "
+        "with the lens covered, or record flats, which fix the gain"
+    )
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse of the information, where that of one parameter may be much smaller than that of others.
+
+    The logarithm of a dark current near zero has next to none, but the dark current itself has an error.
+    """
+    scale = np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+    return np.asarray(np.linalg.pinv(information / np.outer(scale, scale)) / np.outer(scale, scale))
+
+
+def _flat_part(x: Array, moments: Moments, bent: Bent) -> tuple[float, Array, Array]:
+    """Return the flats' ln L, gradient and Fisher information by `PARAMETERS`, the bend integrated out.
+
+    Its normal law times a likelihood that is normal near its coefficients leaves ½ gᵀ M g, with the gradient g by the
+    coefficients, and M the inverse of both their informations (Laplace).
+    """
+    size, flats = len(PARAMETERS), moments.flats
+    if not flats.frames.size:
+        return 0.0, np.zeros(size), np.zeros((size, size))
+    s, b = ca.SX.sym("s", size), ca.SX.sym("b", len(bent.values))
+    values = {"log_gain": s[0], "log_read_dn2": 2 * (s[0] + s[1]), "offset_dn": s[4]}
+    units = np.sqrt(np.diag(bent.covariance))
+    values |= {name: bent.values[name] + b[k] * units[k] for k, name in enumerate(bent.values)}
+    log_likelihood, log_variances, half_freedom = flat_log_likelihood(values, flats, moments.freedom, moments.excess)
+    logs = ca.vertcat(*log_variances)
+    by_bend, weight = ca.jacobian(logs, b), ca.diag(ca.DM(half_freedom))
+    if bent.values:
+        prior = ca.DM(np.linalg.pinv(bent.covariance / np.outer(units, units)))
+        precision = prior + by_bend.T @ weight @ by_bend
+        slope = ca.gradient(log_likelihood, b)
+        log_likelihood = log_likelihood + 0.5 * slope.T @ ca.solve(precision, slope)
+    else:
+        precision = ca.SX(0, 0)
+    outputs = [log_likelihood, ca.gradient(log_likelihood, s), ca.jacobian(logs, s), by_bend, precision]
+    found = ca.Function("flats", [s, b], outputs)(x, np.zeros(len(bent.values)))
+    value, gradient, by_series, bends, inverse = (np.array(part) for part in found)
+    information = (by_series.T * np.array(half_freedom)) @ by_series
+    if bent.values:
+        cross = (by_series.T * np.array(half_freedom)) @ bends
+        information -= cross @ np.linalg.solve(inverse, cross.T)
+    return float(value[0, 0]), gradient.ravel(), information

@@ -1,0 +1,179 @@
+"""Reduce series to the sufficient statistics of the Gaussian likelihood.
+
+Under Gaussian noise the likelihood depends on nothing else. With R rows, C columns and P pixels in use, removing
+levels and profiles takes R + C − 1 of the P degrees of freedom. Of the rest,
+
+- the sum of squares within pixels, W_j, is v_j χ² with (n_j − 1)(P − R − C + 1) degrees of freedom,
+- the J × J scatter of the pixel means of the dark series is Wishart with P − R − C + 1,
+- the mean of each dark series and the scatter of its frames' levels determine the dark signal and the frame jitter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise.likelihood.response import Light, known_light
+from faintfield.calib.noise.likelihood.rounding import dark_roundings, flat_rounding
+from faintfield.calib.noise.series.statistics import Series
+
+
+@dataclass(frozen=True)
+class DarkMoments:
+    """Statistics of the J dark series over the P pixels in use.
+
+    Attributes
+    ----------
+    exposure_s, frames : array (series,)
+        Exposure time t_j at the temperature of reference, and number of frames n_j.
+    mean_dn : array (series,)
+        Mean over frames and pixels.
+    within_dn2 : array (series,)
+        W_j, the squared deviations of pixels from their means, summed over frames and pixels, as if rounding had
+        added 1/12 DN² to each value's variance.
+    level_scatter_dn2 : array (series,)
+        Squared deviations of the frames' mean levels from the series' level, summed over frames.
+    scatter_dn2 : array (series, series)
+        S, the products of the pixels' patterns in two series, summed over pixels.
+    rounding2 : array (series,), optional
+        Square of the relative error of the noise that rounding may make; see `calib.noise.likelihood.rounding`.
+    """
+
+    exposure_s: NDArray[np.float64]
+    frames: NDArray[np.float64]
+    mean_dn: NDArray[np.float64]
+    within_dn2: NDArray[np.float64]
+    level_scatter_dn2: NDArray[np.float64]
+    scatter_dn2: NDArray[np.float64]
+    rounding2: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class FlatMoments:
+    """Statistics of the flat series, possibly none.
+
+    Attributes
+    ----------
+    frames, mean_dn, within_dn2 : array (series,)
+        As for the darks.
+    evenness : array (series,)
+        ⟨s⟩²/⟨s²⟩ of the signal s over the pixels: the factor on the degrees of freedom where brighter pixels are
+        noisier than others.
+    exposure_s, level_scatter_dn2 : array (series,)
+        As for the darks.
+    light : Light
+        What is known of their light.
+    range_dn, bend_se : float
+        Signal at the end of the range, and the standard error of the bend there before it is measured.
+    rounding2 : array (series,), optional
+        As for the darks.
+    """
+
+    frames: NDArray[np.float64]
+    mean_dn: NDArray[np.float64]
+    within_dn2: NDArray[np.float64]
+    evenness: NDArray[np.float64]
+    exposure_s: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    light: Light = field(default_factory=lambda: known_light([]))
+    level_scatter_dn2: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    range_dn: float = np.inf
+    bend_se: float = np.inf
+    rounding2: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class Excess:
+    """Scatter that the model of the pixels does not explain; see `calib.noise.misfit.goodness`.
+
+    Attributes
+    ----------
+    darks, flats : float
+        Squared deviations of variances over blocks of pixels, over those of normal noise.
+    variance2 : float
+        Relative variance of a series' noise about the model.
+    drift_dn2 : float
+        Variance of the level of a series of darks about the straight line.
+    light2 : float
+        Relative variance of the level of a series of flats about the response.
+    """
+
+    darks: float = 1.0
+    flats: float = 1.0
+    variance2: float = 0.0
+    drift_dn2: float = 0.0
+    light2: float = 0.0
+
+    def dispersion(self, freedom: float, rounding2: float, *, flat: bool) -> float:
+        """Return the variance of a sum of squares over that of χ² with `freedom` degrees of freedom."""
+        return (self.flats if flat else self.darks) + 0.5 * freedom * (self.variance2 + rounding2)
+
+
+NO_EXCESS = Excess()
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Sufficient statistics of all series, from `pixels` pixels in use with `freedom` degrees of freedom."""
+
+    pixels: float
+    freedom: float
+    darks: DarkMoments
+    flats: FlatMoments
+    excess: Excess = NO_EXCESS
+
+
+def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]) -> Moments:
+    """Sum the statistics of the series over the pixels in use.
+
+    Parameters
+    ----------
+    darks, flats : sequence of Series
+        At least one dark series; all of one size.
+    used : array (row, column), bool
+        Pixels that are neither defective nor suspect.
+    """
+    rows, columns = used.shape
+    pixels = float(used.sum())
+    patterns = np.array([series.pattern_dn[used] for series in darks], np.float64)
+    dark_dn = darks[0].mean_dn
+    freedom = max(pixels - rows - columns + 1.0, 1.0)
+    roundings = dark_roundings(darks, used)
+    return Moments(
+        pixels=pixels,
+        freedom=freedom,
+        darks=DarkMoments(
+            exposure_s=np.array([series.conditions.dark_time_s for series in darks]),
+            frames=np.array([series.frames for series in darks], np.float64),
+            mean_dn=np.array([_mean_dn(series, used) for series in darks]),
+            within_dn2=np.array(
+                [
+                    series.within_dn2.sum(where=used, dtype=np.float64) - one.excess_dn2 * (series.frames - 1) * freedom
+                    for series, one in zip(darks, roundings, strict=True)
+                ]
+            ),
+            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
+            scatter_dn2=patterns @ patterns.T,
+            rounding2=np.array([one.error**2 for one in roundings]),
+        ),
+        flats=FlatMoments(
+            frames=np.array([series.frames for series in flats], np.float64),
+            mean_dn=np.array([_mean_dn(series, used) for series in flats]),
+            within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in flats]),
+            evenness=np.array([_evenness(series.mean_dn[used] - dark_dn[used]) for series in flats]),
+            exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
+            light=known_light(flats),
+            level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in flats]),
+            rounding2=np.array([flat_rounding(series, used).error ** 2 for series in flats]),
+        ),
+    )
+
+
+def _mean_dn(series: Series, used: NDArray[np.bool_]) -> float:
+    """Return the mean over frames and the pixels in use."""
+    return float(series.mean_dn.mean(where=used))
+
+
+def _evenness(signal_dn: NDArray[np.float64]) -> float:
+    """Return ⟨s⟩²/⟨s²⟩."""
+    return float(signal_dn.mean() ** 2 / max(float((signal_dn**2).mean()), 1e-12))

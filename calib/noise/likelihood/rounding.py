@@ -1,0 +1,118 @@
+"""Rounding to whole DN: what it adds to the noise of a series, and how far that is known.
+
+A value of mean c and normal noise σ, rounded to whole DN, has the variance (Widrow, Kollár and Liu, IEEE Trans.
+Instrum. Meas. 45, 353, 1996)
+
+    σ² + 1/12 − a(σ) cos(2πc),    a(σ) = (4σ² + 1/π²) exp(−2π²σ²)
+
+to the first harmonic. The cosine averages out over pixels whose means differ by a DN or more. Where they do not, as in
+the darks of an 8-bit camera, its mean is taken from the pixels' own means, with the offsets of all darks together.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise.series.statistics import Series
+
+# Variance in DN² that rounding to whole DN adds on average over the phases.
+ROUNDING_DN2 = 1 / 12
+
+# Relative error of a noise that makes no difference.
+_NEGLIGIBLE = 1e-6
+
+# Logarithm of the largest factor by which the noise of the pixels' means may blur the mean cosine.
+_MAX_BLUR = 0.7
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """What rounding does to the variance of a series' values beyond 1/12 DN².
+
+    Attributes
+    ----------
+    excess_dn2 : float
+        Mean excess over the pixels in use; zero if it is not known.
+    error : float
+        Error of the noise of the series that remains, relative to its variance.
+    """
+
+    excess_dn2: float
+    error: float
+
+
+def flat_rounding(series: Series, used: NDArray[np.bool_]) -> Rounding:
+    """Return the rounding of a series whose pixels have means of any phase.
+
+    Parameters
+    ----------
+    series : Series
+        Statistics of its frames.
+    used : array (row, column), bool
+        Pixels in use.
+    """
+    if series.frames < 2:
+        return Rounding(0.0, 0.0)
+    total = _variance_dn2(series, used)
+    pattern = max(float(series.pattern_dn.var(where=used)) - total / series.frames, 0.0)
+    return Rounding(0.0, float(_amplitude(max(total - ROUNDING_DN2, 0.0)) * np.exp(-2 * np.pi**2 * pattern) / total))
+
+
+def dark_roundings(darks: Sequence[Series], used: NDArray[np.bool_]) -> list[Rounding]:
+    """Return the rounding of every dark series; the arguments are as for `flat_rounding`."""
+    roundings = [flat_rounding(one, used) for one in darks]
+    if max(one.error for one in roundings) < _NEGLIGIBLE:
+        return roundings
+    weight = np.array([one.frames for one in darks], np.float64)
+    relative = [one.mean_dn[used] - one.mean_dn.mean(where=used) for one in darks]
+    phase = np.average(relative, axis=0, weights=weight)
+    measured = [_dark_rounding(one, phase, float(weight.sum()), used) for one in darks]
+    return [min(both, key=lambda rounding: rounding.error) for both in zip(roundings, measured, strict=True)]
+
+
+def _dark_rounding(series: Series, phase_dn: NDArray[np.float64], frames: float, used: NDArray[np.bool_]) -> Rounding:
+    """Return the rounding of a dark series by the means of its pixels.
+
+    Parameters
+    ----------
+    series : Series
+        Statistics of its frames.
+    phase_dn : array (pixel,)
+        Offsets of the pixels in use about their mean.
+    frames : float
+        Number of frames that determine an offset.
+    used : array (row, column), bool
+        Pixels in use.
+    """
+    if series.frames < 2:
+        return Rounding(0.0, np.inf)
+    total = _variance_dn2(series, used)
+    blur = 2 * np.pi**2 * total / frames
+    if blur > _MAX_BLUR:
+        return Rounding(0.0, np.inf)
+    sharpening = float(np.exp(blur))
+    level = float(series.mean_dn.mean(where=used)) + series.levels_dn - series.levels_dn.mean()
+    variance, excess = total, 0.0
+    for _ in range(3):  # the amplitude depends on the noise before rounding
+        noise = max(variance - ROUNDING_DN2, 0.0)
+        # Rounding also draws means towards whole numbers
+        drawn = np.exp(-2 * np.pi**2 * noise) / np.pi * np.sin(2 * np.pi * (phase_dn + level.mean()))
+        wave = np.exp(2j * np.pi * (phase_dn + drawn)).mean() * np.exp(2j * np.pi * level).mean()
+        excess = -_amplitude(noise) * float(np.clip(wave.real * sharpening, -1.0, 1.0))
+        variance = max(total - excess, ROUNDING_DN2)
+    # What the pixels' means leave open: their noise, their number and the second harmonic
+    left = sharpening - 1 + np.sqrt(0.5 / phase_dn.size) + np.exp(-2 * np.pi**2 * noise)
+    return Rounding(excess, float(_amplitude(noise) * left / total))
+
+
+def _variance_dn2(series: Series, used: NDArray[np.bool_]) -> float:
+    """Return the mean variance of the pixels over the frames; their levels, rows and columns took a share of it."""
+    share = max(1 - sum(used.shape) / used.sum(), 0.1)
+    return max(float(series.within_dn2.mean(where=used)) / (series.frames - 1) / share, 1e-6)
+
+
+def _amplitude(noise_dn2: float) -> float:
+    """Return a(σ) for a variance of noise before rounding."""
+    return float((4 * noise_dn2 + 1 / np.pi**2) * np.exp(-2 * np.pi**2 * noise_dn2))

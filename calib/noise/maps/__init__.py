@@ -1,0 +1,1 @@
+"""What differs from pixel to pixel."""

@@ -1,0 +1,222 @@
+"""Measure what differs from pixel to pixel: defects, offset and dark signal, noise, and response to light.
+
+Offset and dark signal are posterior means. The mean of ten frames of a pixel is off by 1.1 e⁻ rms at 12 e⁻² of read
+noise: as much as the signal to be reconstructed. So offset and dark signal of pixel i get the priors N(μ, s²) and
+N(d, q²), whose spreads the fit has measured; the means m_ij of the series measure `o_i + d_i t_j` with variance
+v_ij/n_j, v_ij the noise of the pixel itself. Since both are Gaussian, the posterior mean is linear in the means, with a
+2 × 2 matrix (Gelman et al., Bayesian Data Analysis, 3rd ed., §5.4). What rows and columns share is part of μ.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from faintfield.calib.noise.series.statistics import Series, robust_sigma
+
+type Array = NDArray[np.float64]
+
+# Robust standard deviations above the median dark signal from which a pixel is hot.
+_HOT_SIGMA = 5.0
+
+# Probability of a normal value below one standard deviation above the mean.
+_ONE_SIGMA = float(stats.norm.cdf(1.0))
+
+# Expected number of pixels per sensor that are noisy by chance alone.
+_NOISY_BY_CHANCE = 1e-2
+
+# Variance over the median from which a pixel is of no use, and that of a pixel that also jumps between two levels.
+_USELESS, _USELESS_TELEGRAPH = 25.0, 4.0
+
+
+def hot_pixels(darks: Sequence[Series]) -> NDArray[np.bool_]:
+    """Return the pixels (row, column) with a large dark signal, the longest exposure minus the shortest.
+
+    Parameters
+    ----------
+    darks : sequence of Series
+        If all have one exposure, dark signal and offset cannot be separated, and no pixel is hot.
+    """
+    exposure_s = [series.conditions.dark_time_s for series in darks]
+    shortest, longest = darks[int(np.argmin(exposure_s))], darks[int(np.argmax(exposure_s))]
+    if shortest.conditions.dark_time_s == longest.conditions.dark_time_s:
+        return np.zeros(darks[0].pattern_dn.shape, bool)
+    signal_dn = longest.mean_dn - shortest.mean_dn
+    # Means of few frames take few values, so that the median absolute deviation can be zero.
+    spread_dn = max(robust_sigma(signal_dn), 0.5 / np.sqrt(longest.frames))
+    return np.asarray(signal_dn > np.median(signal_dn) + _HOT_SIGMA * spread_dn)
+
+
+def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArray[np.bool_]:
+    """Return the pixels (row, column) with more noise than chance allows.
+
+    Causes are random telegraph signals, cosmic rays and loose contacts.
+
+    Parameters
+    ----------
+    variance_ratio : array (row, column)
+        Variance of each pixel over the frames, divided by that of the model.
+    freedom : float
+        Degrees of freedom of each variance if the noise is normal.
+    """
+    chance = _NOISY_BY_CHANCE / variance_ratio.size
+    by_chance = np.log(stats.chi2.isf(chance, freedom) / freedom)
+    # A population with a tail towards much noise, as sCMOS sensors have it, is no row of defects
+    by_population = stats.norm.isf(chance) * _population_spread(variance_ratio, freedom)
+    return np.asarray(variance_ratio > np.exp(np.hypot(by_chance, by_population)))
+
+
+def _population_spread(variance_ratio: NDArray[np.floating], freedom: float) -> float:
+    """Return the standard deviation of the logarithm of the pixels' own variances.
+
+    It is read from the median and the quantile at one standard deviation above it, which defects do not move. Those of
+    χ² with `freedom` degrees of freedom, divided by it, contain no spread of the pixels.
+    """
+    middle, upper = np.quantile(variance_ratio, (0.5, _ONE_SIGMA))
+    if middle <= 0.0:  # values so coarse that most pixels never change
+        return 0.0
+    chance = np.log(stats.chi2.ppf(_ONE_SIGMA, freedom) / stats.chi2.ppf(0.5, freedom))
+    return float(np.sqrt(max(np.log(upper / middle) ** 2 - chance**2, 0.0)))
+
+
+def noisy_pixels(
+    outlying: NDArray[np.bool_], variance_ratio: NDArray[np.floating], telegraph: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the outlying pixels (row, column) that are too noisy to be of use; the others have a noise of their own.
+
+    A pixel of five times the usual noise tells a twenty-fifth of what others tell. One that jumps between two levels
+    is left out earlier, since its noise is not normal.
+    """
+    ratio = variance_ratio / max(float(np.median(variance_ratio)), 1e-12)
+    return np.asarray(outlying & (ratio > np.where(telegraph, _USELESS_TELEGRAPH, _USELESS)))
+
+
+def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple[NDArray[np.float64], float]:
+    """Return each pixel's variance over that of the model (row, column), and its degrees of freedom."""
+    freedom = float(sum(series.frames - 1 for series in darks))
+    ratio = np.zeros(darks[0].within_dn2.shape)
+    for series, variance in zip(darks, noise_dn2, strict=True):
+        ratio += series.within_dn2 / variance
+    return ratio / max(freedom, 1.0), freedom
+
+
+@dataclass(frozen=True)
+class PixelLevels:
+    """Offset and dark signal of every pixel, arrays (row, column), with the variances of their errors."""
+
+    offset_dn: Array
+    dark_signal_dn_per_s: Array
+    offset_variance_dn2: Array
+    dark_signal_variance_dn2_per_s2: Array
+
+
+@dataclass(frozen=True)
+class LinePattern:
+    """Pattern of rows and columns in the offsets, shrunk by its share of chance.
+
+    Attributes
+    ----------
+    offset_dn : array (row, column)
+        Sum of the patterns.
+    variance_dn2 : float
+        Variance of its error.
+    """
+
+    offset_dn: Array
+    variance_dn2: float
+
+
+def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
+    """Return what rows and columns share in the offsets, by the dark series of most frames.
+
+    Parameters
+    ----------
+    darks : sequence of Series
+        Dark series, at least one.
+    dsnu_dn2 : float
+        Variance of the offsets of the pixels, which scatters the means of rows and columns, too.
+    """
+    most = max(darks, key=lambda one: one.frames)
+    rows, columns = most.pattern_dn.shape
+    pattern, error = np.zeros((rows, columns)), 0.0
+    lines = (
+        (most.row_dn[:, None], most.row_noise_dn2, columns),
+        (most.column_dn[None, :], most.column_noise_dn2, rows),
+    )
+    for profile_dn, noise_dn2, averaged in lines:
+        # A lone frame does not tell the noise of its lines
+        chance = max(dsnu_dn2, 0.0) / averaged + noise_dn2 / most.frames
+        total = float(profile_dn.var())
+        kept = max(1 - chance / total, 0.0) if total > 0 and most.frames > 1 else 0.0
+        pattern = pattern + kept * profile_dn
+        error += kept * chance if most.frames > 1 else total
+    return LinePattern(pattern, error)
+
+
+def pixel_levels(
+    darks: Sequence[Series],
+    values: Mapping[str, float],
+    noise_dn2: Sequence[Array | float],
+    pattern: LinePattern,
+    hot: NDArray[np.bool_],
+) -> PixelLevels:
+    """Return the posterior means of every pixel's offset and dark signal.
+
+    Parameters
+    ----------
+    darks : sequence of Series
+        Dark series, at least one.
+    values : mapping
+        `offset_dn`, `dark_signal_dn_per_s`, `dsnu_dn2`, `dcnu_dn2_per_s2` of the fit.
+    noise_dn2 : sequence of arrays (row, column) or of float
+        Noise of the pixels in each series.
+    pattern : LinePattern
+        What rows and columns share in the offsets.
+    hot : array (row, column), bool
+        Pixels whose dark signal the prior does not describe; only their own values determine it.
+    """
+    exposures = [series.conditions.dark_time_s for series in darks]
+    # The floors stand for spreads that are zero or were not fitted.
+    offset_prior = 1 / max(values["dsnu_dn2"] + pattern.variance_dn2, 1e-6)
+    signal_prior = np.where(
+        hot, 1e-12 if np.ptp(exposures) else 1e12, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)
+    )
+    # Precision of offset, of both, and of dark signal; and the deviations that they weigh
+    offset, signal = np.full(hot.shape, offset_prior), signal_prior
+    both, of_offset, of_signal = np.zeros(hot.shape), np.zeros(hot.shape), np.zeros(hot.shape)
+    for series, variance in zip(darks, noise_dn2, strict=True):
+        t, weight = series.conditions.dark_time_s, series.frames / np.asarray(variance)
+        # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
+        deviation = series.mean_dn - series.mean_dn.mean(where=~hot) - pattern.offset_dn
+        offset, both, signal = offset + weight, both + weight * t, signal + weight * t**2
+        of_offset, of_signal = of_offset + weight * deviation, of_signal + weight * t * deviation
+    determinant = offset * signal - both**2
+    return PixelLevels(
+        values["offset_dn"] + pattern.offset_dn + (signal * of_offset - both * of_signal) / determinant,
+        values.get("dark_signal_dn_per_s", 0.0) + (offset * of_signal - both * of_offset) / determinant,
+        np.asarray(signal / determinant),
+        np.asarray(offset / determinant),
+    )
+
+
+def quantum_efficiency(
+    flats: Sequence[Series], charges_e: Sequence[float], gain_relative_se: float
+) -> tuple[float, float] | None:
+    """Return electrons per photon with the standard error, from the flats that state their photons; None without any.
+
+    EMVA 1288's η = R/K is the slope of charge over photons through the origin. Its error is that of the gain and of the
+    light's steadiness.
+    """
+    stated = [
+        (series.conditions.photons, charge)
+        for series, charge in zip(flats, charges_e, strict=True)
+        if series.conditions.photons
+    ]
+    if not stated:
+        return None
+    photons, charge = np.array(stated, float).T
+    slope = float(charge @ photons / (photons @ photons))
+    scatter = float(np.sum((charge - slope * photons) ** 2)) / max(len(stated) - 1, 1) / float(photons @ photons)
+    return slope, float(np.hypot(slope * gain_relative_se, np.sqrt(scatter)))

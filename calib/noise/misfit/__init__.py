@@ -1,0 +1,1 @@
+"""Where the frames deny the model: scatter, goodness of fit, drift, contradictions."""

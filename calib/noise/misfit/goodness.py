@@ -1,0 +1,112 @@
+"""How well each series follows the model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments
+from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
+from faintfield.calib.noise.misfit.scatter import BLOCKS, block_scatter, flat_noise_map, light_signal, noise_freedom
+from faintfield.calib.noise.series.statistics import Series
+
+type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Deviance of one grouping of a series' noise, and its degrees of freedom."""
+
+    deviance: float
+    freedom: int
+
+
+@dataclass(frozen=True)
+class SeriesGoodness:
+    """How well one series follows the model.
+
+    Attributes
+    ----------
+    series : Series
+        The series.
+    noise_excess, noise_se : float, optional
+        Variance over that of the model, minus 1, with its standard error under Gaussian noise; None for one frame.
+    level_residual_dn : float, optional
+        Level minus that of the model; None where the light of a flat is not known.
+    blocks, rows, columns, frames : Scatter, optional
+        Scatter of the noise over blocks of pixels, rows, columns and frames.
+    """
+
+    series: Series
+    noise_excess: float | None
+    noise_se: float | None
+    level_residual_dn: float | None
+    blocks: Scatter | None = None
+    rows: Scatter | None = None
+    columns: Scatter | None = None
+    frames: Scatter | None = None
+
+
+def series_goodness(
+    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
+) -> tuple[SeriesGoodness, ...]:
+    """Return the goodness of fit of each series, darks first."""
+    t = moments.darks.exposure_s
+    line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * t
+    residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
+    residuals += _light_residuals(fit, moments)
+    models: list[float | Array] = [*dark_variances_dn2(fit.values, t)]
+    noise = [*models, *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
+    maps = [*models, *(flat_noise_map(fit, one) for one in flats)]
+    freedom = np.concatenate(noise_freedom(moments))
+    within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
+    found = []
+    for j, one in enumerate((*darks, *flats)):
+        if one.frames < 2:
+            found.append(SeriesGoodness(one, None, None, residuals[j]))
+            continue
+        excess = float(within[j] / ((one.frames - 1) * moments.freedom * noise[j])) - 1
+        rows, columns = used.shape
+        blocks, by_row, by_column = (
+            _scatter(one, maps[j], used, *shape) for shape in ((BLOCKS, BLOCKS), (rows, 1), (1, columns))
+        )
+        se = float(np.sqrt(2 / max(freedom[j], 1.0)))
+        found.append(
+            SeriesGoodness(
+                one, excess, se, residuals[j], blocks, by_row, by_column, _frame_scatter(one, float(noise[j]))
+            )
+        )
+    return tuple(found)
+
+
+def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
+    """Return the level of each flat minus that of the response; None where the light is not known."""
+    light, signal = moments.flats.light, light_signal(fit, moments)
+    found: list[float | None] = [None] * signal.size
+    slope = charge_slope(fit.values, signal)
+    for group in light.groups:
+        members = np.flatnonzero(light.group == group)
+        charge, amount = charge_dn(fit.values, signal[members]), light.amount[members]
+        weight = 1 / np.array(level_variances_dn2(fit.values, moments), float)[members]
+        factor = float(weight * amount @ charge / (weight * amount @ amount))
+        for j, rest in zip(members.tolist(), charge - factor * amount, strict=True):
+            found[j] = float(rest / np.broadcast_to(slope, signal.shape)[j])
+    return found
+
+
+def _scatter(one: Series, noise_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int) -> Scatter:
+    """Return the scatter of a series' noise over blocks about its own mean."""
+    ratio, freedom = block_scatter(one, noise_dn2, used, rows, columns)
+    mean = np.average(ratio, weights=freedom)
+    return Scatter(float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2)), ratio.size - 1)
+
+
+def _frame_scatter(one: Series, noise_dn2: float) -> Scatter:
+    """Return the scatter of the variance of frames over their pixels, which noise and fixed pattern make."""
+    pixels = float((~one.suspect).sum())
+    pattern_dn2 = max(float(one.spreads_dn2.mean()) - noise_dn2, 0.0)
+    chance = (2 * noise_dn2**2 + 4 * noise_dn2 * pattern_dn2) / pixels
+    return Scatter(float(one.spreads_dn2.var() * one.frames / chance), one.frames - 1)

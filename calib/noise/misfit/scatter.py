@@ -1,0 +1,255 @@
+"""The scatter of series about the model, by which intervals must grow.
+
+Three kinds of scatter are measured from what the fit leaves, each as the variance with which the squares of the
+residuals are as large as their degrees of freedom (Mandel and Paule, Analytical Chemistry 42, 1194, 1970): that of a
+series' noise about the model, of the darks' levels about their straight line, and of the flats' levels about the
+response. A fourth is that of the noise over blocks of pixels, which is wider than χ² where noise has long tails.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
+from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, Moments
+from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope, grown_variance, scatter_of_levels
+from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
+from faintfield.calib.noise.series.statistics import Series
+
+type Array = NDArray[np.float64]
+
+# Blocks of pixels along each side of a frame.
+BLOCKS = 8
+
+# The levels of all dark series have a trend in common below this probability.
+_MAX_TREND_CHANCE = 0.01
+
+# Blocks scatter more than chance allows below this probability.
+_MAX_CHANCE = 0.05
+
+# Rounds of fits in which the scatter is measured, and its relative change at which they end.
+_MAX_ROUNDS, _SETTLED = 5, 0.02
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of an excess variance: degrees of freedom, and its share in the variance that it is part of."""
+
+    freedom: int
+    share: float
+
+
+def noise_freedom(moments: Moments) -> tuple[Array, Array]:
+    """Return the degrees of freedom of the noise of each dark and each flat series."""
+    darks, flats = moments.darks, moments.flats
+    return (darks.frames - 1) * moments.freedom, (flats.frames - 1) * moments.freedom * flats.evenness
+
+
+def block_scatter(
+    series: Series, expected_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int
+) -> tuple[Array, Array]:
+    """Return the noise of rows × columns blocks over the expected one, and the degrees of freedom of each.
+
+    Both are arrays (block,); blocks with fewer than two pixels in use are left out.
+    """
+    row = np.arange(used.shape[0]) * rows // used.shape[0]
+    column = np.arange(used.shape[1]) * columns // used.shape[1]
+    block = (row[:, None] * columns + column)[used]
+    size = rows * columns
+    count = np.bincount(block, minlength=size)
+    measured = np.bincount(block, series.within_dn2[used], size)
+    expected = np.bincount(block, np.broadcast_to(expected_dn2, used.shape)[used], size)
+    share = max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
+    enough = count > 1
+    freedom = (series.frames - 1) * count[enough] * share
+    return measured[enough] / (expected[enough] * (series.frames - 1) * share), np.asarray(freedom, float)
+
+
+def _dispersion(series: Sequence[Series], noise_dn2: Sequence[Array | float], used: NDArray[np.bool_]) -> float:
+    """Return how much wider than χ² the noise of blocks scatters, at least 1.
+
+    What the blocks of all series have in common is a difference between pixels, not chance, and is taken out.
+    """
+    several = [(one, v) for one, v in zip(series, noise_dn2, strict=True) if one.frames > 1]
+    if len(several) < 2:
+        return 1.0
+    ratios, freedoms = zip(*(block_scatter(one, v, used, BLOCKS, BLOCKS) for one, v in several), strict=True)
+    ratio, weight = np.array(ratios), np.array(freedoms) / 2
+    ratio = ratio / np.average(ratio, axis=1, weights=weight[0])[:, None]
+    rest = ratio - np.average(ratio, axis=0, weights=weight[:, 0])
+    freedom = (ratio.shape[0] - 1) * (ratio.shape[1] - 1)
+    deviance = float(np.sum(weight * rest**2))
+    return deviance / freedom if stats.chi2.sf(deviance, freedom) < _MAX_CHANCE else 1.0
+
+
+def flat_noise_map(fit: NoiseFit, one: Series) -> Array:
+    """Return the noise that the model expects of each pixel (row, column) of a flat, from its own mean."""
+    mean = np.maximum(one.mean_dn, fit.values["offset_dn"])
+    grid = np.linspace(float(mean.min()), float(mean.max()) + 1e-6, 64)
+    return np.asarray(np.interp(mean, grid, flat_variances_dn2(fit.values, grid)))
+
+
+def measure_excess(
+    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
+) -> tuple[Excess, dict[str, Known]]:
+    """Return the scatter beyond the model, and for `variance2`, `drift_dn2` and `light2` what is known of each."""
+    dark_noise = dark_variances_dn2(fit.values, moments.darks.exposure_s)
+    excess = Excess(
+        darks=_dispersion(darks, dark_noise, used),
+        flats=_dispersion(flats, [flat_noise_map(fit, one) for one in flats], used),
+    )
+    variance2, noise_known = _noise_scatter(fit, moments, excess)
+    drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
+    light = moments.flats.light
+    bends = sum(name.startswith("nonlinearity") for name in fit.values)
+    light2, light_known = 0.0, Known(0, 1.0)
+    if light.groups.size:
+        signal = light_signal(fit, moments)
+        slope = charge_slope(fit.values, signal)
+        still = replace(moments, excess=replace(excess, drift_dn2=drift_dn2))
+        variance = np.array(level_variances_dn2(fit.values, still), float) * slope**2
+        light2, _ = scatter_of_levels(light, signal, variance, bends)
+        light_known = Known(light.freedom - bends, _share(variance / signal**2, light2))
+    found = replace(excess, variance2=variance2, drift_dn2=drift_dn2, light2=light2)
+    return found, {"variance2": noise_known, "drift_dn2": drift_known, "light2": light_known}
+
+
+def _share(chance: Array, excess: float) -> float:
+    """Return the share of an excess variance in what it makes of the variances that chance has."""
+    return excess / (excess + 1 / float(np.mean(1 / chance))) if excess else 1.0
+
+
+def light_signal(fit: NoiseFit, moments: Moments) -> Array:
+    """Return the signal of each flat series that is due to light."""
+    dark = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * moments.flats.exposure_s
+    return np.asarray(moments.flats.mean_dn - dark)
+
+
+def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[float, Known]:
+    """Return the relative variance of the series' noise about the model, and what is known of it.
+
+    Read noise and gain are fitted to the noise of the series alone: the scatter of the pixels' means may contradict it,
+    as pickup does whose phase turns, which is no scatter between series.
+    """
+    values, darks, flats = fit.values, moments.darks, moments.flats
+    noise = np.array([*dark_variances_dn2(values, darks.exposure_s), *flat_variances_dn2(values, flats.mean_dn)], float)
+    signal = flats.mean_dn - values["offset_dn"]
+    slope = np.broadcast_to(charge_slope(values, signal), signal.shape)
+    dark = max(values.get("dark_signal_dn_per_s", 0.0), 0.0) * darks.exposure_s
+    design = np.concatenate([
+        np.stack([np.ones_like(dark), dark], axis=1),
+        np.stack([1 / slope**2, charge_dn(values, signal) / slope**2], axis=1),
+    ])  # fmt: skip
+    frames = np.concatenate([darks.frames, flats.frames])
+    measured = np.concatenate([darks.within_dn2, flats.within_dn2]) / np.maximum(frames - 1, 1) / moments.freedom
+    freedom = np.concatenate(noise_freedom(moments))
+    wider = np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
+    use = freedom > 0
+    rounding2 = [np.zeros(one.frames.size) if one.rounding2 is None else one.rounding2 for one in (darks, flats)]
+    chance = 2 * wider[use] / freedom[use] + np.concatenate(rounding2)[use]
+    target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
+    left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
+
+    def deviance(more: float) -> float:
+        root = np.sqrt(chance + more)
+        rest = target - columns @ np.linalg.lstsq(columns / root[:, None], target / root)[0]
+        return float(np.sum((rest / root) ** 2))
+
+    found = grown_variance(deviance, left)
+    return found, Known(left, _share(chance, found))
+
+
+def trend_dn2(darks: Sequence[Series]) -> float:
+    """Return the square of the drift of the black level during a series, where all darks drift alike; else zero.
+
+    It goes on from series to series, where it may pass for dark current.
+    """
+    several = [one for one in darks if one.frames > 1]
+    if len(several) < 3:
+        return 0.0
+    rises = np.array([np.polyfit(np.arange(one.frames), one.levels_dn, 1)[0] for one in several])
+    error = float(rises.std(ddof=1)) / np.sqrt(rises.size)
+    if 2 * stats.t.sf(abs(float(rises.mean())) / max(error, 1e-300), rises.size - 1) > _MAX_TREND_CHANCE:
+        return 0.0
+    return float(rises.mean() * np.mean([one.frames for one in several])) ** 2
+
+
+def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known]:
+    """Return the variance of the dark levels about their straight line, and what is known of it.
+
+    It is at least the square of the trend within the series.
+    """
+    darks, t = moments.darks, moments.darks.exposure_s
+    noise = np.array(dark_variances_dn2(fit.values, t), float) / moments.pixels
+    chance = (fit.values.get("jitter_dn2", 0.0) + noise) / darks.frames
+    left = t.size - min(np.unique(t).size, 2)
+
+    def deviance(more: float) -> float:
+        weight = 1 / np.sqrt(chance + more)
+        design = np.stack([np.ones_like(t), t], axis=1)[:, : min(np.unique(t).size, 2)]
+        line = design @ np.linalg.lstsq(design * weight[:, None], darks.mean_dn * weight)[0]
+        return float(np.sum(((darks.mean_dn - line) * weight) ** 2))
+
+    found = grown_variance(deviance, left)
+    if found < trend2:
+        return trend2, Known(0, 1.0)
+    return found, Known(left, _share(chance, found))
+
+
+def fit_with_excess(
+    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_], bends: int
+) -> tuple[NoiseFit, Moments]:
+    """Fit, measure the scatter that the fit leaves, and fit again with it until it settles.
+
+    Returns
+    -------
+    NoiseFit
+        With the degrees of freedom of each kind of scatter, and the covariance without any.
+    Moments
+        With the scatter.
+    """
+    problem = GaussianProblem(moments, bends)
+    fit, known = problem.fit(replace(NO_EXCESS, light2=_first_light2(moments, bends))), dict[str, Known]()
+    for _ in range(_MAX_ROUNDS):
+        excess, known = measure_excess(fit, moments, darks, flats, used)
+        settled = _alike(excess, moments.excess)
+        moments = replace(moments, excess=excess)
+        if settled:
+            break
+        fit = problem.fit(excess, fit.values)
+    sources = []
+    for name, it in known.items():
+        if (value := getattr(moments.excess, name)) > 0 and it.freedom > 0:
+            grown = replace(moments.excess, **{name: 1.1 * value})
+            # Residuals tell the whole of these variances, not only the excess.
+            change = (problem.covariance(fit.values, grown) - fit.covariance) / (0.1 * it.share)
+            sources.append((change, it.freedom))
+    plain = problem.covariance(fit.values, NO_EXCESS)
+    return replace(fit, sources=tuple(sources), plain_covariance=plain), moments
+
+
+def _first_light2(moments: Moments, bends: int) -> float:
+    """Return the scatter of the flats' levels beyond noise and the jitter that the darks show.
+
+    A fit without it would take unsteady light for jitter.
+    """
+    darks, flats = moments.darks, moments.flats
+    if not bends or not flats.light.groups.size:
+        return 0.0
+    freedom = float(np.maximum(darks.frames - 1, 0).sum())
+    noise = flats.within_dn2 / np.maximum(flats.frames - 1, 1) / moments.freedom
+    dark_noise = float(darks.within_dn2.sum()) / max(freedom * moments.freedom, 1.0)
+    jitter = max(float(darks.level_scatter_dn2.sum()) / max(freedom, 1.0) - dark_noise / moments.pixels, 0.0)
+    variance = (jitter + noise / moments.pixels) / flats.frames
+    return scatter_of_levels(flats.light, flats.mean_dn - float(darks.mean_dn.min()), variance, bends)[0]
+
+
+def _alike(one: Excess, other: Excess) -> bool:
+    """Return whether all parts of two scatters are alike."""
+    names = ("darks", "flats", "variance2", "drift_dn2", "light2")
+    pairs = [(getattr(one, name), getattr(other, name)) for name in names]
+    return all(abs(a - b) <= _SETTLED * max(a, b) for a, b in pairs)

@@ -1,0 +1,126 @@
+"""Darks at several temperatures: the growth of their dark current, and what it makes of the result."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.noise.emva.warmth import dark_current_doubling
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.moments import Moments
+from faintfield.calib.noise.misfit.drift import dark_factor
+from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.series.statistics import Series
+
+# Standard errors from which a stated doubling contradicts that of the darks.
+_MAX_SIGMAS = 3.0
+
+# Relative change of the dark current per kelvin of most sensors, where the darks do not tell it.
+_USUAL_PER_K = 0.1
+
+
+@dataclass(frozen=True)
+class Warmth:
+    """What the temperatures of the darks say.
+
+    Attributes
+    ----------
+    doubling : Estimate, optional
+        Kelvins over which the dark current of these darks doubles, if the series were taken to one temperature by it;
+        without a value if nothing tells by what.
+    range_k : float
+        Range of the temperatures of the darks.
+    warnings : tuple of str
+        What the user should know.
+    """
+
+    doubling: Estimate | None = None
+    range_k: float = 0.0
+    warnings: tuple[str, ...] = ()
+
+
+def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warmth]:
+    """Return the series with their dark current over that at their mean temperature, and what their temperatures say.
+
+    Nothing changes if they state no temperature, or already state their dark current.
+    """
+    darks = [one for one in series if one.conditions.kind == "dark" and one.conditions.temperature_c is not None]
+    warmth = np.array([one.conditions.temperature_c for one in darks], np.float64)
+    if np.unique(warmth).size < 2:
+        return series, Warmth()
+    range_k, found = float(np.ptp(warmth)), _doubling(darks)
+    stated_k = _stated_doubling_k(darks)
+    if stated_k is not None:
+        return series, Warmth(range_k=range_k, warnings=_contradiction(stated_k, found))
+    if found.value is None:
+        why = (
+            f"the darks have {warmth.min():g} to {warmth.max():g} °C and nothing tells how their dark current grows: "
+            f"its interval allows for {_USUAL_PER_K:.0%} per kelvin; state dark_current_doubling_k, or record all "
+            f"darks at one temperature ({found.why})"
+        )
+        return series, Warmth(found, range_k, (why,))
+    frames = np.array([one.frames for one in darks])
+    reference_c = float(np.average(warmth, weights=frames))
+    note = (
+        f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {found.value:.3g} ± "
+        f"{found.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
+    )
+    return [_at(one, reference_c, found.value) for one in series], Warmth(found, range_k, (note,))
+
+
+def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series], warmth: Warmth) -> NoiseFit:
+    """Return a fit whose dark signal has the error of the doubling, too."""
+    if warmth.doubling is None or "dark_signal_dn_per_s" not in fit.values:
+        return fit
+    error = 0.5 * _USUAL_PER_K * warmth.range_k * fit.values["dark_signal_dn_per_s"]
+    if warmth.doubling.value is not None and warmth.doubling.se is not None:
+        doublings = np.log2([one.conditions.dark_factor for one in darks]) * warmth.doubling.value
+        ends = [warmth.doubling.value + sign * warmth.doubling.se for sign in (-1, 1)]
+        slopes = [_slope(moments, 2.0 ** (doublings / end), darks) for end in ends]
+        error = 0.5 * (slopes[1] - slopes[0])
+    at = list(fit.values).index("dark_signal_dn_per_s")
+    covariance = fit.covariance.copy()
+    covariance[at, at] += error**2
+    return replace(fit, covariance=covariance)
+
+
+def _slope(moments: Moments, factor: NDArray[np.float64], darks: Sequence[Series]) -> float:
+    """Return the slope of the dark levels over the exposure times at given factors of the dark current."""
+    times = factor * [one.conditions.exposure_s for one in darks]
+    return float(np.polyfit(times, moments.darks.mean_dn, 1, w=np.sqrt(moments.darks.frames))[0])
+
+
+def _doubling(darks: Sequence[Series]) -> Estimate:
+    """Return the kelvins over which the dark current of the darks doubles."""
+    exposures, warmth = ([getattr(one.conditions, of) for one in darks] for of in ("exposure_s", "temperature_c"))
+    frames = [one.frames for one in darks]
+    levels = np.concatenate([one.levels_dn for one in darks])
+    return dark_current_doubling(levels, np.repeat(exposures, frames), np.repeat(np.array(warmth, float), frames))
+
+
+def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
+    """Return the kelvins over which the stated dark current doubles, None if none is stated."""
+    low, high = (pick(darks, key=lambda one: one.conditions.temperature_c or 0.0).conditions for pick in (min, max))
+    if low.dark_factor == high.dark_factor or low.temperature_c is None or high.temperature_c is None:
+        return None
+    return float((high.temperature_c - low.temperature_c) / np.log2(high.dark_factor / low.dark_factor))
+
+
+def _contradiction(stated_k: float, found: Estimate) -> tuple[str, ...]:
+    """Return a warning if the darks contradict the stated doubling."""
+    if found.value is None or found.se is None or abs(found.value - stated_k) <= _MAX_SIGMAS * found.se:
+        return ()
+    return (
+        f"dark_current_doubling_k = {stated_k:.3g} is stated, but the dark current of these darks doubles every "
+        f"{found.value:.3g} ± {found.se:.2g} K ({abs(found.value - stated_k) / found.se:.0f} standard errors): correct "
+        "it, or leave it out to have it measured",
+    )
+
+
+def _at(one: Series, reference_c: float, doubling_k: float) -> Series:
+    """Return a series with its dark current over that at a temperature."""
+    if (warmth := one.conditions.temperature_c) is None:
+        return one
+    factor = dark_factor(warmth, reference_c, doubling_k)
+    return replace(one, conditions=replace(one.conditions, dark_factor=factor))

@@ -1,0 +1,1 @@
+"""Frames reduced to the sufficient statistics of their series."""

@@ -1,0 +1,182 @@
+"""Find where a sensor saturates, and which series of flats lie beyond.
+
+A converter at its end leaves a mode of values there. A full well leaves none, because every pixel fills at another
+level, but the noise of the pixels falls: EMVA 1288 release 4.0 calls the mean of the noisiest series the saturation. It
+counts only if it shows without any one of the series.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.errors import SaturatedFlat
+from faintfield.calib.noise.series.statistics import Series
+
+type Limit = Literal["ADC", "full well", "not reached"]
+
+# Share of the values at a known end of the range beyond which the noise of a series is clipped: the variance of a
+# normal law that loses this share of one tail falls by 0.05 %.
+_MAX_CLIPPED_SHARE = 3e-4
+
+# Share, and number, of the values on the highest one from which it is the end of the range though nobody states it.
+_MIN_MODE_SHARE, _MIN_MODE_VALUES = 1e-3, 10
+
+# Noise falls if a brighter series has this share less of variance, and is so many standard errors below.
+_MIN_FALL, _MIN_SIGMAS = 0.1, 5.0
+
+# Share of the full well up to which no pixel is full yet: the end of EMVA 1288's range of the photon transfer.
+_MAX_FILLED = 0.7
+
+
+@dataclass(frozen=True)
+class Saturation:
+    """Where a sensor saturates, and the series of flats within its range.
+
+    Attributes
+    ----------
+    limit : {"ADC", "full well", "not reached"}
+        What ends the range.
+    level_dn : float, optional
+        The end of the converter's range, or the mean of the noisiest series; None if no series reaches it.
+    interval_dn : tuple of float, optional
+        Bounds of that level: means of the series next to it.
+    kept : tuple of Series
+        Flats to use.
+    left_out : tuple of (Series, str)
+        Flats beyond, each with the reason.
+    """
+
+    limit: Limit
+    level_dn: float | None
+    interval_dn: tuple[float, float] | None
+    kept: tuple[Series, ...]
+    left_out: tuple[tuple[Series, str], ...]
+
+
+def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation_dn: float) -> Saturation:
+    """Separate the flats within the range from those beyond.
+
+    Parameters
+    ----------
+    darks, flats : sequence of Series
+        At least one dark series.
+    saturation_dn : float
+        The end of the converter's range as far as it is stated, else infinity.
+
+    Raises
+    ------
+    SaturatedFlat
+        No flat is left.
+    """
+    ceiling = _ceiling_dn(flats, saturation_dn)
+    clipped = np.array([one.clipped_share(ceiling) for one in flats])
+    peak = _noisiest(flats)
+    if peak is not None and clipped[peak[1] :].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
+        odd = _odd_one(flats, *peak)
+        found = _full_well(darks, flats, *peak) if odd is None else _without_odd(darks, flats, *peak, odd)
+    else:
+        found = _converter_end(flats, clipped, ceiling)
+    if flats and not found.kept:
+        first, why = found.left_out[0]
+        raise SaturatedFlat(
+            f"{first.names[0]}: {why}, and no other flat is below; shorten the exposure or dim the light"
+        )
+    return found
+
+
+def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
+    """Return the end of the range: the highest value where many values stand on it, else the stated one."""
+    modes = [
+        one.top_dn
+        for one in flats
+        if one.at_top > max(_MIN_MODE_SHARE * one.counted, _MIN_MODE_VALUES * one.frames, one.below_top)
+    ]
+    return min(float(max(modes, default=np.inf)), saturation_dn)
+
+
+def _converter_end(flats: Sequence[Series], clipped: NDArray[np.float64], ceiling: float) -> Saturation:
+    """Return the flats that the end of the converter's range does not clip."""
+    over = clipped > _MAX_CLIPPED_SHARE
+    kept = tuple(one for one, out in zip(flats, over, strict=True) if not out)
+    left_out = tuple(
+        (one, f"{share:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range")
+        for one, share, out in zip(flats, clipped, over, strict=True)
+        if out
+    )
+    if not left_out:
+        return Saturation("not reached", None, None, kept, left_out)
+    return Saturation("ADC", ceiling, (ceiling, ceiling), kept, left_out)
+
+
+def _noise_dn2(one: Series) -> tuple[float, float]:
+    """Return the noise of the regular pixels of a series, and its standard error."""
+    variance = float(one.within_dn2.mean(where=~one.suspect)) / (one.frames - 1)
+    return variance, variance * float(np.sqrt(2 / ((one.frames - 1) * (~one.suspect).sum())))
+
+
+def _by_level(flats: Sequence[Series]) -> list[int]:
+    """Return the places of the flats of several frames, from dim to bright."""
+    return [j for j in np.argsort([one.levels_dn.mean() for one in flats]).tolist() if flats[j].frames > 1]
+
+
+def _falls(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
+    """Return the place in the order of the noisiest series, and whether noise falls beyond."""
+    noise: Any = [_noise_dn2(flats[j]) for j in order]
+    if len(order) < 2:
+        return 0, False
+    variance, se = np.array(noise).T
+    at = int(variance.argmax())
+    beyond, error = variance[at + 1 :], np.hypot(se[at], se[at + 1 :])
+    falls = (beyond < (1 - _MIN_FALL) * variance[at]) & (variance[at] - beyond > _MIN_SIGMAS * error)
+    return at, bool(falls.any())
+
+
+def _noisiest(flats: Sequence[Series]) -> tuple[list[int], int] | None:
+    """Return the series by their level and the place of the noisiest among them, if noise falls beyond; else None."""
+    order = _by_level(flats)
+    at, falls = _falls(flats, order)
+    return (order, at) if falls else None
+
+
+def _odd_one(flats: Sequence[Series], order: list[int], at: int) -> int | None:
+    """Return the series without which noise does not fall, the noisiest or another one; None if there is no such one.
+
+    The noise of a single series may be anything: its frames may be of different light, or the readout has failed.
+    """
+    ways = [order[at], *(j for j in reversed(order) if j != order[at])]
+    return next((j for j in ways if not _falls(flats, [it for it in order if it != j])[1]), None)
+
+
+def _without_odd(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int, odd: int) -> Saturation:
+    """Return the flats that can be relied on if one series alone has noise that may be that of a full well."""
+    if odd == order[at]:
+        why = "its noise is larger than that of brighter flats, and it is the only one; record it again"
+        kept = tuple(one for j, one in enumerate(flats) if j != odd)
+        return Saturation("not reached", None, None, kept, ((flats[odd], why),))
+    found = _full_well(darks, flats, order, at)
+    why = (
+        f"the noise of the flats of {flats[odd].levels_dn.mean():.1f} DN alone is less than that of dimmer ones, as "
+        "beyond a full well; record two more levels as bright"
+    )
+    return Saturation("not reached", None, None, found.kept, tuple((one, why) for one, _ in found.left_out))
+
+
+def _full_well(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int) -> Saturation:
+    """Return the flats in which no well is full."""
+    level = [float(flats[j].levels_dn.mean()) for j in order]
+    dark = min(float(one.levels_dn.mean()) for one in darks)
+    highest = dark + _MAX_FILLED * (level[at] - dark)
+    kept = {j for j, mean in zip(order, level, strict=True) if mean <= highest}
+    left_out = tuple(
+        (
+            one,
+            f"its mean of {one.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, {level[at]:.1f} DN",
+        )
+        for j, one in enumerate(flats)
+        if j not in kept
+    )
+    around = (level[max(at - 1, 0)], level[at + 1])
+    return Saturation("full well", level[at], around, tuple(flats[j] for j in sorted(kept)), left_out)
