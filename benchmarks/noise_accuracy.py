@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.marginal import PARAMETERS, Counts, MarginalLikelihood
+from faintfield.calib.noise.likelihood.marginal import PARAMETERS, Counts, MarginalLikelihood
 from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import darks, expose, specimen
 

@@ -18,6 +18,7 @@ from cyclopts import App, CycloptsError, CycloptsPanel, Group, Parameter
 
 from faintfield.pipelines.console import framed_console, inform, visible
 from faintfield.pipelines.errors import NAMED_FAILURES, FileFailed, MemoryShort, WrongUsage
+from faintfield.pipelines.formats.units import json_of
 from faintfield.pipelines.log_file import logged
 from faintfield.pipelines.registry import register_commands
 
@@ -74,7 +75,7 @@ def _launch(
 def _json(result: object) -> bytes:
     """Return a result as one line of JSON."""
     try:
-        return msgspec.json.encode(result)
+        return json_of(result)
     except UnicodeEncodeError:  # the name of a file is not UTF-8
         return dumps(msgspec.to_builtins(result)).encode()
 

@@ -1,7 +1,11 @@
 """Messages and progress bars, always on standard error; standard output is for results only."""
 
 import logging
-from collections.abc import Generator, Iterable
+import threading
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sized
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.progress import (
@@ -12,6 +16,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
@@ -19,6 +24,17 @@ logger = logging.getLogger("faintfield")
 
 # Wraps lines: messages in a frame would be cut off otherwise.
 framed_console = Console(stderr=True, highlight=False, emoji=False)
+
+
+# Off a terminal, seconds until the first line of what takes long, and from one line to the next.
+_FIRST_LINE_S, _NEXT_LINE_S = 2.0, 10.0
+
+
+# Reports of work under way, each part of the one before: one is silent while a part of it speaks for itself.
+_reports: list["_Report"] = []
+
+# Labels of the bars that are drawn.
+_bars: list[str] = []
 
 
 # Words that no log may hold.
@@ -75,5 +91,117 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
     )
     # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
     drawn = console.is_terminal
+    if not drawn:
+        yield from _in_lines(items, label, total if total is not None else _length(items))
+        return
     with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
-        yield from bar.track(items, description=visible(label), total=total)
+        _bars.append(label)
+        try:
+            yield from bar.track(items, description=visible(label), total=total)
+        finally:
+            _bars.remove(label)
+
+
+@contextmanager
+def working(label: str) -> Iterator[None]:
+    """Say what is done while it takes long and nobody watches a bar: one long call, without steps to count."""
+    if console.is_terminal:
+        # Within a bar, which goes on, only one of the two could be drawn
+        with nullcontext() if _bars else console.status(Text(visible(label))):
+            yield
+        return
+    with _said_while(_Report(label)):
+        yield
+
+
+@dataclass
+class _Report:
+    """Lines about work that takes long: the first after 2 s, then one every 10 s.
+
+    Attributes
+    ----------
+    label : str
+        The work in a few words.
+    total, done : int
+        Number of its steps, and of those that are finished; no total if it is not known.
+    clock : callable
+        Returns the time in s.
+    """
+
+    label: str
+    total: int | None = None
+    done: int = 0
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self.spoke = False
+        self._started = self.clock()
+        self._due = self._started + _FIRST_LINE_S
+
+    def wait_s(self) -> float:
+        """Return the time until the next line."""
+        return max(self._due - self.clock(), 0.0)
+
+    def line(self) -> str | None:
+        """Return the line that is due, if one is."""
+        now = self.clock()
+        if now < self._due:
+            return None
+        self._due = now + _NEXT_LINE_S
+        self.spoke = True
+        passed_s = now - self._started
+        steps = "" if self.total is None else f"{self.done} of {self.total}, "
+        left = ""
+        if self.total and self.done:
+            left = f", about {_duration(passed_s * (self.total - self.done) / self.done)} to go"
+        return f"{self.label}: {steps}{_duration(passed_s)}{left}"
+
+
+def _duration(seconds: float) -> str:
+    """Return a time in words, to the second, or to the minute from two minutes on.
+
+    >>> _duration(20.4), _duration(150)
+    ('20 s', '2 min')
+    """
+    return f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
+
+
+@contextmanager
+def _said_while(report: _Report) -> Iterator[None]:
+    """Print the lines of a report from a thread, which a caller that never returns cannot keep from ending."""
+    finished = threading.Event()
+
+    def say() -> None:
+        while not finished.wait(report.wait_s()):
+            if (line := report.line()) is not None and not _parts_speak(report):
+                inform(line)
+
+    thread = threading.Thread(target=say, daemon=True, name="progress")
+    _reports.append(report)
+    thread.start()
+    try:
+        yield
+    finally:
+        finished.set()
+        _reports.remove(report)
+        if thread is not threading.current_thread():
+            thread.join()
+
+
+def _parts_speak(report: _Report) -> bool:
+    """Return whether a part of the work has already said what it does."""
+    return any(part.spoke for part in _reports[_reports.index(report) + 1 :])
+
+
+def _in_lines[T](items: Iterable[T], label: str, total: int | None) -> Generator[T]:
+    """Yield items, and say every 10 s how many are done."""
+    report = _Report(label, total)
+    with _said_while(report):
+        for item in items:
+            yield item
+            report.done += 1
+
+
+def _length(items: Iterable[object]) -> int | None:
+    """Return the number of items if it is known."""
+    return len(items) if isinstance(items, Sized) else None

@@ -3,10 +3,16 @@
 InputError
 ├── MissingFile
 ├── UnreadableImage
+│   └── UnknownFormat
 ├── WrongSize
 ├── WrongBitDepth
 ├── BadValue
 │   └── UnknownKey
+├── ArrangementError
+│   ├── NotOneScene
+│   ├── CopiedPicture
+│   ├── AmbiguousOrder
+│   └── CameraTurned
 ├── ResultDamaged
 ├── OutputExists
 ├── OutputBusy
@@ -39,6 +45,10 @@ class UnreadableImage(InputError):
     """An image file cannot be decoded, or does not hold one picture."""
 
 
+class UnknownFormat(UnreadableImage):
+    """No image file of this kind can be decoded here, which says nothing about the file."""
+
+
 class WrongSize(InputError):
     """An image does not have the size that its camera states."""
 
@@ -53,6 +63,26 @@ class BadValue(InputError):
 
 class UnknownKey(BadValue):
     """A file has a key that is not read, most often a misspelt one."""
+
+
+class ArrangementError(InputError):
+    """Pictures are no views from a grid, or do not tell which."""
+
+
+class NotOneScene(ArrangementError):
+    """Pictures show different scenes, or nothing that they share."""
+
+
+class CopiedPicture(ArrangementError):
+    """One picture is there under several names."""
+
+
+class AmbiguousOrder(ArrangementError):
+    """Two orders of the views are equally likely, and nothing states which."""
+
+
+class CameraTurned(ArrangementError):
+    """The camera turned, or its focal length changed, from view to view."""
 
 
 class ResultDamaged(InputError):

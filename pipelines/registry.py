@@ -37,11 +37,14 @@ IMPORTS = (
     "import grid pictures bright --pitch-mm 50 --fx-px 600",
     "import colmap sparse/0 set --images images",
     "import mrcal cameras set --images images",
+    "import nerfstudio transforms.json set --mm-per-unit 1000",
+    "import poses poses.csv set --fx-px 600 --images images",
     "import emva1288 descriptor.txt noise",
 )
 EXPORTS = (
     "export colmap set sparse",
     "export mrcal set cameras",
+    "export nerfstudio set transforms",
     "export zarr sweep sweep.ome.zarr",
     "export emva1288 noise emva1288",
 )

@@ -16,7 +16,7 @@ import pytest
 import faintfield
 
 _ROOT = Path(__file__).parents[1]
-_FOLDERS = ("rig", "calib", "recon", "pipelines")
+_FOLDERS = ("rig", "calib", "recon", "pipelines", "testing")
 _BUILT_FROM = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE", "faintfield", *_FOLDERS, "tests")
 # Prints the modules that `import faintfield` loads.
 _IMPORT = "import sys; before = set(sys.modules); import faintfield; print(*sorted(set(sys.modules) - before))"

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.calib.detection import BoardCorners, detect_all
@@ -21,9 +22,10 @@ from faintfield.calib.geometry import (
     rms_over_views,
     transfer_sigma_at,
 )
+from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
-from faintfield.pipelines.console import inform, progress
+from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.geometry import (
@@ -33,6 +35,7 @@ from faintfield.pipelines.formats.results.geometry import (
     BoardRecord,
     GeometryOptions,
     GeometryRecord,
+    HomingRecord,
     LensRecord,
     NodeRecord,
     RepeatabilityRecord,
@@ -79,7 +82,8 @@ def measure_geometry(board_set: BoardSet, settings: GeometrySettings) -> Measure
     """
     load_mrcal()  # fails at once if it is missing, not after all images were searched
     observations, size_px = _observe(board_set)
-    rig = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
+    with working("solving lens and poses"):
+        rig = calibrate_geometry(board_set.boards, observations, size_px, board_set.reference, settings)
     visits = [] if board_set.one_sided else [(view.node, view.sweep) for view in board_set.views]
     stage = stage_report(rig, approach_directions(visits), board_set.pitch_mm)
     return MeasuredGeometry(board_set, settings, observations, rig, stage)
@@ -97,21 +101,39 @@ def geometry_record(measured: MeasuredGeometry, options: GeometryOptions) -> Geo
         size_px=lens.size_px,
         reference_node=rig.nodes[rig.reference],
         nodes=[NodeRecord(*pose) for pose in poses],
+        homings=[_homing_record(shift) for shift in rig.homings] or UNSET,
         rms_inlier_px=rig.rms_inlier_px,
         rms_mrcal_px=rig.rms_mrcal_px,
         corner_sigma_px=rig.sigma_px,
         corners=rig.corners,
         outliers=rig.outliers,
         holdout_ratio=rig.holdout_ratio,
-        warnings=rig.warnings,
+        warnings=[*rig.warnings, *_homing_warnings(measured)],
         transfer_sigma_px={
             f"{depth:g}": rms_over_views(transfer_sigma_at(rig, depth)) for depth in measured.settings.depths_mm
         },
         repeatability=msgspec.convert(rig.repeatability, RepeatabilityRecord | None, from_attributes=True),
         boards=_board_records(measured),
         stage=msgspec.convert(measured.stage, StageRecord, from_attributes=True),
-        **msgspec.structs.asdict(provenance("geometry", options, dict(measured.board_set.input_hashes()))),
+        **provenance("geometry", options, dict(measured.board_set.input_hashes())).parts(),
     )
+
+
+def _homing_warnings(measured: MeasuredGeometry) -> list[str]:
+    """Return a warning where the stage homed within the only sweep, and may have come back to another place."""
+    sweeps = measured.rig.undetermined_homings
+    if not sweeps or measured.board_set.switches_repeat:
+        return []
+    return [
+        f"the stage homed again within sweep {', '.join(map(str, sweeps))}, and no other sweep joins the nodes before "
+        "and after, which may be shifted by as much as its switches repeat; take one more sweep"
+    ]
+
+
+def _homing_record(shift: HomingShift) -> HomingRecord:
+    """Return the record of a shift."""
+    (x, y, z), sigmas = shift.shift_mm.tolist(), np.sqrt(np.diag(shift.covariance_mm2)).tolist()
+    return HomingRecord(shift.before, shift.after, (x, y, z), (sigmas[0], sigmas[1], sigmas[2]))
 
 
 def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
@@ -121,10 +143,13 @@ def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
     boards whose pose was solved.
     """
     rig = measured.rig
-    solved = {board.target for board in rig.boards}
+    solved = {(board.target.board, board.target.sweep) for board in rig.boards}
     files: dict[str, bytes | str] = {
         COVARIANCE_FILE: _npz(covariance=rig.covariance, nodes=np.array(rig.nodes), intrinsics=rig.lens.parameters),
-        CORNERS_FILE: _corners_npz([seen for seen in measured.observations if seen.target in solved]),
+        CORNERS_FILE: _corners_npz(
+            [seen for seen in measured.observations if (seen.target.board, seen.target.sweep) in solved],
+            apart=bool(rig.homings),
+        ),
     }
     for node, rt_cam_ref in zip(rig.nodes, rig.rt_cam_ref, strict=True):
         files[CAMERA_FILE.format(*node)] = camera_model_text(rig.lens, rig.lens_model, rt_cam_ref)
@@ -140,7 +165,9 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
     per_view = list(zip(views, found, strict=True))
     _inform_of_found(per_view)
     observations = [
-        BoardObservation(view.node, Target(seen.board, view.sweep), seen.corners, seen.pixels, seen.sigma_px)
+        BoardObservation(
+            view.node, Target(seen.board, view.sweep, view.homing), seen.corners, seen.pixels, seen.sigma_px
+        )
         for view, boards_seen in per_view
         for seen in boards_seen
         if len(seen.corners)
@@ -185,13 +212,14 @@ def _board_records(measured: MeasuredGeometry) -> list[BoardRecord]:
             sweep=pose.target.sweep,
             rt_ref_board=tuple(pose.rt_ref_board.tolist()),
             warp_mm=(warp_x_mm, warp_y_mm),
+            homing=pose.target.homing or UNSET,
         )
         for pose in measured.rig.boards
     ]
 
 
-def _corners_npz(observations: Sequence[BoardObservation]) -> bytes:
-    """Return all corners, one row per corner."""
+def _corners_npz(observations: Sequence[BoardObservation], *, apart: bool) -> bytes:
+    """Return all corners, one row per corner; with the homings of the boards' poses if these are told apart."""
     counts = [len(seen.corners) for seen in observations]
     return _npz(
         pixels=np.concatenate([seen.pixels for seen in observations]),
@@ -199,6 +227,7 @@ def _corners_npz(observations: Sequence[BoardObservation]) -> bytes:
         corner=np.concatenate([seen.corners for seen in observations]),
         node=np.repeat([seen.node for seen in observations], counts, axis=0),
         sweep=np.repeat([seen.target.sweep for seen in observations], counts),
+        homing=np.repeat([seen.target.homing if apart else 0 for seen in observations], counts),
         board=np.repeat([seen.target.board for seen in observations], counts),
     )
 

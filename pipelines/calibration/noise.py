@@ -15,11 +15,17 @@ from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.calibration.noise_fit import fit_record
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
+from faintfield.pipelines.console import working
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.noise import CovarianceRecord, NoiseRecord, PhaseRecord, Quantities
 from faintfield.pipelines.formats.results.noise_fit import Measured
-from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, temperature_notes
+from faintfield.pipelines.formats.sets.noise_set import (
+    FILE_NAME,
+    NoiseSet,
+    scene_temperature_warnings,
+    temperature_notes,
+)
 from faintfield.rig.session.session import PLAN
 
 # Black levels of masked pixels and of covered ones differ by less in a sound camera.
@@ -74,7 +80,8 @@ def calibrate_sensor(folder: Path, settings: NoiseSet) -> SensorCalibration:
         A frame cannot be used, or the frames do not determine the noise; the message says what to record.
     """
     readout = read_series(folder, settings)
-    phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
+    with working("fitting noise and response"):
+        phases = [_calibrate_phase(phase, readout.saturation_dn) for phase in readout.phases]
     warmth = {str(folder / frame.file): it for frame in settings.frame if (it := frame.temperature_c) is not None}
     emva = [measure_emva(*of_phase, warmth) for of_phase in zip(readout.phases, phases, strict=True)]
     return SensorCalibration(folder, settings, readout, phases, emva)
@@ -89,6 +96,7 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
         for kind in ("hot", "noisy", "dead")
     }
     temperature_c, warnings = temperature_notes(settings)
+    warnings += scene_temperature_warnings(sensor.folder, settings)
     warnings += [warning for calibration in phases for warning in calibration.warnings]
     means = {name: _mean([c.estimates[name] for c in phases]) for name in phases[0].estimates if _is_quantity(name)}
     return NoiseRecord(
@@ -143,8 +151,23 @@ def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibrati
         calibration = calibrate(phase.series, saturation_dn)
     except CalibrationError as failure:
         raise type(failure)(f"{prefix}{failure}") from failure
-    warnings = [*calibration.warnings, *_black_level_warnings(phase, calibration)]
+    calibration, impossible = _without_impossible_efficiency(calibration)
+    warnings = [*calibration.warnings, *_black_level_warnings(phase, calibration), *impossible]
     return replace(calibration, warnings=tuple(prefix + warning for warning in warnings))
+
+
+def _without_impossible_efficiency(calibration: NoiseCalibration) -> tuple[NoiseCalibration, list[str]]:
+    """Return a calibration without a quantum efficiency that is certainly above 100 %, and a warning if it was."""
+    efficiency = calibration.estimates["quantum_efficiency"]
+    if efficiency.value is None or efficiency.ci95 is None or efficiency.ci95[0] <= 1.0:
+        return calibration, []
+    why = (
+        f"the flats hold {efficiency.value:.4g} electrons per stated photon (95 %: {efficiency.ci95[0]:.4g} to "
+        f"{efficiency.ci95[1]:.4g}; limit 1): the photons, or the pixel area that they were computed with, are wrong, "
+        "or the light is not the one that was measured; correct `photons` (the mean per pixel and exposure)"
+    )
+    estimates = {**calibration.estimates, "quantum_efficiency": Estimate(None, why=why)}
+    return replace(calibration, estimates=estimates), [why]
 
 
 def _black_level_warnings(phase: MosaicPhase, calibration: NoiseCalibration) -> list[str]:

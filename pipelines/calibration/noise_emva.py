@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Estimate, NoiseCalibration, Series
-from faintfield.calib.noise.emva import derived_quantities, gather_inputs
-from faintfield.calib.noise.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
-from faintfield.calib.noise.warmth import dark_current_doubling
+from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
+from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
+from faintfield.calib.noise.emva.warmth import dark_current_doubling
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase
 from faintfield.pipelines.formats.results.noise_emva import EmvaImageRecord, EmvaRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured
@@ -195,8 +195,8 @@ def _dsnu(dark: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Es
 
 def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, Estimate]:
     """Return PRNU as a share of the signal: all of it, and its parts."""
-    if bright is None:
-        why = _NO_PAIR.format("flat") if calibration.saturation.kept else calibration.estimates["prnu"].why
+    if bright is None or calibration.estimates["prnu"].value is None:
+        why = calibration.estimates["prnu"].why or _NO_PAIR.format("flat")
         return {f"prnu_{part.name}": Estimate(None, why=why) for part in fields(Nonuniformity)}
     parts = nonuniformity(bright.values, ~calibration.maps.unusable, bright.noise)
     return {f"prnu_{part.name}": getattr(parts, part.name) for part in fields(parts)}

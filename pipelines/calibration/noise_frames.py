@@ -112,7 +112,13 @@ def _layout(first: Path, settings: NoiseSet) -> Readout:
     period = mosaic_period(mosaic)
     rows, columns = _slices(settings.region, (height, width), period)
     phases = [MosaicPhase((r, c), period, "" if mosaic is None else mosaic[r][c]) for r, c in np.ndindex(*period)]
-    saturation_dn = settings.saturation_dn or frame.saturation_dn or float(np.iinfo(frame.pixels_dn.dtype).max)
+    last_dn = float(np.iinfo(frame.pixels_dn.dtype).max)
+    if settings.saturation_dn and settings.saturation_dn > last_dn:
+        raise BadValue(
+            f"saturation_dn = {settings.saturation_dn:g}; the {frame.pixels_dn.dtype} values of {first} end at "
+            f"{last_dn:g}; state the value from which the converter saturates, or leave it out"
+        )
+    saturation_dn = settings.saturation_dn or frame.saturation_dn or last_dn
     return Readout((width, height), rows, columns, mosaic, saturation_dn, phases)
 
 

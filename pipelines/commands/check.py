@@ -4,14 +4,18 @@ from pathlib import Path
 from typing import Any
 
 from faintfield.pipelines.console import inform
+from faintfield.pipelines.errors import MissingFile
 from faintfield.pipelines.formats.files import require_room, write_json
 from faintfield.pipelines.formats.rig_file import read_rig, read_stage_settings, stage_settings_path
 from faintfield.pipelines.live.guided import changed_settings, needed_bytes, survey_lines
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
+from faintfield.rig.session.changes import check_same_rig, find_changes, present_settings
+from faintfield.rig.session.session import has_session, is_sealed, read_plan
+from faintfield.rig.settings import RigSettings
 
 
-def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
+def check(rig: Path, /, *, remember: bool = False, session: Path | None = None) -> dict[str, Any]:
     """Check a configuration against the rig, without any motion.
 
     Parameters
@@ -20,8 +24,11 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
         The rig.toml.
     remember
         Store the stage's settings beside the file; later checks say what has changed since.
+    session
+        Folder of a session: also say which settings have changed since it was begun, and whether it can be resumed.
     """
     settings = read_rig(rig)
+    since = [] if session is None else _changes_since(session, settings)
     found = survey(open_rig(settings), settings)
     stored = read_stage_settings(rig)
     changed = [] if stored is None else changed_settings(stored, found.stage.settings)
@@ -42,5 +49,26 @@ def check(rig: Path, /, *, remember: bool = False) -> dict[str, Any]:
         "stage": found.stage.firmware,
         "camera": found.camera.name,
         "changed_settings": changed,
+        "changed_since_session": since,
         "warnings": found.stage.warnings,
     }
+
+
+def _changes_since(session: Path, settings: RigSettings) -> list[str]:
+    """Print what has changed since a session was begun or resumed last, and return it.
+
+    Raises
+    ------
+    PlanRefused
+        A setting that the session keeps has changed, so that it cannot be resumed.
+    """
+    if not has_session(session):
+        raise MissingFile(f"{session}: holds no session; name the folder of one that was begun")
+    changes = find_changes(present_settings(session), settings)
+    for change in changes:
+        effect = "the session keeps the old value" if change.frozen else "would apply from the resume on"
+        inform(f"session: {change}; {effect}")
+    check_same_rig(read_plan(session), settings)
+    outcome = "it is complete, nothing is left to capture" if is_sealed(session) else "a resume would be accepted"
+    inform(f"session: {session}: {outcome}; {len(changes) or 'no'} settings differ")
+    return [str(change) for change in changes]

@@ -94,6 +94,9 @@ def _inform_of(measured: MeasuredGeometry, record: GeometryRecord) -> None:
     off_grid = record.stage.node_residual_rms_mm.value
     if off_grid is not None:
         inform(f"nodes lie {off_grid:.3f} mm rms off the regular grid that fits best")
+    for shift in record.homings or ():
+        by = ", ".join(f"{mm:.3f} ± {sigma:.3f}" for mm, sigma in zip(shift.shift_mm, shift.sigma_mm, strict=True))
+        inform(f"homing {shift.after} shifted the cameras by ({by}) mm from those of homing {shift.before}: taken out")
     for warning in (*record.warnings, *record.stage.warnings):
         inform(warning)
     repeatability = record.repeatability

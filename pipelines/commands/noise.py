@@ -5,7 +5,7 @@ from typing import overload
 
 from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
 from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
-from faintfield.pipelines.console import inform
+from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
 from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
@@ -64,14 +64,15 @@ def measure(folder: Path, out: Path | None) -> NoiseRecord:
     folder, settings = load_noise_set(folder)
     out = out or folder
     sensor = calibrate_sensor(folder, settings)
-    pages = {
-        f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
-            calibration, f"{folder.resolve().name} {phase.name}"
-        )
-        for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
-    }
-    record = noise_record(sensor)
-    pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
+    with working("drawing the pages"):
+        pages = {
+            f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
+                calibration, f"{folder.resolve().name} {phase.name}"
+            )
+            for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
+        }
+        record = noise_record(sensor)
+        pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
     record = write_noise(out, record, noise_maps(sensor), pages)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")
@@ -103,7 +104,10 @@ def _inform_of_fit(fit: FitRecord) -> None:
     """Print what the flats say of saturation and response, as far as they do."""
     saturation, error = fit.saturation, fit.linearity_error
     if saturation.level_dn is not None:
-        capacity = "" if fit.saturation_e.value is None else f", mu_e.sat {fit.saturation_e.value:.4g} e⁻"
+        full, capacity = fit.saturation_e, ""
+        if full.value is not None:
+            ends = "" if full.ci95 is None else f" (95 %: {full.ci95[0]:.5g} to {full.ci95[1]:.5g})"
+            capacity = f", mu_e.sat {full.value:.5g} e⁻{ends}"
         inform(f"  saturation: {saturation.level_dn:.5g} DN ({saturation.limit}){capacity}")
     if error.value is not None and error.ci95 is not None:
         low, high = error.ci95

@@ -9,7 +9,7 @@ import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
-from faintfield.pipelines.console import inform
+from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
 from faintfield.pipelines.formats.results.records import REPORT_FILE, Method
@@ -32,6 +32,8 @@ def reconstruct(
     /,
     *,
     out: Path | None = None,
+    depth: Annotated[list[float | Literal["auto"]] | None, Parameter(allow_leading_hyphen=True)] = None,
+    sweep: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None,
     depth_mm: list[float | Literal["auto"]] | None = None,
     sweep_mm: str | None = None,
     disparity_px: list[float] | None = None,
@@ -68,11 +70,17 @@ def reconstruct(
     out
         Folder for the results; planes of the same depth are replaced. By default, for a session, its folder
         reconstructions.
+    depth
+        Depth of a plane in the unit of the set (mm, relative, or px of disparity); repeat it for further planes. auto:
+        find the depths of the objects by comparing the views, in the range of a sweep if given, else in that which
+        the import found, else at all depths that the views share; refused if shuffled views agree as well.
+    sweep
+        FIRST:LAST:COUNT in the unit of the set: COUNT planes in equal steps, with a curve of focus against depth. auto:
+        the range in which the views agree, in steps of half a pixel of the outermost view, at most 96 planes.
     depth_mm
-        Depth of a plane; repeat it for further planes. auto: find the depths of the objects by comparing the views,
-        in the range of --sweep-mm or --sweep-px if given, else at all depths that the views share.
+        Depth of a plane in mm, for sets with a scale; or auto, as above.
     sweep_mm
-        FIRST:LAST:COUNT: COUNT planes in equal steps of depth, with a curve of focus against depth.
+        FIRST:LAST:COUNT in mm, for sets with a scale.
     disparity_px
         Plane by disparity instead of depth: how many pixels a point of the plane moves from one node to the next, right
         or down; negative for near points, unless the pictures are aligned on a nearer plane.
@@ -128,6 +136,7 @@ def reconstruct(
     asked = select_surface(surface, depth_range_mm, disparity_range_px, settings)
     if asked is not None:
         _refuse_beside_surface(
+            depth=depth, sweep=sweep,
             depth_mm=depth_mm, sweep_mm=sweep_mm, disparity_px=disparity_px, sweep_px=sweep_px, plane_pose=plane_pose,
             depth_map=depth_map, method=method, joint=joint, occlusion=occlusion, uncertainty=uncertainty,
             pitch_mm=pitch_mm, workers=workers, scheduler=scheduler,
@@ -136,7 +145,7 @@ def reconstruct(
         return surface_and_report(loaded, out or page_in / SURFACE_FOLDER, asked.resolve(loaded), page_in=page_in)
     runner = make_runner(workers, scheduler)
     selection = select_planes(
-        *(depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
+        *(depth or [], sweep, depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
         depth_map=depth_map,
         methods=selected_methods(method or [], joint=joint, occlusion=occlusion),
         settings=settings,
@@ -157,7 +166,8 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     started = time.monotonic()
     with exclusive(out):
         outcome = reconstruct_set(loaded, out, request, runner)
-        report = write_report(out)
+        with working("writing the report"):
+            report = write_report(out)
     planes = len({record.file for record in outcome.planes})
     inform(f"{planes} plane(s) in {time.monotonic() - started:.1f} s: {report}")
     return msgspec.structs.replace(outcome, report=str(report))
@@ -179,12 +189,13 @@ def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest,
         for folder in dict.fromkeys((page_in, out)):
             locks.enter_context(exclusive(folder))
         record = reconstruct_surface(loaded, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
-        report = write_report(page_in)
+        with working("writing the report"):
+            report = write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     return Outcome(
         out=str(out), report=str(report), planes=[], focus=None, best_focus=None, depth_map=None, metrics=None,
-        surface=record,
+        surface=record, units=loaded.units,
     )  # fmt: skip
 
 

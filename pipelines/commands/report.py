@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from faintfield.pipelines.console import inform
+from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.pages.report import write_report
 
 
@@ -19,6 +19,7 @@ def report(directory: Path, /) -> dict[str, str]:
         Folder with reconstruction.json or surface.json, or whose folders have one: what `reconstruct` wrote,
         or a session.
     """
-    path = write_report(directory)
+    with working("writing the report"):
+        path = write_report(directory)
     inform(f"{path}")
     return {"report": str(path)}

@@ -12,17 +12,18 @@ from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, RE
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
+from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
 from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import (
     DEFAULT_METHOD,
     Request,
     distinct_depths,
     folder_of_method,
-    swept_depths,
 )
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
-from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
+from faintfield.rig.session.changes import present_settings
+from faintfield.rig.session.session import PLAN, has_session, taken_frames
 
 
 def run(
@@ -74,7 +75,7 @@ def run(
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
     swept = swept_depths(sweep_mm) if sweep_mm else []
-    depths = distinct_depths([*(depth_mm or ([] if swept else read_plan(session).rig.scene.depth_mm)), *swept])
+    depths = distinct_depths([*(depth_mm or ([] if swept else present_settings(session).scene.depth_mm)), *swept])
     settings = Settings(penalty_weight, passes)
     relief = select_surface(surface, depth_range_mm, None, settings)
     if not depths and (relief is None or method or pitch_mm):
@@ -96,7 +97,7 @@ def session_steps(
 ) -> list[Step]:
     """Return the steps from a captured session to the planes and the surface that are asked for, in order."""
     # Depths of the rig, not of the request: the geometry stays the same for other planes
-    gated_mm = list(read_plan(session).rig.scene.depth_mm or DEFAULT_DEPTHS_MM)
+    gated_mm = list(present_settings(session).scene.depth_mm or DEFAULT_DEPTHS_MM)
 
     def measure_noise() -> None:
         from faintfield.pipelines.commands.noise import noise  # the fitting is heavy to load, and most runs need none

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
-from faintfield.pipelines.formats.toml_files import read_toml
+from faintfield.pipelines.formats.rig_file import read_rig_tables
 from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
 from faintfield.rig.simulation.controller.firmware import serving
@@ -38,7 +38,7 @@ class Connection:
     Parameters
     ----------
     port
-        Serial device, pyserial URL, or simulated:grbl, simulated:marlin.
+        Serial device, pyserial URL, or simulated:grbl, simulated:grblhal, simulated:marlin.
     protocol
         Firmware of the controller at the port; grbl by default.
     baud
@@ -58,7 +58,7 @@ class Connection:
         if self.rig is not None:
             if stated:
                 raise WrongUsage(f"--rig describes the whole stage; leave out --{stated[0]}, or --rig")
-            return read_toml(self.rig, _RigFile).stage
+            return read_rig_tables(self.rig, _RigFile).stage
         if self.port is None:
             raise WrongUsage(
                 "no stage is named; give --port, such as /dev/ttyUSB0 or simulated:grbl, or --rig rig.toml"
@@ -70,10 +70,11 @@ class Connection:
                 raise WrongUsage(
                     f"--port {self.port}: no such stage is simulated; name one of {', '.join(SIMULATED_FIRMWARE)}"
                 )
+            return StageSettings(protocol="simulated", port=self.port)
         return StageSettings(protocol=self.protocol or "grbl", port=self.port, baud=self.baud or 115200)
 
 
-@app.command(sort_key=1)
+@app.command(sort_key=1, help_epilogue="Example: faintfield stage info --port /dev/ttyUSB0")
 def info(connection: Connection = Connection()) -> Identity:
     """Show firmware, travel and settings of the controller, without moving."""
     with _connected(connection) as stage:
@@ -84,7 +85,7 @@ def info(connection: Connection = Connection()) -> Identity:
         return identity
 
 
-@app.command(sort_key=3)
+@app.command(sort_key=3, help_epilogue="Example: faintfield stage home --rig rig.toml")
 def home(connection: Connection = Connection()) -> Position:
     """Find the homing switches."""
     with _connected(connection) as stage:
@@ -93,7 +94,7 @@ def home(connection: Connection = Connection()) -> Position:
         return homing.position
 
 
-@app.command(sort_key=4)
+@app.command(sort_key=4, help_epilogue="Example: faintfield stage goto 100 50 --home --rig rig.toml")
 def goto(
     x_mm: float,
     y_mm: float,
@@ -121,7 +122,7 @@ def goto(
         return position
 
 
-@app.command(sort_key=2)
+@app.command(sort_key=2, help_epilogue="Example: faintfield stage jog 1 0 --port /dev/ttyUSB0")
 def jog(
     dx_mm: float,
     dy_mm: float,
@@ -146,7 +147,7 @@ def jog(
         return position
 
 
-@app.command(name="test", sort_key=5)
+@app.command(name="test", sort_key=5, help_epilogue="Example: faintfield stage test --port simulated:grbl")
 def conform(connection: Connection = Connection()) -> list[Check]:
     """Test what a capture relies on: limits, speed, repeatability. The stage homes and moves.
 
@@ -172,8 +173,8 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     return checks
 
 
-@app.command(sort_key=6)
-def simulate(protocol: Literal["grbl", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
+@app.command(sort_key=6, help_epilogue="Example: faintfield stage simulate grbl --speed 10")
+def simulate(protocol: Literal["grbl", "grblhal", "marlin"] = "grbl", *, speed: float = 1.0) -> None:
     """Serve a simulated controller on a port for other programs, until Ctrl-C.
 
     Parameters

@@ -90,7 +90,7 @@ def _report_session(folder: Path, verdict: Verdict) -> None:
     for count, what in (
         (len(verdict.left_out), "left out by the operator"),
         (verdict.superseded, "taken again; the earlier files are kept"),
-        (len(verdict.suspect), "kept although the stage lost its scale after them"),
+        (len(verdict.suspect), "kept although no check of the stage confirms them"),
         (len(verdict.interrupted), "of an exposure that was interrupted, which is no damage; run capture again"),
     ):
         if count:

@@ -6,7 +6,7 @@ from faintfield.pipelines.pages.napari_layers import show_planes
 
 
 def view(directory: Path, /) -> dict[str, list[str]]:
-    """Open the planes of a folder in napari, if it is installed: in millimetres, on one grey scale.
+    """Open the planes of a folder in napari, if it is installed: in the units of the set, on one grey scale.
 
     A few planes are one layer each; a sweep in equal steps is one layer per method, with a slider over depth.
 

@@ -14,6 +14,7 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import UnreadableImage
+from faintfield.pipelines.formats.limits import MAX_FRAME_BYTES
 from faintfield.rig.session.regular_files import read_all
 
 # Takes width and height in px and the size in bytes of a picture when it is decoded; raises if it is too large.
@@ -38,6 +39,9 @@ _DEFLATE_RATIO, _UNTESTED_BYTES = 1032, 300_000_000
 # What a file may have in bytes besides its pixels: its header, and a picture of its own.
 OVERHEAD_BYTES = 64_000_000
 
+# Pictures in one TIFF: more than any grid of cameras has nodes.
+_MAX_PAGES = 100_000
+
 # A JPEG has some ten segments and fill bytes before its picture.
 _MAX_SEGMENTS = 10_000
 
@@ -48,8 +52,17 @@ _NO_SPECIAL_KIND: dict[str, Any] = {f"is_{kind}": False for kind in ("lsm", "ndp
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 
-def decode_tiff(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any]:
+def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | None = None) -> NDArray[Any]:
     """Return the picture of a TIFF; compressions for which tifffile needs extra packages are decoded by OpenCV.
+
+    Parameters
+    ----------
+    file, path
+        The file, and its name for messages.
+    accept : callable
+        Raises if the picture is too large.
+    number : int, optional
+        Which picture of a stack; without it the file must hold one.
 
     Raises
     ------
@@ -57,16 +70,42 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept) -> NDArray[Any
         Of any type, when the file is damaged, or `accept` refuses its size.
     """
     with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
-        page = tiff.pages.first
-        if page.dtype is None:
+        page = tiff.pages.first if number is None else tiff.pages[number]
+        if page.dtype is None or not isinstance(page, tifffile.TiffPage):
             raise ValueError("its pixels are of no known type")
         accept(page.imagewidth, page.imagelength, page.nbytes)
         if page.compression in _OWN_COMPRESSIONS:
-            _require_one_page(tiff, path)
+            if number is None:
+                _require_one_page(tiff, path)
             _require_honest_strips(page, file)
             return np.asarray(page.asarray())
     file.seek(0)
-    return _with_opencv(read_all(file, page.nbytes + OVERHEAD_BYTES))
+    if number is None:
+        return decode_with_opencv(read_all(file, page.nbytes + OVERHEAD_BYTES))
+    return _page_with_opencv(read_all(file, MAX_FRAME_BYTES), number)
+
+
+def count_pages(file: BufferedReader) -> int:
+    """Return how many pictures of the first one's size and type a TIFF holds from its beginning, at most 100 000.
+
+    Raises
+    ------
+    Exception
+        Of any type, when the file is damaged.
+    """
+    with tifffile.TiffFile(file, name="frame", **_NO_SPECIAL_KIND) as tiff:
+        first, count = tiff.pages.first, 1
+        while count < _MAX_PAGES:
+            try:
+                page = tiff.pages[count]
+            except IndexError:
+                break
+            if (page.shape, page.dtype) != (first.shape, first.dtype):
+                if any((it.shape, it.dtype) == (first.shape, first.dtype) for it in tiff.pages[count + 1 : _MAX_PAGES]):
+                    raise ValueError(f"picture {count + 1} has another size or type than those around it")
+                break
+            count += 1
+        return count
 
 
 def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
@@ -87,7 +126,7 @@ def decode_photo(file: BufferedReader, accept: Accept) -> NDArray[Any]:
     content = read_all(file, size_bytes + OVERHEAD_BYTES)
     if _END_MARKS[mark] not in content[-1024:] or (mark is _PNG and not _sound_png(content)):
         raise ValueError("not an image, or truncated")
-    return _with_opencv(content)
+    return decode_with_opencv(content)
 
 
 def _require_one_page(tiff: tifffile.TiffFile, path: Path) -> None:
@@ -98,7 +137,10 @@ def _require_one_page(tiff: tifffile.TiffFile, path: Path) -> None:
     except IndexError:
         return
     if (second.shape, second.dtype) == (first.shape, first.dtype):
-        raise UnreadableImage(f"{path}: holds several pictures of one size; export one to a file of its own")
+        raise UnreadableImage(
+            f"{path}: holds several pictures of one size; export one to a file of its own, or, if they are views of a "
+            "grid, name this file in `faintfield import grid`"
+        )
 
 
 def _require_honest_strips(page: tifffile.TiffPage, file: BufferedReader) -> None:
@@ -139,15 +181,30 @@ def _jpeg_size(file: BufferedReader) -> tuple[int, int, int]:
     raise ValueError("its picture does not begin")
 
 
-def _with_opencv(content: bytes) -> NDArray[Any]:
+def decode_with_opencv(content: bytes) -> NDArray[Any]:
     """Return the picture of a file's content, decoded by OpenCV."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # the failure below says it in one line
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise ValueError("not an image, or truncated")
+    return _in_rgb(np.asarray(pixels))
+
+
+def _page_with_opencv(content: bytes, number: int) -> NDArray[Any]:
+    """Return one picture of a stack, decoded by OpenCV."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    buffer = np.frombuffer(content, np.uint8)
+    done, pages = cv2.imdecodemulti(buffer, cv2.IMREAD_UNCHANGED, None, (number, number + 1))
+    if not done or len(pages) != 1:
+        raise ValueError(f"picture {number} of the stack cannot be decoded")
+    return _in_rgb(np.asarray(pages[0]))
+
+
+def _in_rgb(pixels: NDArray[Any]) -> NDArray[Any]:
+    """Return a picture of OpenCV, whose colours are blue, green, red, in our order."""
     if pixels.ndim == 3 and pixels.shape[2] >= 3:
-        pixels = cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB)
-    return np.asarray(pixels)
+        pixels = np.asarray(cv2.cvtColor(pixels[:, :, :3], cv2.COLOR_BGR2RGB))
+    return pixels
 
 
 def _sound_png(content: bytes) -> bool:

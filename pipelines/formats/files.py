@@ -17,6 +17,7 @@ import msgspec
 
 from faintfield.pipelines.errors import CannotWrite, DiskFull, MissingFile, OutputBusy, OutputExists
 from faintfield.pipelines.formats.digests import with_digest
+from faintfield.pipelines.formats.units import json_of
 from faintfield.rig.session import durable, regular_files
 
 # Error numbers of a full disk; numpy reports a short write of an array without a number.
@@ -76,8 +77,8 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def write_record(path: Path, record: msgspec.Struct) -> None:
-    """Write the record of a result as JSON with its own digest, whole or not at all."""
-    write_whole(path, with_digest(msgspec.json.encode(record)))
+    """Write the record of a result as JSON in its units, with its own digest, whole or not at all."""
+    write_whole(path, with_digest(json_of(record)))
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, and raw files with their colour mosaic."""
+"""Image files that are read, with the sensor's own values: TIFF, PNG, JPEG, others, and raw files with their mosaic."""
 
 import contextlib
 import logging
@@ -12,16 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import MAX_PIXELS, MAX_SIDE_PX
-from faintfield.pipelines.errors import InputError, MissingFile, UnreadableImage, WrongSize
-from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, decode_photo, decode_tiff
+from faintfield.pipelines.errors import InputError, MissingFile, UnknownFormat, UnreadableImage, WrongSize
+from faintfield.pipelines.formats.decoders import OVERHEAD_BYTES, Accept, count_pages, decode_photo, decode_tiff
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_FRAME_BYTES
+from faintfield.pipelines.formats.plain_decoders import NETPBM_SUFFIXES, decode_bmp, decode_exr, decode_netpbm
 from faintfield.pipelines.formats.reading import is_file, opened
 from faintfield.rig.session.regular_files import require_size
 
 TIFF_SUFFIXES = {".tif", ".tiff"}
 PHOTO_SUFFIXES = {".png", ".jpg", ".jpeg"}
 RAW_SUFFIXES = {".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".rw2", ".orf", ".pef", ".srw", ".3fr", ".iiq"}
-IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | RAW_SUFFIXES
+PLAIN_SUFFIXES = NETPBM_SUFFIXES | {".bmp", ".exr"}
+IMAGE_SUFFIXES = TIFF_SUFFIXES | PHOTO_SUFFIXES | PLAIN_SUFFIXES | RAW_SUFFIXES
 
 # Complaints about damaged EXIF are dropped: such a file states no exposure.
 logging.getLogger("exifread").addHandler(logging.NullHandler())
@@ -91,7 +93,13 @@ class Frame:
     exposure_s: float | None = None
 
 
-def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: str = "the camera") -> Frame:
+def read_frame(
+    path: Path,
+    expected_px: tuple[int, int] | None = None,
+    *,
+    of: str = "the camera",
+    page: int | None = None,
+) -> Frame:
     """Read one image file, after the size that its header states was compared with what is expected.
 
     Parameters
@@ -102,6 +110,8 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
         Width and height that it must have.
     of : str
         Whose size that is, for the message.
+    page : int, optional
+        Which picture of a TIFF that holds several; without it, a file holds one.
 
     Raises
     ------
@@ -109,6 +119,8 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
         There is no such file, or it cannot be opened.
     WrongSize
         The file does not have the size that is expected.
+    UnknownFormat
+        Files of this kind cannot be decoded here; so does a raw file whose beginning is damaged.
     UnreadableImage
         The file cannot be decoded, is truncated, has no pixels, or is larger than any that is read.
     """
@@ -117,7 +129,7 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
     suffix = path.suffix.lower()
     if suffix not in IMAGE_SUFFIXES:
         readable = ", ".join(sorted(IMAGE_SUFFIXES))
-        raise UnreadableImage(f"{path}: '{suffix}' is not a format that is read; use one of {readable}")
+        raise UnknownFormat(f"{path}: '{suffix}' is not a format that is read; use one of {readable}")
 
     def accept(width: int, height: int, size_bytes: int) -> None:
         _require_sane_size(path, width, height, size_bytes)
@@ -127,11 +139,15 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
                 "take it again with the same settings, or correct the size that is stated"
             )
 
-    most = MAX_FRAME_BYTES if expected_px is None else expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
+    most = (
+        MAX_FRAME_BYTES
+        if expected_px is None or page is not None
+        else expected_px[0] * expected_px[1] * _MAX_PIXEL_BYTES
+    )
     with opened(path) as file:
         try:
             require_size(file, most + OVERHEAD_BYTES)  # decoders read what a header states before they tell its size
-            frame = _decoded(file, path, suffix, accept)
+            frame = _decoded(file, path, suffix, accept, page)
         except InputError:
             raise
         except Exception as failure:  # decoders raise exceptions of a dozen types
@@ -146,6 +162,23 @@ def read_frame(path: Path, expected_px: tuple[int, int] | None = None, *, of: st
     return frame
 
 
+def pages_in(path: Path) -> int:
+    """Return how many pictures of one size and type a file holds, one after the other; 1 for all files but TIFF.
+
+    Raises
+    ------
+    MissingFile, UnreadableImage
+        The file cannot be opened, or is damaged.
+    """
+    if path.suffix.lower() not in TIFF_SUFFIXES:
+        return 1
+    with opened(path) as file:
+        try:
+            return count_pages(file)
+        except Exception as failure:  # tifffile raises exceptions of a dozen types
+            raise UnreadableImage(_cannot_decode(path, str(failure))) from failure
+
+
 def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> None:
     """Refuse a picture without pixels, and one that is larger than any camera takes."""
     if not min(width, height) > 0:
@@ -157,12 +190,21 @@ def _require_sane_size(path: Path, width: int, height: int, size_bytes: int) -> 
         )
 
 
-def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept) -> Frame:
+def _decoded(file: BufferedReader, path: Path, suffix: str, accept: Accept, page: int | None) -> Frame:
     """Return the frame in a file; decoders raise exceptions of any type."""
     if suffix in RAW_SUFFIXES:
         return _read_raw(file, path, accept)
-    pixels = decode_tiff(file, path, accept) if suffix in TIFF_SUFFIXES else decode_photo(file, accept)
-    return Frame(pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels)
+    saturation_dn = None
+    if suffix in NETPBM_SUFFIXES:
+        pixels, saturation_dn = decode_netpbm(file, path, accept)
+    elif suffix == ".bmp":
+        pixels = decode_bmp(file, accept)
+    elif suffix == ".exr":
+        pixels = decode_exr(file, path, accept)
+    else:
+        pixels = decode_tiff(file, path, accept, page) if suffix in TIFF_SUFFIXES else decode_photo(file, accept)
+    pixels = pixels[:, :, :3] if pixels.ndim == 3 and pixels.shape[2] == 4 else pixels
+    return Frame(pixels, saturation_dn=saturation_dn)
 
 
 def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
@@ -183,7 +225,10 @@ def _read_raw(file: BufferedReader, path: Path, accept: Accept) -> Frame:
             black_dn = _masked_black_dn(raw, mosaic_period(mosaic))
             saturation_dn = float(raw.white_level)
     except rawpy.LibRawError as failure:
-        raise ValueError(failure.args[0].decode() if isinstance(failure.args[0], bytes) else failure) from failure
+        reason = failure.args[0].decode() if isinstance(failure.args[0], bytes) else str(failure)
+        if isinstance(failure, rawpy.LibRawFileUnsupportedError):
+            raise UnknownFormat(_cannot_decode(path, reason)) from failure
+        raise ValueError(reason) from failure
     return Frame(pixels, mosaic, black_dn, saturation_dn, exif_exposure_s(path))
 
 

@@ -1,6 +1,7 @@
 """Image files that are written: 16-bit frames, float planes with their scale, and previews."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,39 @@ type Picture = NDArray[np.uint8]
 _FILM_QUALITY = 80
 
 
-def write_frame(path: Path, pixels: NDArray[Any]) -> None:
-    """Write a frame (row, column[, colour]) as TIFF of its own data type, losslessly compressed."""
+def write_frame(path: Path, pixels: NDArray[Any], *, few_values: bool = False) -> None:
+    """Write a frame (row, column[, colour]) as TIFF of its own data type, losslessly compressed.
+
+    Frames of few different values, such as those that had 8 bits, compress best as they are, and fast.
+    """
+    how: dict[str, Any] = {"compressionargs": {"level": 1}} if few_values else {"predictor": True}
     with writing(path) as file:
         photometric = "rgb" if pixels.ndim == 3 else "minisblack"
-        tifffile.imwrite(file, pixels, compression="zlib", predictor=True, photometric=photometric)
+        tifffile.imwrite(file, pixels, compression="zlib", photometric=photometric, **how)
 
 
-def write_plane(path: Path, plane: NDArray[np.floating], pitch_mm: float) -> None:
+@dataclass(frozen=True)
+class Spacing:
+    """The distance of the samples of a plane, in mm or else in a unit that TIFF has no name for."""
+
+    pitch: float
+    in_mm: bool = True
+
+
+# Of maps whose samples are a constant angle apart, one detector pixel.
+ONE_PIXEL = Spacing(1.0, in_mm=False)
+
+
+def write_plane(path: Path, plane: NDArray[np.floating], spacing: Spacing) -> None:
     """Write a plane (row, column[, colour]) as float32 TIFF whose resolution tags give its pitch."""
-    per_cm = 10.0 / pitch_mm
+    resolution = (10.0 if spacing.in_mm else 1.0) / spacing.pitch
     with writing(path) as file:
         tifffile.imwrite(
             file,
             plane.astype(np.float32),
             photometric="rgb" if plane.ndim == 3 else "minisblack",
-            resolution=(per_cm, per_cm),
-            resolutionunit="CENTIMETER",
+            resolution=(resolution, resolution),
+            resolutionunit="CENTIMETER" if spacing.in_mm else "NONE",
         )
 
 

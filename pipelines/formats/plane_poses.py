@@ -136,8 +136,3 @@ def _turn_to(normal: NDArray[np.float64]) -> _Three:
 def depth_of(place: Place) -> float:
     """Return the depth in mm at which the axis of the reference camera meets a plane."""
     return place.depth_mm if isinstance(place, TiltedPlane) else place
-
-
-def words_of(place: Place) -> str:
-    """Return the name of a plane in messages."""
-    return f"'{place.name}'" if isinstance(place, TiltedPlane) else f"{place:g} mm"

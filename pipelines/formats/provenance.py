@@ -4,8 +4,12 @@ import platform
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
 
 import msgspec
+from msgspec import UNSET, UnsetType
+
+from faintfield.pipelines.formats.units import StatedUnits, record_of
 
 _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-headless", "mrcal", "casadi")
 
@@ -15,6 +19,8 @@ class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes
     ----------
+    units : StatedUnits, optional
+        The units of a result that is made of an elemental set.
     command : str
         The name of the command.
     options : mapping or msgspec.Struct
@@ -25,15 +31,22 @@ class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
         Of Python and the packages that compute results.
     """
 
+    units: StatedUnits | UnsetType = UNSET
     command: str
     options: Options
     inputs: dict[str, str]
     versions: dict[str, str]
 
+    def parts(self) -> dict[str, Any]:
+        """Return what is recorded, by name."""
+        return {name: part for name, part in msgspec.structs.asdict(self).items() if part is not UNSET}
 
-def provenance[Options](command: str, options: Options, inputs: dict[str, str]) -> Provenance[Options]:
+
+def provenance[Options](
+    command: str, options: Options, inputs: dict[str, str], units: StatedUnits | UnsetType = UNSET
+) -> Provenance[Options]:
     """Return the provenance of a result that is made now."""
-    return Provenance(command=command, options=options, inputs=inputs, versions=versions())
+    return Provenance(units=units, command=command, options=options, inputs=inputs, versions=versions())
 
 
 def versions() -> dict[str, str]:
@@ -60,7 +73,7 @@ def first_difference[Options](content: bytes, now: Provenance[Options]) -> str |
     msgspec.MsgspecError, UnicodeDecodeError, RecursionError
         The file is damaged.
     """
-    record = msgspec.json.decode(content, type=dict[str, object])
+    record = record_of(content, dict[str, object])
     written = msgspec.convert(record.get("provenance") or record, Provenance[dict[str, object]])
     now_options: dict[str, object] = msgspec.json.decode(msgspec.json.encode(now.options))
     compared: tuple[tuple[str, Mapping[str, object], Mapping[str, object]], ...] = (

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.digests import DIGEST_KEY, digest_holds
+from faintfield.pipelines.formats.units import record_of
 from faintfield.rig.session.regular_files import open_regular, read_regular
 
 # Size in bytes up to which a file of text, settings or records is read. The largest that faintfield writes, the record
@@ -121,7 +122,7 @@ def read_json[T](path: Path, kind: type[T], *, what: str, remedy: str) -> T:
     """
     content = read_content(path)
     try:
-        record = msgspec.json.decode(content, type=kind)
+        record = record_of(content, kind)
         altered = digest_holds(content) is False
     except JSON_FAILURES as failure:
         raise BadValue(f"{path}: is not {what} ({failure}); {remedy}") from failure

@@ -5,18 +5,30 @@ from pathlib import Path
 
 from faintfield.pipelines.formats.reading import is_file, read_json
 from faintfield.pipelines.formats.toml_files import read_toml
+from faintfield.rig.errors import UnknownPlugin
+from faintfield.rig.plugins import fold_plugins
 from faintfield.rig.settings import RigSettings
 
 
 def read_rig(path: Path) -> RigSettings:
-    """Read a rig.toml.
+    """Read a rig.toml; raises as `read_rig_tables` does."""
+    return read_rig_tables(path, RigSettings)
+
+
+def read_rig_tables[T](path: Path, kind: type[T]) -> T:
+    """Read a rig.toml, or those of its tables that `kind` has.
 
     Raises
     ------
     MissingFile, BadValue, UnknownKey
         The file cannot be used; the message names the file and the key.
+    UnknownPlugin
+        It names a driver that is neither built in nor installed.
     """
-    return read_toml(path, RigSettings)
+    try:
+        return read_toml(path, kind, fold_plugins)
+    except UnknownPlugin as failure:
+        raise UnknownPlugin(f"{path}: {failure}") from None
 
 
 def rig_template() -> str:

@@ -2,6 +2,7 @@
 
 import difflib
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,17 @@ _MAX_TOML_BYTES = 8_000_000
 _LONG_KEY = re.compile(rb"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){32}""")
 
 
-def read_toml[T](path: Path, kind: type[T]) -> T:
+def read_toml[T](path: Path, kind: type[T], prepare: Callable[[Any], Any] = lambda content: content) -> T:
     """Read a TOML file into `kind`, a msgspec Struct that forbids unknown fields.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : type
+        The Struct.
+    prepare : callable
+        Gives the file's tables the form that `kind` has.
 
     Raises
     ------
@@ -40,9 +50,10 @@ def read_toml[T](path: Path, kind: type[T]) -> T:
     content = _decoded(path)
     _require_finite(path, content)
     try:
-        return msgspec.convert(content, kind)
+        return msgspec.convert(prepare(content), kind)
     except msgspec.ValidationError as failure:
-        raise _failure_of(path, str(failure), kind) from None
+        message = str(failure).replace(" | null`", "`")  # None is a key left out: TOML has no null
+        raise _failure_of(path, message, kind) from None
 
 
 def _decoded(path: Path) -> Any:

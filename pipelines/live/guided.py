@@ -10,7 +10,7 @@ from types import FrameType
 import numpy as np
 
 from faintfield.pipelines.console import console, inform, progress
-from faintfield.pipelines.errors import InputError
+from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.panel import CapturePanel
@@ -20,9 +20,10 @@ from faintfield.rig.capture.guide import format_duration
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import Survey, survey
 from faintfield.rig.devices import is_simulated, open_rig
-from faintfield.rig.errors import CaptureStopped
+from faintfield.rig.errors import CameraError, CaptureStopped
 from faintfield.rig.plan import CapturePlan
-from faintfield.rig.session.resume import check_same_rig, open_session
+from faintfield.rig.session.changes import adopt_settings, check_same_rig
+from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan, has_session, is_sealed, read_plan
 from faintfield.rig.settings import RigSettings
 from faintfield.rig.stages.protocol import StageSettings
@@ -57,6 +58,8 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
     panel = CapturePanel(unattended=unattended)
     with ExitStack() as stack:
         session = stack.enter_context(open_session(folder, frozen, lambda frames: progress(list(frames), "comparing")))
+        for change in adopt_settings(session, settings):
+            inform(f"{folder}: {change}, from now on")
         before = len(session.valid())
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
@@ -64,7 +67,7 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
             _open_page(panel, stack)
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
-        Capture(session, open_rig(settings, session.journal), panel, read_pixels).run()
+        Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
         taken = len(session.valid()) - before
     inform(f"{folder}: complete, {taken} frames taken; faintfield verify {folder} compares every byte")
     return taken
@@ -101,12 +104,22 @@ def _open_page(panel: CapturePanel, stack: ExitStack) -> None:
 
 
 def read_pixels(path: Path) -> Pixels | None:
-    """Return the pixels of a frame's file, None if it cannot be decoded or holds what is no number."""
+    """Return the pixels of a frame's file, None if files of its kind cannot be decoded here.
+
+    Raises
+    ------
+    CameraError
+        The file is truncated or damaged, or holds what is no number.
+    """
     try:
         pixels_dn = read_frame(path).pixels_dn
-    except InputError:
+    except UnknownFormat:
         return None
-    return pixels_dn if np.isfinite(pixels_dn).all() else None
+    except InputError as failure:
+        raise CameraError(str(failure)) from failure
+    if not np.isfinite(pixels_dn).all():
+        raise CameraError(f"{path}: holds values that are no numbers; let the camera's program save integers")
+    return pixels_dn
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from faintfield.pipelines.pages.page import INK, ink, svg
+from faintfield.pipelines.pages.symbols import mathtext
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,8 +38,11 @@ def drawn(title: str, caption: str, draw: "Callable[[Axes], None]") -> Drawing:
     draw(axes)
     _few_ticks(axes)
     ink(axes)
+    axes.set(xlabel=mathtext(axes.get_xlabel()), ylabel=mathtext(axes.get_ylabel()))
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(frameon=False, labelcolor=INK, fontsize=9)
+        legend = axes.legend(frameon=False, labelcolor=INK, fontsize=9)
+        for text in legend.get_texts():
+            text.set_text(mathtext(text.get_text()))
     return Drawing(title, caption, svg(figure))
 
 

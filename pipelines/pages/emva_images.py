@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from faintfield.calib.noise.nonuniformity import accumulated_histogram, high_pass, spectrogram
+from faintfield.calib.noise.emva.nonuniformity import accumulated_histogram, high_pass, spectrogram
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, MeanImage
 from faintfield.pipelines.pages.emva_drawing import MEASURED, MODEL, SECOND, Drawing, drawn
 

@@ -1,13 +1,15 @@
 """The page `emva1288_report.html`: the report of a sensor by EMVA 1288 release 4.0."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from faintfield.calib.noise import Estimate
+from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.formats.results.noise import STANDARD, NoiseRecord
+from faintfield.pipelines.pages import symbols
 from faintfield.pipelines.pages.emva_drawing import Drawing
 from faintfield.pipelines.pages.emva_plots import drawings
 from faintfield.pipelines.pages.page import template
@@ -21,6 +23,7 @@ _TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
         (
             ("quantum_efficiency", "η", "quantum efficiency", "%", 100.0),
             ("gain_dn_per_e", "K", "system gain", "DN/e⁻", 1.0),
+            ("gain_e_per_dn", "1/K", "inverse of it", "e⁻/DN", 1.0),
             ("responsivity_dn_per_photon", "R", "responsivity", "DN/photon", 1.0),
         ),
     ),
@@ -30,6 +33,7 @@ _TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
             ("read_noise_e", "σ_d(0)", "at zero exposure", "e⁻", 1.0),
             ("dark_noise_e", "σ_d", "at the exposure stated above", "e⁻", 1.0),
             ("read_noise_dn", "K σ_d(0)", "at zero exposure, without rounding", "DN", 1.0),
+            ("dark_noise_dn", "σ_y.dark(0)", "at zero exposure, with rounding", "DN", 1.0),
         ),
     ),
     (
@@ -47,6 +51,7 @@ _TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
         "Nonuniformity",
         (
             ("dsnu_total_e", "DSNU", "dark signal, all", "e⁻", 1.0),
+            ("dsnu_total_dn", "DSNU", "dark signal, all", "DN", 1.0),
             ("dsnu_row_e", "DSNU.row", "its row part", "e⁻", 1.0),
             ("dsnu_column_e", "DSNU.col", "its column part", "e⁻", 1.0),
             ("dsnu_pixel_e", "DSNU.pixel", "its pixel part", "e⁻", 1.0),
@@ -56,7 +61,18 @@ _TABLE: tuple[tuple[str, tuple[tuple[str, str, str, str, float], ...]], ...] = (
             ("prnu_pixel", "PRNU.pixel", "its pixel part", "%", 100.0),
         ),
     ),
-    ("Linearity", (("linearity_error", "LE", "mean absolute deviation, 5 to 95 % of saturation", "%", 100.0),)),
+    (
+        "Linearity",
+        (
+            (
+                "linearity_error",
+                "LE",
+                "mean absolute deviation of the fitted response, 5 to 95 % of saturation",
+                "%",
+                100.0,
+            ),
+        ),
+    ),
     (
         "Dark current",
         (
@@ -95,12 +111,13 @@ class Part:
 def emva_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
     """Return the page about a sensor, with one part for each phase of its mosaic."""
     parts = [Part(one.name, one, table_of(one), drawings(one)) for one in measured]
-    return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD)
+    return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD, sub=symbols.html)
 
 
 def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
     """Return the table in groups; a reason that holds for several quantities is given once."""
     known = {**measured.calibration.estimates, **measured.estimates}
+    known |= _in_other_units(known)
     told: dict[str, str] = {}
     groups = []
     for title, rows in _TABLE:
@@ -110,6 +127,25 @@ def table_of(measured: EmvaMeasurement) -> list[tuple[str, list[Line]]]:
                 lines += [_ratio_line(known[key], symbol, words, *way) for way in _WAYS]
         groups.append((title, lines))
     return groups
+
+
+def _in_other_units(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
+    """Return 1/K, the dark noise with that of rounding, and DSNU in DN."""
+    gain = known["gain_dn_per_e"].value or 0.0
+    return {
+        "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda it: 1 / it),
+        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda it: float(np.sqrt(it**2 + ROUNDING_DN2))),
+        # DSNU in electrons is that in DN over K, whose own error is not in its interval
+        "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda it: it * gain),
+    }
+
+
+def _mapped(known: Estimate, of: Callable[[float], float]) -> Estimate:
+    """Return a monotonic function of an estimate."""
+    if known.value is None or known.ci95 is None:
+        return known
+    low, high = sorted(of(end) for end in known.ci95)
+    return Estimate(of(known.value), None, (low, high))
 
 
 def _decibels(ratio: float) -> float:
@@ -131,7 +167,7 @@ def _ratio_line(known: Estimate, symbol: str, words: str, unit: str, of: Callabl
     assert known.ci95 is not None
     low, high = (of(end) for end in known.ci95)
     value, interval = rounded(of(known.value), (low, high))
-    return Line(f"{symbol}.{unit}", words, value, interval, unit)
+    return Line(symbol, words, value, interval, unit)
 
 
 def _line(known: Estimate, symbol: str, words: str, unit: str, factor: float, told: dict[str, str]) -> Line:
@@ -151,6 +187,8 @@ def rounded(value: float, ends: tuple[float, float] | None) -> tuple[str, str]:
         return f"{value:.4g}".replace("-", "−"), ""
     half = (ends[1] - ends[0]) / 2
     scale = half if half > 0 else 1e-4 * abs(value) or 1.0
-    digits = int(np.clip(1 - np.floor(np.log10(scale)), 0, 8))
-    low, at, high = (f"{number:.{digits}f}".replace("-", "−") for number in (ends[0], value, ends[1]))
+    digits = int(np.clip(1 - np.floor(np.log10(scale)), -8, 8))
+    low, at, high = (
+        f"{round(number, digits):.{max(digits, 0)}f}".replace("-", "−") for number in (ends[0], value, ends[1])
+    )
     return at, f"{low} … {high}"

@@ -7,12 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Series
-from faintfield.calib.noise.emva import ROUNDING_DN2, snr
-from faintfield.calib.noise.response import known_light
+from faintfield.calib.noise.emva.quantities import snr
+from faintfield.calib.noise.likelihood.response import known_light
+from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement
 from faintfield.pipelines.pages.emva_drawing import MEASURED, MODEL, SECOND, Drawing, drawn
 from faintfield.pipelines.pages.emva_images import image_drawings
 from faintfield.pipelines.pages.page import INK
+from faintfield.pipelines.pages.symbols import mathtext
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -177,9 +179,11 @@ def _linearity(measured: EmvaMeasurement) -> Drawing:
         axes.set(xlabel=f"{light[1]} ({light[2]})", ylabel="deviation (%)")
 
     caption = (
-        "From the straight line a₀ + a₁ μ_p that minimizes the squares of relative deviations, within 5 to 95 % of "
+        "Of each measured level, its own error included, from the straight line a₀ + a₁ μ_p that minimizes the squares "
+        "of relative deviations, within 5 to 95 % of saturation (of the brightest flat, if none is saturated). LE in "
+        "the table is the mean of those of the fitted response, which has no errors of single levels."
     )
-    return drawn(title, caption + "saturation (of the brightest flat, if none is saturated).", draw)
+    return drawn(title, caption, draw)
 
 
 def _snr(measured: EmvaMeasurement) -> Drawing:
@@ -214,7 +218,9 @@ def _snr(measured: EmvaMeasurement) -> Drawing:
                 axes.axvline(at * per_e, color=INK, lw=0.6, ls="-.")
                 side = {"ha": "right", "xytext": (-3, 3)} if label == "sat" else {"ha": "left", "xytext": (3, 3)}
                 place = (at * per_e, 0.3)
-                axes.annotate(f"{name[:3]}.{label}", place, textcoords="offset points", color=INK, fontsize=9, **side)
+                axes.annotate(
+                    mathtext(f"{name[:3]}.{label}"), place, textcoords="offset points", color=INK, fontsize=9, **side
+                )
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="SNR")
         axes.set_ylim(bottom=0.3)
 

@@ -1,4 +1,4 @@
-"""Planes of a folder as layers of napari, in millimetres and on one grey scale."""
+"""Planes of a folder as layers of napari, in the units of their set and on one grey scale."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,10 +15,15 @@ from faintfield.pipelines.formats.image_files import white_level
 from faintfield.pipelines.formats.results.records import PlaneRecord, ReconstructionRecord
 from faintfield.pipelines.formats.results.stacks import planes_in_order, stack_scale
 from faintfield.pipelines.formats.results.surface import planes_below
+from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.report_planes import method_title
 
 # Planes at fewer depths than this are a layer each; more, in equal steps, are one layer with a slider.
 _MIN_DEPTHS_OF_A_STACK = 3
+
+
+# Names of units of length in napari, for which one without a name is a pixel.
+_UNITS = {"mm": "mm", "px": "pixel", "": "pixel"}
 
 
 @dataclass(frozen=True)
@@ -72,33 +77,38 @@ def _layers(directory: Path, folder: Path, result: ReconstructionRecord) -> list
     method = result.planes[0].method
     where = folder.relative_to(directory).as_posix()
     name = method_title(result.planes) + (f", {where}" if where not in (".", method) else "")
-    step_mm = stack_scale(planes).step_mm if len(planes) >= _MIN_DEPTHS_OF_A_STACK else None
+    units = units_of(result)
+    step_mm = stack_scale(planes, units).step_mm if len(planes) >= _MIN_DEPTHS_OF_A_STACK else None
     if step_mm is not None and len({record.shape for record in planes}) == 1:
-        layers = [_stack_layer(folder, planes, name, step_mm)]
+        layers = [_stack_layer(folder, planes, name, step_mm, units)]
     else:
-        layers = [_plane_layer(folder, plane, f"{name}, {plane.depth_mm:g} mm") for plane in planes]
-    return layers + [_plane_layer(folder, plane, f"{name}, {plane.name}") for plane in tilted]
+        layers = [
+            _plane_layer(folder, plane, f"{name}, {units.depths_text([plane.depth_mm])}", units) for plane in planes
+        ]
+    return layers + [_plane_layer(folder, plane, f"{name}, {plane.name}", units) for plane in tilted]
 
 
-def _plane_layer(folder: Path, plane: PlaneRecord, name: str) -> Layer:
+def _plane_layer(folder: Path, plane: PlaneRecord, name: str, units: StatedUnits) -> Layer:
     """Return one plane as a layer."""
     pixels = _pixels(folder, plane)
-    (x_mm, y_mm), pitch_mm = plane.origin_mm, plane.pitch_mm
-    return Layer(pixels, name, pixels.ndim == 3, (pitch_mm, pitch_mm), (y_mm, x_mm), ("mm", "mm"), ("y", "x"))
+    (x, y), pitch = plane.origin_mm, plane.pitch_mm
+    unit = _UNITS[units.length]
+    return Layer(pixels, name, pixels.ndim == 3, (pitch, pitch), (y, x), (unit, unit), ("y", "x"))
 
 
-def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float) -> Layer:
+def _stack_layer(folder: Path, planes: Sequence[PlaneRecord], name: str, step_mm: float, units: StatedUnits) -> Layer:
     """Return planes at equal steps of depth as one layer."""
     pixels = np.stack([_pixels(folder, plane) for plane in planes])
-    scale = stack_scale(planes)
+    scale = stack_scale(planes, units)
+    across = _UNITS.get(scale.unit, scale.unit)
     return Layer(
         data=pixels,
         name=name,
         rgb=pixels.ndim == 4,
         scale=(step_mm, scale.across, scale.across),
         translate=(planes[0].depth_mm, scale.origin[1], scale.origin[0]),
-        units=("mm", scale.unit, scale.unit),
-        axis_labels=("depth", "y", "x"),
+        units=(_UNITS[units.length], across, across),
+        axis_labels=(units.quantity, "y", "x"),
     )
 
 

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from faintfield.pipelines.formats.units import StatedUnits
+
 if TYPE_CHECKING:
     from jinja2 import Environment, Template
     from matplotlib.figure import Figure
@@ -45,6 +47,11 @@ def figure(value: float | None, digits: int = 3) -> str:
         decimals = digits - 1 - int(np.floor(np.log10(abs(rounded)))) if rounded else 0
         return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
     return f"{rounded:.{digits - 1}e}".replace("-", "−")
+
+
+def words_of_depths(units: StatedUnits, *depths: float, join: str = ", ") -> str:
+    """Return depths in words, in their unit, with the minus sign of print."""
+    return units.depths_text(depths, join).replace("-", "−")
 
 
 def data_uri(content: bytes, suffix: str) -> str:

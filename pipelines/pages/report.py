@@ -15,6 +15,7 @@ from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
 from faintfield.pipelines.formats.results.records import (
     RECONSTRUCTION_FILE,
     REPORT_FILE,
+    BestFocusRecord,
     GeometryErrors,
     ReconstructionRecord,
 )
@@ -22,7 +23,8 @@ from faintfield.pipelines.formats.results.result_files import files_below, resul
 from faintfield.pipelines.formats.results.stacks import at_depths
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
-from faintfield.pipelines.pages.page import figure, template
+from faintfield.pipelines.formats.units import StatedUnits, named_by, units_of
+from faintfield.pipelines.pages.page import figure, template, words_of_depths
 from faintfield.pipelines.pages.report_calibration import (
     GeometrySection,
     NoiseSection,
@@ -48,13 +50,17 @@ class Fact:
 
 @dataclass(frozen=True)
 class Origin:
-    """A reconstruction or a surface, with its folder, method, options and time of writing as the page shows them."""
+    """A reconstruction or a surface, with its folder, method, options and time of writing as the page shows them.
+
+    `search` says how the depths were found, if they were.
+    """
 
     where: str
     method: str
     written: str
     options: dict[str, object]
     record: ReconstructionRecord | SurfaceFileRecord
+    search: str | None = None
 
 
 def write_report(directory: Path, *, noise: Path | None = None, geometry: Path | None = None) -> Path:
@@ -74,6 +80,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     """
     surfaces = surfaces_below(directory)
     results = results_below(directory, required=not surfaces)
+    units = units_of(next(iter([*results.values(), *surfaces.values()])))
     inputs = {digest for result in results.values() for digest in result.inputs.values()}
     inputs |= {digest for made in surfaces.values() for digest in made.inputs.values()}
     noise, geometry = noise or find_beside(directory, NOISE_FILE), geometry or find_beside(directory, GEOMETRY_FILE)
@@ -84,14 +91,15 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
     shown, errors = plane_sections(planes, results.values()), error_sections(directory, planes)
     the_set = sets[0] if sets else None
     facts = _light(the_set) if the_set else []
-    facts.append(_poses(of_geometry, errors.geometry_off))
+    facts.append(_poses(of_geometry, errors.geometry_off, units))
     facts += _noise(of_noise, the_set)
     if shown.best and (best := errors.of(shown.best)):
         values = ", ".join(figure(row.mse_bright) for row in best)
-        depths = ", ".join(f"{row.depth_mm:g}" for row in best)
-        facts.append(Fact("Mean square error", values, f"at {depths} mm; objects 0…1, truth: plenty of light"))
+        depths = words_of_depths(units, *(row.depth_mm for row in best))
+        facts.append(Fact("Mean square error", values, f"at {depths}; objects 0…1, truth: plenty of light"))
     page = template("report.html").render(
         title=_title(directory, results, surfaces),
+        units=units,
         facts=facts,
         sets=sets,
         **vars(shown),
@@ -124,13 +132,32 @@ def _origin(directory: Path, folder: Path, result: ReconstructionRecord) -> Orig
     """Return how and when the planes of one folder were made."""
     where, method = folder.relative_to(directory).as_posix(), method_title(result.planes)
     written = _written(folder / RECONSTRUCTION_FILE)
-    return Origin(where, method, written, msgspec.to_builtins(result.options), result)
+    search = _search(result.best_focus, units_of(result)) if result.best_focus else None
+    return Origin(where, method, written, _options(result), result, search)
+
+
+def _search(found: BestFocusRecord, units: StatedUnits) -> str:
+    """Return in words how depths were found, and how often shuffled views agreed as well."""
+    where = f"Depths found by comparing the views between {words_of_depths(units, *found.searched_mm[0], join=' and ')}"
+    if found.p_value is UNSET or found.shuffles is UNSET or found.z_shuffled is UNSET:
+        return f"{where}."
+    as_well = round(found.p_value * (found.shuffles + 1)) - 1
+    times = f"views shuffled {found.shuffles} times: {as_well or 'none'} agreed as well (p = {found.p_value:.2g})"
+    return (
+        f"{where}; {times}. The stated places are {figure(found.z_shuffled)} standard deviations of the shuffled "
+        "better than their mean. This is about the set, not about each plane."
+    )
 
 
 def _surface_origin(directory: Path, folder: Path, made: SurfaceFileRecord) -> Origin:
     """Return how and when the surface of one folder was made."""
     where, written = folder.relative_to(directory).as_posix(), _written(folder / SURFACE_FILE)
-    return Origin(where, "Surface", written, msgspec.to_builtins(made.options), made)
+    return Origin(where, "Surface", written, _options(made), made)
+
+
+def _options(made: ReconstructionRecord | SurfaceFileRecord) -> dict[str, object]:
+    """Return the options of a result, as its file names them."""
+    return dict(named_by(msgspec.to_builtins(made.options), units_of(made)))
 
 
 def _written(path: Path) -> str:
@@ -142,8 +169,11 @@ def _title(directory: Path, results: dict[Path, ReconstructionRecord], surfaces:
     """Return the title of the page: what is reconstructed, and at which depths."""
     records = [plane for result in results.values() for plane in result.planes]
     depths = sorted({record.depth_mm for record in at_depths(records)})
-    few = " and ".join(f"{depth:g}" for depth in depths)
-    planes = f"{few} mm" if len(depths) <= 2 else f"{len(depths)} depths, {depths[0]:g} to {depths[-1]:g} mm"
+    units = units_of(next(iter(results.values()), None))
+    planes = words_of_depths(units, *depths, join=" and ")
+    if len(depths) > 2:
+        ends = units.numbers_text([depths[0], depths[-1]], " to ").replace("-", "−")
+        planes = f"{len(depths)} {'relative ' if units.depth == 'relative' else ''}{units.quantities}, {ends}"
     parts = [f"planes at {planes}"] if depths else []
     parts += list(dict.fromkeys(f"plane {record.name}" for record in records if record.rt_ref_plane is not UNSET))
     parts += ["a surface" if len(surfaces) == 1 else f"{len(surfaces)} surfaces"] if surfaces else []
@@ -163,7 +193,13 @@ def _light(the_set: SetSection) -> list[Fact]:
     if light.snr is None or the_set.noise_free:
         return []
     found = [Fact("SNR of a view", figure(light.snr), f"eq. (4): {light.region} against {light.noise_from}")]
-    if light.photons_from_moments is not None:
+    units = units_of(the_set.overview)
+    if units.light != "electrons":
+        value = f"{figure(light.mean_signal_e)} {units.light_per_pixel}"
+        found.append(
+            Fact("Mean light of a view", value, f"{light.region}, above the dark level; the gain is not known")
+        )
+    elif light.photons_from_moments is not None:
         value = f"{figure(light.photons_from_moments)} photons/px"
         found.append(Fact("Light", value, f"from moments; {figure(light.photons_linear)} by the paper’s eq. (7)"))
     elif light.electrons_from_moments is not None:
@@ -173,10 +209,11 @@ def _light(the_set: SetSection) -> list[Fact]:
     return found
 
 
-def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None) -> Fact:
+def _poses(geometry: GeometrySection | None, against_truth: GeometryErrors | None, units: StatedUnits) -> Fact:
     """Return how well the camera's positions are known."""
     if geometry is None:
-        return Fact("Poses", "as stated", "by the set; not measured")
+        scale = "" if units.depth == "mm" else "; their scale is not known"
+        return Fact("Poses", "as stated", f"by the set; not measured{scale}")
     record = geometry.record
     sigma_mm = [node.sigma_mm for node in record.nodes if node.node != record.reference_node]
     known = f"± {_length(float(np.sqrt(np.mean(np.square(sigma_mm))))) if sigma_mm else '–'}"
@@ -193,7 +230,9 @@ def _noise(noise: NoiseSection | None, the_set: SetSection | None) -> list[Fact]
     if noise is None:
         if the_set is None or the_set.noise_free:
             return []
-        return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} e⁻", "as the set states it")]
+        units = units_of(the_set.overview)
+        says = "as the set states it" if units.light == "electrons" else "estimated, not measured"
+        return [Fact("Read noise", f"{figure(the_set.overview.read_noise_e)} {units.light_symbol}", says)]
     read, dark = noise.record.read_noise_e, noise.record.dark_current_e_per_s
     means = [f"± {figure(read.se, 2)}"] if read.se else []
     means += [] if dark.value is None else [f"dark current {figure(dark.value)} e⁻/s"]

@@ -6,7 +6,8 @@ from itertools import cycle
 import numpy as np
 
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, FocusCurve
-from faintfield.pipelines.pages.page import INK, ink, svg
+from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.pages.page import INK, ink, svg, words_of_depths
 from faintfield.pipelines.pages.report_planes import Plane
 
 # Colour and mark of the curves of several planes.
@@ -16,7 +17,7 @@ _LINES = (("#0072b2", "o"), ("#e69f00", "s"), ("#009e73", "^"), ("#cc79a7", "D")
 _MAX_LABELLED = 8
 
 
-def focus_curve(focus: FocusCurve) -> str:
+def focus_curve(focus: FocusCurve, units: StatedUnits) -> str:
     """Return the focus curve as SVG that takes its colour from the page."""
     from matplotlib.figure import Figure  # loading it costs most of a second
 
@@ -27,9 +28,18 @@ def focus_curve(focus: FocusCurve) -> str:
     for depth in focus.sharp_mm:
         axes.axvline(depth, color="#d95f02", linewidth=1, linestyle="--")
         axes.annotate(
-            f"{depth:.0f} mm", (depth, top), xytext=(4, -2), textcoords="offset points", color="#d95f02", va="top"
+            f"{depth:.0f} mm" if units.depth == "mm" else units.numbers_text([depth]).replace("-", "−"),
+            (depth, top),
+            xytext=(4, -2),
+            textcoords="offset points",
+            color="#d95f02",
+            va="top",
         )
-    axes.set(xlabel="depth (mm)", ylabel="detail both halves\nof the views agree on (e⁻²)")
+    squared = {"electrons": "e⁻²", "dn": "DN²", "relative": "white²"}[units.light]
+    axes.set(
+        xlabel=f"{units.quantity} ({units.length or 'relative'})",
+        ylabel=f"detail both halves\nof the views agree on ({squared})",
+    )
     axes.ticklabel_format(axis="y", scilimits=(-3, 3))
     ink(axes)
     return svg(figure)
@@ -85,4 +95,4 @@ def _line_name(plane: Plane) -> str:
     """Return the name of a plane in the legend; planes that were solved together share one curve."""
     if plane.method in JOINT_METHODS:
         return "all planes"
-    return plane.name or f"{plane.depth_mm:g} mm"
+    return plane.name or words_of_depths(plane.units, plane.depth_mm)

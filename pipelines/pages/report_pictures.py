@@ -14,7 +14,8 @@ from faintfield.pipelines.formats.results.records import (
     FocusCurve,
     ReconstructionRecord,
 )
-from faintfield.pipelines.pages.page import data_uri
+from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.pages.page import data_uri, words_of_depths
 from faintfield.pipelines.pages.report_curves import focus_curve, weight_curves
 from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles, plane_words
 
@@ -35,9 +36,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Sigmas:
-    """The standard deviations of the planes on one scale, whose white is in electrons.
+    """The standard deviations of the planes on one scale, whose white is in the unit of light.
 
-    A picture is its title, the median in electrons, and the data URI.
+    A picture is its title, the median, and the data URI.
     """
 
     white: float
@@ -47,7 +48,7 @@ class Sigmas:
 class Slide(TypedDict):
     """One picture of the sliders as a data URI, and the samples across the plane; JSON for the page's script."""
 
-    depth_mm: float
+    depth: float
     words: str
     samples: int
     src: str
@@ -83,9 +84,9 @@ class PlaneSections:
     depths : int
         Number of planes per column.
     white : float
-        White of the grey scale, in electrons.
-    sharp_mm : list of float
-        Depths at which the focus curve peaks.
+        White of the grey scale, in the unit of light.
+    sharp : str
+        Depths at which the focus curve peaks, in words; empty if there are none.
     """
 
     best: Plane | None = None
@@ -104,7 +105,7 @@ class PlaneSections:
     depths: int = 0
     white: float = 0.0
     focus_curve: str | None = None
-    sharp_mm: list[float] = field(default_factory=list)
+    sharp: str = ""
 
 
 def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord]) -> PlaneSections:
@@ -114,6 +115,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     depths = sorted({plane.depth_mm for plane in planes if not plane.name})
     places = sorted({plane.place for plane in planes})
     focus = next((result.focus for result in results if result.focus), None)
+    units = planes[0].units
     titles, best = column_titles(planes), best_column(planes)
     columns = list(titles)
     white = _shared_white(planes, columns)
@@ -130,7 +132,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         best_planes=[(row.words, picture) for row in rows if (picture := row.cells[place])],
         weight_curves=weight_curves(of_best),
         certificates=[
-            (plane_words(*plane.place), record.certificate)
+            (plane.words, record.certificate)
             for plane in of_best
             for record in plane.records
             if record.certificate and record.certificate.is_bound
@@ -143,9 +145,16 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         sigmas=_sigmas(planes, titles, shown),
         depths=len(places),
         white=white,
-        focus_curve=focus_curve(focus) if focus else None,
-        sharp_mm=focus.sharp_mm if focus else [],
+        focus_curve=focus_curve(focus, units) if focus else None,
+        sharp=_sharp(focus, units) if focus else "",
     )
+
+
+def _sharp(focus: FocusCurve, units: StatedUnits) -> str:
+    """Return the depths at which a focus curve peaks, in words."""
+    if units.depth == "mm":
+        return ", ".join(f"{depth:.0f} mm" for depth in focus.sharp_mm)
+    return words_of_depths(units, *focus.sharp_mm) if focus.sharp_mm else ""
 
 
 def _shared_white(planes: list[Plane], columns: list[str]) -> float:
@@ -173,7 +182,7 @@ def _side_by_side(planes: list[Plane], columns: list[str], depths: list[float], 
     for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
         found = (by_place.get((place, column)) for column in columns)
         cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
-        rows.append(Row(plane_words(*place), cells))
+        rows.append(Row(plane_words(planes[0].units, *place), cells))
     return rows
 
 
@@ -187,7 +196,7 @@ def _sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) ->
     white = max(white_level(sigma) for _, sigma in found)
     pictures = [
         (
-            f"{titles[plane.column]}, {plane_words(*plane.place)}",
+            f"{titles[plane.column]}, {plane.words}",
             float(np.median(sigma)),
             _picture(sigma, white, _GRID_WIDTH_PX, ".png"),
         )
@@ -209,8 +218,8 @@ def _slide(plane: Plane, white: float) -> Slide:
     """Return one picture of the sliders."""
     pixels = plane.pixels()
     return {
-        "depth_mm": plane.depth_mm,
-        "words": plane_words(*plane.place),
+        "depth": plane.depth_mm,
+        "words": plane.words,
         "samples": pixels.shape[1],
         "src": _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg"),
     }

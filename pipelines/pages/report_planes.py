@@ -1,7 +1,7 @@
 """The planes of a report: read from disk, in the columns of the report, and their errors against the truth."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.results.result_files import files_below, read_result
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
+from faintfield.pipelines.formats.units import StatedUnits, units_of
+from faintfield.pipelines.pages.page import words_of_depths
 
 # Order of the columns.
 _POSES_IN_ORDER: tuple[Poses, ...] = ("measured", "nominal", "true", "stated")
@@ -55,11 +57,13 @@ class Plane:
     method, poses : str
         By which it was reconstructed.
     depth_mm : float
-        Its depth, on the axis.
+        Its depth, on the axis, in the unit of its records.
     path : Path
         Its file.
     records : list of PlaneRecord
         Its records, one per colour.
+    units : StatedUnits
+        The units of its records.
     """
 
     column: str
@@ -68,6 +72,7 @@ class Plane:
     depth_mm: float
     path: Path
     records: list[PlaneRecord]
+    units: StatedUnits = field(default_factory=StatedUnits)
 
     @property
     def title(self) -> str:
@@ -84,8 +89,13 @@ class Plane:
         """Depth and name, which planes of several columns share when they stand side by side."""
         return (self.depth_mm, self.name)
 
+    @property
+    def words(self) -> str:
+        """Name of the plane on the page."""
+        return plane_words(self.units, *self.place)
+
     def pixels(self) -> NDArray[Any]:
-        """Return the plane (row, column[, colour]) in electrons."""
+        """Return the light of the plane (row, column[, colour])."""
         return read_frame(self.path).pixels_dn
 
     def sigma_e(self) -> NDArray[Any] | None:
@@ -117,7 +127,9 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
             parts = [part for part in where.parts if part not in (method, RECONSTRUCTIONS)]
             column = f"{parts[-1]}/{method}" if parts else method
             path = _existing(folder / Path(name).name)
-            planes.append(Plane(column, method, result.options.poses, records[0].depth_mm, path, records))
+            planes.append(
+                Plane(column, method, result.options.poses, records[0].depth_mm, path, records, units_of(result))
+            )
     poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
     return sorted(planes, key=lambda it: (poses(it.poses), it.column.rpartition("/")[0], methods(it.method)))
 
@@ -150,9 +162,12 @@ def best_column(planes: list[Plane]) -> str:
     return best.column
 
 
-def plane_words(depth_mm: float, name: str) -> str:
+def plane_words(units: StatedUnits, depth: float, name: str) -> str:
     """Return the name of a plane on the page."""
-    return f"{name}, {depth_mm:.1f} mm on the axis" if name else f"{round(depth_mm, 1):g} mm"
+    if units.depth == "mm":
+        return f"{name}, {depth:.1f} mm on the axis" if name else f"{round(depth, 1):g} mm"
+    words = words_of_depths(units, depth)
+    return f"{name}, {words} on the axis" if name else words
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.result_files import file_within, read_result
+from faintfield.pipelines.formats.units import units_of
 from faintfield.pipelines.pages.page import data_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (
@@ -134,13 +135,13 @@ def _thinned(path: Path) -> str | None:
 
 
 def photon_budget(overview: Overview) -> PhotonBudget | None:
-    """Return the photon budget of a set, None without light, or if its dark level is not recorded.
+    """Return the photon budget of a set, None without light or electrons, or if its dark level is not recorded.
 
     Light is in electrons, and in photons too if the quantum efficiency is known.
     """
-    light, exposure_s, dark_e = overview.brightness, overview.exposure_s, overview.dark_e
+    light, dark_e = overview.brightness, overview.dark_e
     signal_e = light.mean_signal_e
-    if dark_e is UNSET or signal_e <= 0:
+    if dark_e is UNSET or signal_e <= 0 or units_of(overview).light != "electrons":
         return None
     by_formula = (
         ("the paper’s linear formula, eq. (7)", light.electrons_linear),
@@ -148,10 +149,10 @@ def photon_budget(overview: Overview) -> PhotonBudget | None:
         ("counted: mean signal above dark", signal_e),
     )
     variance = noise_variance_e2(
-        signal_e / exposure_s,
-        exposure_s,
+        signal_e,
+        1.0,  # of one exposure, however long
         quantum_efficiency=1.0,
-        dark_current_e_per_s=dark_e / exposure_s,
+        dark_current_e_per_s=dark_e,
         read_noise_e=overview.read_noise_e,
     )
     parts = (("read noise", overview.read_noise_e**2), ("light", signal_e), ("dark current", dark_e))
@@ -167,4 +168,5 @@ def _light_row(words: str, electrons: float, overview: Overview) -> LightRow:
     if overview.quantum_efficiency is None:
         return LightRow(words, electrons)
     photons = electrons / overview.quantum_efficiency
-    return LightRow(words, electrons, photons, photons / overview.exposure_s, photons * overview.views)
+    per_s = None if overview.exposure_s is None else photons / overview.exposure_s
+    return LightRow(words, electrons, photons, per_s, photons * overview.views)

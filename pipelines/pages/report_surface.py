@@ -10,6 +10,7 @@ from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.records import preview_name
 from faintfield.pipelines.formats.results.surface import HeldOutRecord, SurfaceFileRecord, SurfaceRecord
+from faintfield.pipelines.formats.units import StatedUnits, units_of
 from faintfield.pipelines.pages.page import data_uri, figure
 
 # Kinds of films that browsers play.
@@ -83,27 +84,28 @@ def _section(directory: Path, folder: Path, made: SurfaceFileRecord) -> SurfaceS
         title=folder.relative_to(directory).as_posix(),
         made=made,
         picture=_embedded(folder / preview_name(surface.picture)),
-        figures=_figures(folder, surface),
+        figures=_figures(folder, surface, units_of(made)),
         rows=_rows(surface),
         predictions=predictions,
         verdict=_verdict(surface.held_out, predictions),
     )
 
 
-def _figures(folder: Path, surface: SurfaceRecord) -> list[Figure]:
+def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[Figure]:
     """Return the pictures of a surface whose files are there."""
-    what, unit = ("depth", "mm") if surface.unit == "mm" else ("disparity", "px")
+    what, unit = _quantity(surface), surface.unit
     film = _embedded(folder / surface.film) if surface.film and Path(surface.film).suffix in _FILMS else None
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
-    known = f"Where each sample is, in {unit}; hatched where that is not known"
+    measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
+    known = f"Where each sample is, {measured}; hatched where that is not known"
     entries = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
         (surface.depth, f"{what.capitalize()}, {unit}.", known),
-        (surface.depth_confidence, "How sure.", "Probability that the depth is right within 2 %"),
+        (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within {_tolerance(surface)}"),
         (surface.depth_sigma, f"σ of the {what}, {unit}.", "Standard deviation, if the right surface was found"),
         (
             surface.picture_sigma,
-            "σ of the picture, e⁻.",
+            f"σ of the picture, {'1 = white' if units.light == 'relative' else units.light_symbol}.",
             "Standard deviation of the light of each sample by noise, if its depth is right",
         ),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
@@ -126,18 +128,29 @@ def _embedded(path: Path) -> str | None:
 
 def _rows(surface: SurfaceRecord) -> list[tuple[str, str, str]]:
     """Return the numbers of a surface in plain words."""
-    what = "depth" if surface.unit == "mm" else "disparity"
+    what, unit = _quantity(surface), "" if surface.unit == "relative" else f" {surface.unit}"
     first, last = (figure(value) for value in surface.searched)
     how = "found in the views" if surface.range_found else "as asked for"
     compared = f"{how}; {surface.depths} depths compared in bins of {surface.bins_px} × {surface.bins_px} pixels"
-    sure = f"the {what} is right within 2 % with a probability of at least {100 * surface.sure_above:.0f} %"
-    median = f"{figure(surface.median)} {surface.unit}" if surface.median is not None else "–"
+    probability = f"with a probability of at least {100 * surface.sure_above:.0f} %"
+    sure = f"the {what} is right within {_tolerance(surface)} {probability}"
+    median = f"{figure(surface.median)}{unit}" if surface.median is not None else "–"
     return [
-        (f"{what.capitalize()} searched", f"{first} to {last} {surface.unit}", compared),
+        (f"{what.capitalize()} searched", f"{first} to {last}{unit}", compared),
         (f"Median {what}", median, "of all samples whose " + what + " is known"),
         ("Known", _percent(surface.known_share), f"of the picture has a {what}"),
         ("Sure", _percent(surface.sure_share), f"of the picture: {sure}"),
     ]
+
+
+def _quantity(surface: SurfaceRecord) -> str:
+    """Return what the map of a surface shows."""
+    return "disparity" if surface.unit == "px" else "depth"
+
+
+def _tolerance(surface: SurfaceRecord) -> str:
+    """Return within what a depth counts as right: 2 % of it, which is a difference of disparities."""
+    return "2 % of its difference from that of infinity" if surface.unit == "px" else "2 %"
 
 
 def _percent(share: float) -> str:

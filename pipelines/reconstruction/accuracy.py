@@ -11,6 +11,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import Method, Metrics, PhotonsRecord, PlaneErrors, Poses, SnrRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
 from faintfield.pipelines.formats.sets.ground_truth import Truth, read_truth, texture_and_region, true_plane
+from faintfield.pipelines.formats.sets.stated import in_units
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
@@ -54,7 +55,8 @@ def assess(
         if depth in depths
     ]
     return Metrics(
-        planes=[row for row in rows if row is not None],
+        planes=[in_units(loaded, row) for row in rows if row is not None],
+        units=loaded.units,
         snr=SnrRecord(truth.snr, brightness(loaded, folder / OBJECT_REGION).snr),
         photons_per_px=PhotonsRecord(truth.photons_linear, truth.photons_from_moments, truth.photons_on_object),
     )

@@ -3,19 +3,26 @@
 from pathlib import Path
 
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, image_lattice, transfer
-from faintfield.pipelines.console import inform
+from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.formats.results.records import BestFocusRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.comparison import Compared, compared_depths
+from faintfield.pipelines.formats.sets.stated import rounded_depth
+from faintfield.pipelines.reconstruction.comparison import BinnedViews, Compared, binned_views
+from faintfield.pipelines.reconstruction.significance import check_places
 from faintfield.recon.depth.agreement import DepthEstimate
 from faintfield.recon.depth.focus import MIN_SAMPLES, SURE, likeliest_depth_mm, places_of_focus
+from faintfield.recon.depth.significance import Significance
 from faintfield.recon.errors import NothingInFocus
 
-# Depths of a search; depths around a plane that it found; searches, each in the range in which the last found anything.
-_DEPTHS, _DEPTHS_AROUND, _SEARCHES = 48, 9, 3
+# Depths of a search, and searches, each in the range in which the last found anything.
+_DEPTHS, _SEARCHES = 48, 3
+
+# Steps of the search on both sides of a place, between which its depth is refined.
+_STEPS_AROUND = 2
 
 # Search again if the range shrinks to less than this share of the last one.
 _SHRUNK_ENOUGH = 0.6
@@ -32,6 +39,18 @@ _MIN_OVERLAP = 0.25
 
 # Depths at which the overlap is computed.
 _OVERLAP_DEPTHS = 80
+
+# Margin of a range of disparities that an import found: a share of the range, and in px.
+_RANGE_MARGIN, _MIN_MARGIN_PX = 0.1, 0.2
+
+# Least movement of the outermost view over a range that is searched, in px: depths beside a single plane show it.
+_LEAST_MOVED_PX = 12.0
+
+# Movement of the outermost view from one plane of a sweep of the range to the next, in px, and limits of its planes.
+_SWEEP_STEP_PX, _FEWEST_PLANES, _MOST_PLANES = 0.5, 8, 96
+
+# Depths farther than this many times the nearest are taken for infinity.
+_INFINITY = 1e4
 
 
 def best_focus(loaded: ElementalSet, out: Path, range_mm: tuple[float, float] | None = None) -> BestFocusRecord:
@@ -53,72 +72,151 @@ def best_focus(loaded: ElementalSet, out: Path, range_mm: tuple[float, float] | 
     Raises
     ------
     NothingInFocus
-        The views agree on nothing in this range.
+        The views agree on nothing in this range, or no better than shuffled ones.
     """
     near_mm, far_mm = sorted(range_mm or searched_range_mm(loaded))
-    ranges, compared, found = _narrowed(loaded, out, (near_mm, far_mm))
+    ranges, compared, found, significance = _narrowed(loaded, out, (near_mm, far_mm))
     sure = found.confidence >= SURE
     places = places_of_focus(found, _DEPTHS)
     if not places:
-        raise _nothing(ranges[0])
-    depths = [
-        round(_refined(loaded, out, compared, place, float(np.median(found.index[place]))), 1) for place in places
-    ]
-    depths = sorted(set(depths))
-    inform(f"planes of best focus between {near_mm:g} and {far_mm:g} mm: {', '.join(f'{d:g}' for d in depths)} mm")
+        raise _nothing(loaded, ranges[0])
+    depths = sorted({rounded_depth(loaded, _refined(compared, found, place)) for place in places})
+    between = loaded.depths_text(near_mm, far_mm, join=" and ")
+    inform(f"planes of best focus between {between}: {loaded.depths_text(*depths)}")
     return BestFocusRecord(
         depth_mm=depths,
         searched_mm=ranges,
         depths_per_search=_DEPTHS,
         bins_px=compared.bins_px,
         share_of_sure=[float(place.sum() / sure.sum()) for place in places],
+        p_value=significance.p_value if significance else UNSET,
+        z_shuffled=significance.z if significance else UNSET,
+        shuffles=significance.shuffles if significance else UNSET,
     )
+
+
+def found_range_mm(loaded: ElementalSet, out: Path) -> tuple[float, float]:
+    """Return the nearest and farthest depth between which the views agree on anything, with a margin.
+
+    Raises
+    ------
+    NothingInFocus
+        As `best_focus`.
+    """
+    return _narrowed(loaded, out, searched_range_mm(loaded))[0][-1]
+
+
+def sweep_of_range(loaded: ElementalSet, range_mm: tuple[float, float]) -> list[float]:
+    """Return depths from the nearest to the farthest, in equal steps of disparity.
+
+    From one to the next, a point moves by at most half a pixel in the outermost view, unless that took more than
+    `_MOST_PLANES` planes.
+    """
+    moved_px = _moved_px(loaded, range_mm)
+    count = int(np.ceil(moved_px / _SWEEP_STEP_PX)) + 1
+    planes = int(np.clip(count, _FEWEST_PLANES, _MOST_PLANES))
+    step_px = moved_px / (planes - 1)
+    inform(
+        f"sweep: {planes} planes, {step_px:.2g} px apart in the outermost view, over {loaded.depths_text(*range_mm)}"
+    )
+    inverse = np.linspace(1 / range_mm[0], 1 / range_mm[1], planes)
+    return list(dict.fromkeys(rounded_depth(loaded, depth) for depth in (1 / inverse).tolist()))
+
+
+def _moved_px(loaded: ElementalSet, range_mm: tuple[float, float]) -> float:
+    """Return by how much a point moves in the outermost view from one end of a range of depths to the other."""
+    moved_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:5], axis=1).max())
+    return loaded.settings.camera.fx_px * moved_mm * (1 / range_mm[0] - 1 / range_mm[1])
 
 
 def _narrowed(
     loaded: ElementalSet, out: Path, range_mm: tuple[float, float]
-) -> tuple[list[tuple[float, float]], Compared, DepthEstimate]:
-    """Search a range, then the part of it in which anything was found; return all ranges, and the last comparison."""
-    moved_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:5], axis=1).max())
+) -> tuple[list[tuple[float, float]], Compared, DepthEstimate, Significance | None]:
+    """Search a range, then the part of it in which anything was found.
+
+    Returns all ranges, the last comparison, and the significance of the first.
+    """
+    views = _binned(loaded, range_mm, out)
+    significance = check_places(views, range_mm)
     ranges = [range_mm]
-    for _ in range(_SEARCHES):
-        near_mm, far_mm = ranges[-1]
-        step_px = loaded.settings.camera.fx_px * moved_mm * (1 / near_mm - 1 / far_mm) / (_DEPTHS - 1)
-        depths = (1 / np.linspace(1 / near_mm, 1 / far_mm, _DEPTHS)).tolist()
-        compared = compared_depths(loaded, depths, out, min_bins_px=int(np.ceil(step_px / _MAX_BINS_PER_STEP)))
+    while True:
+        compared = views.compared(_searched_depths(ranges[-1]))
         found = compared.depth_map()
         sure = found.confidence >= SURE
         if np.count_nonzero(sure) < MIN_SAMPLES:
-            raise _nothing(range_mm)
+            raise _nothing(loaded, range_mm)
         first, last = np.quantile(found.index[sure], _RANGE_OF_SURE) + np.array([-_MARGIN_STEPS, _MARGIN_STEPS])
-        if last - first > _SHRUNK_ENOUGH * _DEPTHS:
-            break
+        if len(ranges) == _SEARCHES or last - first > _SHRUNK_ENOUGH * _DEPTHS:
+            return ranges, compared, found, significance
         inverse = np.interp([first, last], np.arange(_DEPTHS), 1 / np.asarray(compared.depths_mm))
-        ranges.append((float(1 / inverse[0]), float(1 / inverse[1])))
-    return ranges, compared, found
+        narrower = float(1 / inverse[0]), float(1 / inverse[1])
+        if _moved_px(loaded, narrower) < _LEAST_MOVED_PX:
+            return ranges, compared, found, significance
+        ranges.append(narrower)
+        views = _binned(loaded, ranges[-1], out)
+
+
+def _searched_depths(range_mm: tuple[float, float]) -> list[float]:
+    """Return the depths of a search, in equal steps of 1/depth, the nearest first."""
+    depths: list[float] = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
+    return depths
+
+
+def _binned(loaded: ElementalSet, range_mm: tuple[float, float], out: Path) -> BinnedViews:
+    """Return the views in bins of pixels that suit the steps of a search."""
+    step_px = _moved_px(loaded, range_mm) / (_DEPTHS - 1)
+    least_px = int(np.ceil(step_px / _MAX_BINS_PER_STEP))
+    with working("reading views"):
+        return binned_views(loaded, _searched_depths(range_mm)[_DEPTHS // 2], out, min_bins_px=least_px)
+
+
+def imported_range_px(loaded: ElementalSet) -> tuple[float, float] | None:
+    """Return the range of disparities that an import found, None if it found none."""
+    arrangement = loaded.settings.arrangement
+    return None if arrangement is None else arrangement.disparity_range_px
 
 
 def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:
-    """Return the nearest and farthest depth at which a set can show anything, from its poses.
+    """Return the nearest and farthest depth at which a set can show anything.
 
-    At the near end the views share a quarter of the reference view, on average. At the far end they no longer do
-    (cameras that look inwards), or else it is one step of the search before infinity.
+    This is the range of disparities that an import found, with a margin, if the set states it. Otherwise it follows
+    from the poses. At the near end the views share a quarter of the reference view, on average. At the far end they
+    no longer do (cameras that look inwards), or else it is one step of the search before infinity.
     """
     baseline_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max())
     if baseline_mm <= 0:
-        raise NothingInFocus("all views were taken from one place, which tells no depths apart; give --depth-mm")
+        raise NothingInFocus("all views were taken from one place, which tells no depths apart; give --depth")
+    imported_px = imported_range_px(loaded)
+    if imported_px is not None:
+        return _range_of_disparities(loaded, *imported_px)
     depths = np.geomspace(0.3 * baseline_mm, 1000 * baseline_mm, _OVERLAP_DEPTHS)
     shared = np.array([overlap(loaded, depth) for depth in depths])
     best = int(shared.argmax())
     if shared[best] < _MIN_OVERLAP:
         raise NothingInFocus(
-            f"the views share {shared[best]:.0%} of the reference view at most, at {depths[best]:.3g} mm; "
-            "give the range to search by --sweep-mm, or that of a surface by --depth-range-mm"
+            f"the views share {shared[best]:.0%} of the reference view at most, at {loaded.depth_text(depths[best])}; "
+            "give the range to search by --sweep, or that of a surface by --depth-range-mm"
         )
     overlapping = shared >= _MIN_OVERLAP
     first = best - int(np.argmin(np.append(overlapping[best::-1], False))) + 1
     last = best + int(np.argmin(np.append(overlapping[best:], False))) - 1
     return float(depths[first]), float(min(depths[last], _DEPTHS * depths[first]))
+
+
+def _range_of_disparities(loaded: ElementalSet, least_px: float, largest_px: float) -> tuple[float, float]:
+    """Return the nearest and farthest depth of a range of disparities with a margin, at most infinity."""
+    at_zero, slope = loaded.inverse_depth_of_disparity()
+    moved_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:5], axis=1).max())
+    wide_px = _LEAST_MOVED_PX / max(abs(slope) * loaded.settings.camera.fx_px * moved_mm, 1e-9)
+    found_px = largest_px - least_px
+    margin_px = max(_RANGE_MARGIN * found_px, _MIN_MARGIN_PX, 0.5 * (wide_px - found_px))
+    far, near = sorted(at_zero + slope * end_px for end_px in (least_px - margin_px, largest_px + margin_px))
+    if near <= 0:
+        raise NothingInFocus(
+            f"{loaded.folder}: arrangement.disparity_range_px = {least_px:g} to {largest_px:g} lies behind infinity by "
+            "the poses; correct one of them"
+        )
+    return 1 / near, 1 / max(far, near / _INFINITY)
 
 
 def overlap(loaded: ElementalSet, depth_mm: float) -> float:
@@ -137,20 +235,16 @@ def overlap(loaded: ElementalSet, depth_mm: float) -> float:
     return float(inside.mean())
 
 
-def _refined(loaded: ElementalSet, out: Path, compared: Compared, place: NDArray[np.bool_], index: float) -> float:
-    """Return the depth around a place of the search at which the views agree best on it."""
-    inverse = np.interp(
-        index + np.linspace(-1.5, 1.5, _DEPTHS_AROUND),
-        np.arange(len(compared.depths_mm)),
-        1 / np.asarray(compared.depths_mm),
-    )
-    around = compared_depths(loaded, (1 / inverse).tolist(), out, bins_px=compared.bins_px)
-    return likeliest_depth_mm(around.planes, around.depths_mm, place)
+def _refined(compared: Compared, found: DepthEstimate, place: NDArray[np.bool_]) -> float:
+    """Return the depth, between those of the search, at which the views agree best on a place."""
+    middle = round(float(np.median(found.index[place])))
+    near = slice(max(middle - _STEPS_AROUND, 0), middle + _STEPS_AROUND + 1)
+    return likeliest_depth_mm(compared.planes[near], compared.depths_mm[near], place)
 
 
-def _nothing(range_mm: tuple[float, float]) -> NothingInFocus:
+def _nothing(loaded: ElementalSet, range_mm: tuple[float, float]) -> NothingInFocus:
     return NothingInFocus(
-        f"between {range_mm[0]:.4g} and {range_mm[1]:.4g} mm there is no depth at which the views agree on at least "
-        f"{MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep-mm "
-        "FIRST:LAST:COUNT, more light, or --depth-mm"
+        f"between {loaded.depths_text(*range_mm, join=' and ')} there is no depth at which the views agree on at least "
+        f"{MIN_SAMPLES} bins of pixels that stand out of the noise; give another range by --sweep "
+        "FIRST:LAST:COUNT, more light, or --depth"
     )

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import msgspec
@@ -12,12 +11,16 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import encoded, grey_levels, white_level, write_plane
+from faintfield.pipelines.formats.image_files import ONE_PIXEL, encoded, grey_levels, white_level, write_plane
 from faintfield.pipelines.formats.results.plane_files import Origin, read_current
 from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, DepthMapFileRecord, DepthMapRecord, Method
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import unit_of_maps
 from faintfield.pipelines.reconstruction.map_pictures import map_picture
 from faintfield.pipelines.reconstruction.operators import plane_grid
+
+# The file of the depths by their unit.
+_FILES = {"mm": "depth_mm.tiff", "px": "disparity_px.tiff", "relative": "depth.tiff"}
 
 ALL_IN_FOCUS, CONFIDENCE = "all_in_focus", "depth_confidence"
 
@@ -35,7 +38,7 @@ class _Map:
     index : float array (row, column)
         Between which planes of the sweep each sample lies; given everywhere, even where nothing is known.
     values, confidence : float array (row, column)
-        Depth in mm or disparity in px, NaN where it is not known; and the probability that this is right.
+        Depth or disparity in the unit of the record, NaN where it is not known; and the probability that this is right.
     """
 
     record: DepthMapRecord
@@ -116,12 +119,12 @@ def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Ma
     bins, shape = default_bins(loaded), plane_grid(loaded, 1.0).shape
     _, estimate = depths_of_set(loaded, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
     inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
-    unit: Literal["mm", "px"] = "px" if disparities_px else "mm"
-    scale = [disparities_px[depth] if disparities_px else depth for depth in depths_mm]
+    unit = unit_of_maps(loaded.units, as_px=bool(disparities_px))
+    scale = [disparities_px[depth] if disparities_px else in_unit(loaded, 1 / depth, unit) for depth in depths_mm]
     known = confidence.astype(np.float32) >= SURE  # as in the file
     values = np.clip(in_unit(loaded, inverse_depth, unit), min(scale), max(scale))
     record = DepthMapRecord(
-        file="disparity_px.tiff" if disparities_px else "depth_mm.tiff",
+        file=_FILES[unit],
         confidence=f"{CONFIDENCE}.tiff",
         all_in_focus=f"{ALL_IN_FOCUS}.tiff",
         unit=unit,
@@ -137,14 +140,14 @@ def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Ma
 def _write_maps(folder: Path, found: _Map, sharp: NDArray[np.float32]) -> dict[str, str]:
     """Write the maps and the all-in-focus picture with their previews; return their hashes by file name."""
     record = found.record
-    label = "disparity (px)" if record.unit == "px" else "depth (mm)"
+    label = "disparity (px)" if record.unit == "px" else f"depth ({record.unit})"
     pictures: dict[str, tuple[NDArray[np.floating], bytes]] = {
         record.file: (found.values, map_picture(found.values, label, *found.limits)),
         record.confidence: (found.confidence, map_picture(found.confidence, "probability of the depth", 0.0, 1.0)),
         record.all_in_focus: (sharp, encoded(grey_levels(sharp, white_level(sharp)), ".png")),
     }
     for name, (values, picture) in pictures.items():
-        write_plane(folder / name, values, 1.0)
+        write_plane(folder / name, values, ONE_PIXEL)
         write_whole((folder / name).with_suffix(".png"), picture)
     files = [path for name in pictures for path in (folder / name, (folder / name).with_suffix(".png"))]
     return {path.name: sha256(path) for path in files}

@@ -62,7 +62,7 @@ def plane_grid(loaded: ElementalSet, depth_mm: float, pitch_mm: float | None = N
             pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
         )
     except ValueError as failure:
-        raise GeometryMismatch(f"plane at {depth_mm:g} mm: {failure}") from failure
+        raise GeometryMismatch(f"plane at {loaded.depth_text(depth_mm)}: {failure}") from failure
 
 
 def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:

@@ -15,6 +15,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import Picture, contact_sheet, encoded, grey_levels, white_level
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE, Brightness, Overview
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import in_units
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
 
@@ -178,6 +179,7 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
     pictures |= _bright_views(loaded, region)
     noise, exposure_s = loaded.noise, loaded.settings.exposure_s
     record = Overview(
+        units=loaded.units,
         set=loaded.folder.resolve().name,
         views=len(loaded.settings.view),
         grid=grid,
@@ -188,10 +190,11 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
         read_noise_e=float(np.sqrt(np.mean(np.square(noise.read_noise_e)))),
         has_noise_reference=bool(loaded.noise_reference),
         quantum_efficiency=noise.quantum_efficiency,
-        dark_e=float(np.mean(noise.background_e(exposure_s))),
+        dark_e=float(np.mean(loaded.background_e(noise))),
         grey_scale_dn=(black, white),
         brightness=brightness_within(loaded, region, name),
     )
+    record = in_units(loaded, record)
     try:
         msgspec.json.decode(msgspec.json.encode(record), type=Overview)  # null stands for what is not finite
     except msgspec.ValidationError as failure:

@@ -1,12 +1,9 @@
 """What `reconstruct` is asked for: its options select planes, are checked, and are resolved for a set."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, read_plane_poses
@@ -19,47 +16,32 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionOptions,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.autofocus import best_focus
+from faintfield.pipelines.formats.sets.stated import plane_stem
+from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, sweep_of_range
+from faintfield.pipelines.reconstruction.given_sweeps import swept, swept_depths
 from faintfield.pipelines.reconstruction.operators import check_in_front
 from faintfield.pipelines.reconstruction.planes import Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 
-# Largest sweep: more planes are a typing error, and would fill any disk.
-_MAX_PLANES = 10_000
-
 # Fewer depths leave nothing to interpolate between.
 _MIN_DEPTHS_OF_A_MAP = 5
 
 
-def distinct_depths(depths: list[float]) -> list[float]:
-    """Return each depth once; refuse those behind the camera, and two different ones that would share a file name."""
+def distinct_depths(depths: list[float], loaded: ElementalSet | None = None) -> list[float]:
+    """Return each depth once; refuse those behind the camera, and two different ones that would share a file name.
+
+    Names and messages are those of a set; of one in mm if it is not given.
+    """
     by_name: dict[str, float] = {}
     for depth in depths:
         check_in_front(depth)
-        other = by_name.setdefault(plane_name(depth), depth)
+        other = by_name.setdefault(plane_stem(loaded, depth) if loaded else plane_name(depth), depth)
         if other != depth:
-            raise WrongUsage(f"planes at {other:g} and {depth:g} mm would share a file name; keep them 0.1 mm apart")
+            pair = loaded.depths_text(other, depth, join=" and ") if loaded else f"{other:g} and {depth:g} mm"
+            apart = "0.1 mm apart" if pair.endswith(" mm") else "farther apart"
+            raise WrongUsage(f"planes at {pair} would share a file name; keep them {apart}")
     return list(by_name.values())
-
-
-def swept_depths(sweep_mm: str) -> list[float]:
-    """Return the depths of FIRST:LAST:COUNT."""
-    depths = _swept("--sweep-mm", sweep_mm, "400:900:64")
-    if min(depths) <= 0:
-        raise WrongUsage(f"--sweep-mm {sweep_mm}: is no sweep; give two different positive depths")
-    return depths
-
-
-def _swept(option: str, given: str, example: str) -> list[float]:
-    """Return the numbers of FIRST:LAST:COUNT, in equal steps."""
-    parts = re.fullmatch(r"(-?\d+(?:\.\d*)?):(-?\d+(?:\.\d*)?):(\d+)", given)
-    if parts is None:
-        raise WrongUsage(f"{option} {given}: is no sweep; give FIRST:LAST:COUNT, such as {example}")
-    first, last, count = float(parts[1]), float(parts[2]), int(parts[3])
-    if first == last or not 2 <= count <= _MAX_PLANES:
-        raise WrongUsage(f"{option} {given}: is no sweep; give two different ends and 2 to {_MAX_PLANES} planes")
-    return [round(float(value), 6) for value in np.linspace(first, last, count)]
 
 
 @dataclass(frozen=True)
@@ -139,6 +121,10 @@ class Selection:
         Planes given by a pose.
     auto : bool
         Search for the depths, within a sweep's range if there is one.
+    own, own_swept : list of float
+        Single depths, and those of a sweep, in the unit of the set.
+    auto_sweep : bool
+        Sweep the range in which depths are found.
     depth_map : bool
         Make a depth map of the sweep.
     methods, settings, pitch_mm : list of Method, Settings, float, optional
@@ -155,9 +141,14 @@ class Selection:
     methods: list[Method]
     settings: Settings
     pitch_mm: float | None
+    own: list[float] = field(default_factory=list)
+    own_swept: list[float] = field(default_factory=list)
+    auto_sweep: bool = False
 
 
 def select_planes(
+    depth: Sequence[float | Literal["auto"]],
+    sweep: str | None,
     depth_mm: Sequence[float | Literal["auto"]],
     sweep_mm: str | None,
     disparity_px: Sequence[float],
@@ -176,22 +167,27 @@ def select_planes(
     WrongUsage, InputError
         They select none, contradict one another, would have no effect, or name a file that cannot be read.
     """
-    if not (depth_mm or sweep_mm or disparity_px or sweep_px or plane_pose):
+    if not (depth or sweep or depth_mm or sweep_mm or disparity_px or sweep_px or plane_pose):
         raise WrongUsage(
-            "no plane is asked for; give --depth-mm, --sweep-mm FIRST:LAST:COUNT, --disparity-px, --sweep-px or "
-            "--plane-pose"
+            "no plane is asked for; give --depth auto, --sweep auto, --depth-mm, --sweep-mm FIRST:LAST:COUNT, "
+            "--disparity-px, --sweep-px or --plane-pose"
         )
-    if depth_map and "auto" in depth_mm:
-        raise WrongUsage(
-            "--depth-map compares depths of a sweep, and --depth-mm auto leaves few; give --sweep-mm alone"
+    auto = "auto" in [*depth, *depth_mm]
+    if auto and (sweep == "auto" or depth_map):
+        option = (
+            "--sweep auto makes all planes of a range" if sweep == "auto" else "--depth-map compares those of a sweep"
         )
+        raise WrongUsage(f"{option}, and --depth-mm auto leaves few; give --sweep alone")
     selection = Selection(
         depths_mm=[depth for depth in depth_mm if depth != "auto"],
         swept_mm=swept_depths(sweep_mm) if sweep_mm else [],
         disparities_px=list(disparity_px),
-        swept_px=_swept("--sweep-px", sweep_px, "-3.5:0.8:40") if sweep_px else [],
+        swept_px=swept("--sweep-px", sweep_px, "-3.5:0.8:40") if sweep_px else [],
         tilted=read_plane_poses(plane_pose),
-        auto="auto" in depth_mm,
+        auto=auto,
+        own=[value for value in depth if value != "auto"],
+        own_swept=swept("--sweep", sweep, "400:900:64") if sweep and sweep != "auto" else [],
+        auto_sweep=sweep == "auto",
         depth_map=depth_map,
         methods=methods,
         settings=settings,
@@ -230,6 +226,8 @@ def resolve(selection: Selection, loaded: ElementalSet, out: Path) -> Request:
     WrongUsage, BadValue, NothingInFocus
         The depths do not suit the options, a disparity has no depth, or the search finds none.
     """
+    _refuse_mm(selection, loaded)
+    selection = _in_unit(selection, loaded)
     disparities_px = [*selection.disparities_px, *selection.swept_px]
     of_disparity = {loaded.depth_of_disparity(disparity_px): disparity_px for disparity_px in disparities_px}
     depths = [*selection.depths_mm, *selection.swept_mm, *of_disparity]
@@ -241,21 +239,52 @@ def resolve(selection: Selection, loaded: ElementalSet, out: Path) -> Request:
             )
         found = best_focus(loaded, out, (min(depths), max(depths)) if depths else None)
         depths, of_disparity = found.depth_mm, {}
-    if selection.depth_map and (count := len(distinct_depths(depths))) < _MIN_DEPTHS_OF_A_MAP:
+    elif selection.auto_sweep:
+        depths = [*depths, *sweep_of_range(loaded, found_range_mm(loaded, out))]
+    if selection.depth_map and (count := len(distinct_depths(depths, loaded))) < _MIN_DEPTHS_OF_A_MAP:
         raise WrongUsage(
-            f"--depth-map compares depths, and {count} are given; give at least {_MIN_DEPTHS_OF_A_MAP}, by --sweep-mm "
-            "or --sweep-px"
+            f"--depth-map compares depths, and {count} are given; give at least {_MIN_DEPTHS_OF_A_MAP}, by --sweep"
         )
     return Request(
         depths,
         selection.methods,
         selection.settings,
         selection.pitch_mm,
-        with_focus=bool(selection.swept_mm or selection.swept_px) and found is None,
+        with_focus=bool(selection.swept_mm or selection.swept_px or selection.auto_sweep) and found is None,
         with_depth_map=selection.depth_map,
         disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
         tilted=selection.tilted,
         found=found,
+    )
+
+
+def _refuse_mm(selection: Selection, loaded: ElementalSet) -> None:
+    """Refuse depths in mm for a set without a scale (WrongUsage)."""
+    if loaded.units.depth == "mm" or not (selection.depths_mm or selection.swept_mm):
+        return
+    given = "--depth-mm" if selection.depths_mm else "--sweep-mm"
+    own = given.removesuffix("-mm")
+    other = f"{own}, in its own unit, or {'--disparity-px' if selection.depths_mm else '--sweep-px'}"
+    raise WrongUsage(
+        f"{given} {[*selection.depths_mm, *selection.swept_mm][0]:g}: {loaded.folder} has no scale, its depths are "
+        f"{'disparities' if loaded.units.depth == 'disparity_px' else 'relative'}; give {other}, or auto"
+    )
+
+
+def _in_unit(selection: Selection, loaded: ElementalSet) -> Selection:
+    """Return a selection whose depths in the unit of the set are depths or disparities."""
+    if loaded.units.depth == "disparity_px":
+        return replace(
+            selection,
+            disparities_px=[*selection.disparities_px, *selection.own],
+            swept_px=[*selection.swept_px, *selection.own_swept],
+        )
+    for depth in selection.own_swept:
+        check_in_front(depth)
+    return replace(
+        selection,
+        depths_mm=[*selection.depths_mm, *selection.own],
+        swept_mm=[*selection.swept_mm, *selection.own_swept],
     )
 
 

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.errors import OutputExists
+from faintfield.pipelines.errors import BadValue, OutputExists
 from faintfield.pipelines.formats.files import remove, remove_leftovers, require_room, write_record
 from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.provenance import provenance
@@ -31,8 +31,11 @@ from faintfield.pipelines.formats.results.stacks import write_stack
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceRecord
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
+from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
+from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth_map import check_sweep, write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
@@ -55,6 +58,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     depth_map: DepthMapRecord | None
     metrics: Metrics | None
     surface: SurfaceRecord | UnsetType = UNSET
+    units: StatedUnits | UnsetType = UNSET
 
 
 def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
@@ -69,8 +73,10 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
         A depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
     """
     started = time.monotonic()
-    depths, methods = distinct_depths(request.depths_mm), list(dict.fromkeys(request.methods))
+    depths, methods = distinct_depths(request.depths_mm, loaded), list(dict.fromkeys(request.methods))
+    found = in_units(loaded, request.found) if request.found else None
     request = replace(request, depths_mm=depths, methods=methods)
+    _refuse_pitch(loaded, request)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     if request.with_depth_map:
         _refuse_surfaces(list(folders.values()))
@@ -83,6 +89,8 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     depth_map = None
     if request.with_depth_map:
         depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins)
+        for folder in folders.values():
+            write_depth_errors(loaded, folder, depth_map.file, depth_map.unit)
     metrics = assess(loaded, sweep.written)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:
@@ -93,19 +101,29 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
         result = ReconstructionRecord(
             planes=[record for record in records if record.method == name],
             focus=focus,
-            best_focus=request.found,
+            best_focus=found,
             depth_map=depth_map,
             wall_time_s=time.monotonic() - started,
             **msgspec.structs.asdict(sweep.origins[name]),
         )
         write_record(folder / RECONSTRUCTION_FILE, result)
         if request.with_focus:
-            write_stack(folder, result.planes)
+            write_stack(folder, result.planes, loaded.units)
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
-    _warn(records)
+    _warn(loaded, records)
     return Outcome(
-        out=str(out), planes=records, focus=focus, best_focus=request.found, depth_map=depth_map, metrics=metrics
-    )
+        out=str(out), planes=records, focus=focus, best_focus=found, depth_map=depth_map, metrics=metrics,
+        units=loaded.units,
+    )  # fmt: skip
+
+
+def _refuse_pitch(loaded: ElementalSet, request: Request) -> None:
+    """Refuse a pitch in mm for a set that knows no lengths (BadValue)."""
+    if request.pitch_mm and loaded.units.depth == "disparity_px":
+        raise BadValue(
+            f"{loaded.folder}: knows disparities, no lengths; a pitch of {request.pitch_mm:g} means nothing; "
+            "leave --pitch-mm out, or import the pictures again with the pitch of the nodes and the focal length"
+        )
 
 
 def _refuse_surfaces(folders: list[Path]) -> None:
@@ -144,18 +162,22 @@ def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) 
     for plane in request.tilted:
         grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
     inputs = dict(loaded.input_hashes())
-    all_planes = {name: provenance("reconstruct", request.options(name, loaded.poses), inputs) for name in folders}
+    units = loaded.units
+    all_planes = {
+        name: provenance("reconstruct", in_units(loaded, request.options(name, loaded.poses)), inputs, units)
+        for name in folders
+    }
     channels = tuple(layout.name for layout in layouts)
     files = []
     for place in grids:
         for name, folder in folders.items():
-            options = request.of_plane(name, place).options(name, loaded.poses)
+            options = in_units(loaded, request.of_plane(name, place).options(name, loaded.poses))
             origin = msgspec.structs.replace(all_planes[name], options=options)
-            files.append(PlaneFiles(folder, name, place, channels, origin))
+            files.append(PlaneFiles(folder, name, place, channels, origin, plane_stem(loaded, place)))
     return Sweep(loaded, layouts, grids, files, all_planes, request.settings, request.with_focus)
 
 
-def _warn(records: list[PlaneRecord]) -> None:
+def _warn(loaded: ElementalSet, records: list[PlaneRecord]) -> None:
     """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
     certificates = [one.certificate for one in records if one.certificate and one.certificate.oscillates is not UNSET]
     swings = [one.relative_change for one in certificates if one.oscillates and one.relative_change is not UNSET]
@@ -172,10 +194,11 @@ def _warn(records: list[PlaneRecord]) -> None:
             f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
             f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
         )
-    black = [record for record in records if record.mean_e <= _BLACK_E]
+    black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(loaded)]
     if black:
+        first = loaded.units.depths_text([black[0].depth_mm])
         inform(
-            f"{len(black)} of {len(records)} planes are black ({black[0].method}, {black[0].depth_mm:g} mm for "
+            f"{len(black)} of {len(records)} planes are black ({black[0].method}, {first} for "
             "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "
             "with dark frames of the same exposure"
         )

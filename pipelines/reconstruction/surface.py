@@ -26,7 +26,10 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
+from faintfield.pipelines.reconstruction.autofocus import imported_range_px
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
@@ -101,7 +104,9 @@ def reconstruct_surface(
     """
     started = time.monotonic()
     _check(loaded, out)
-    origin = provenance("reconstruct", request.options(loaded.poses), dict(loaded.input_hashes()))
+    unit = unit_of_maps(loaded.units, as_px=request.unit == "px")
+    options = in_units(loaded, request.options(loaded.poses))
+    origin = provenance("reconstruct", options, dict(loaded.input_hashes()), loaded.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface
@@ -109,32 +114,35 @@ def reconstruct_surface(
     grid = plane_grid(loaded, 1.0)
     require_room(out, _needed_bytes(grid.shape, len(layouts)))
     range_mm = limits_mm(loaded, request)
+    find_range = request.depth_range_mm is None and imported_range_px(loaded) is None
     remove_leftovers(out)
     bins = default_bins(loaded)
-    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=request.depth_range_mm is None)
+    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=find_range)
     far, near = float(depths[0]), float(depths[-1])
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
-    with naming_range(far, near):
+    with naming_range(loaded, far, near):
         lights = {
             layout.name: _light(loaded, layout, inverse_depth, request.settings, out)
             for layout in progress(layouts, "picture")
         }
     facts = SurfaceFacts(
-        unit=request.unit,
-        searched=(in_unit(loaded, near, request.unit), in_unit(loaded, far, request.unit)),
+        unit=unit,
+        searched=(in_unit(loaded, near, unit), in_unit(loaded, far, unit)),
         range_found=request.depth_range_mm is None,
         depths=len(depths),
         bins_px=bins,
         rounds=estimate.rounds,
         sure_above=SURE,
         held_out=_held_out(estimate.prediction),
-        channels=[_channel(name, light) for name, light in lights.items()],
+        channels=[in_units(loaded, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
-    maps = _maps(loaded, inverse_depth, estimate, list(lights.values()), request.unit, bins)
+    maps = _maps(loaded, inverse_depth, estimate, list(lights.values()), unit, bins)
     for page in pages:
         remove(page)
-    return write_surface(out, maps, facts, origin)
+    record = write_surface(out, maps, facts, origin)
+    write_depth_errors(loaded, out, record.depth, record.unit)
+    return record
 
 
 def _check(loaded: ElementalSet, out: Path) -> None:
@@ -220,7 +228,7 @@ def _maps(
     inverse_depth: NDArray[np.float64],
     estimate: SurfaceEstimate,
     lights: list[_Light],
-    unit: Literal["mm", "px"],
+    unit: Literal["mm", "px", "relative"],
     bins: int,
 ) -> SurfaceMaps:
     """Return what is known of each sample."""
@@ -231,15 +239,20 @@ def _maps(
     # Of a normal distribution that lies within the tolerance with this probability
     sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
     slope = np.abs(in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
-    colours = len(lights) > 1
+    light = light_per_e(loaded)
     return SurfaceMaps(
         grid=grid,
-        picture=np.stack([light.picture for light in lights], -1) if colours else lights[0].picture,
-        picture_sigma=np.stack([light.sigma for light in lights], -1) if colours else lights[0].sigma,
+        picture=_colours([light * one.picture for one in lights]),
+        picture_sigma=_colours([light * one.sigma for one in lights]),
         depth=np.where(known, depth, np.nan),
         depth_sigma=np.where(known, sigma * slope, np.nan),
         depth_confidence=confidence,
-        visibility=np.mean([light.visibility for light in lights], axis=0),
+        visibility=np.mean([one.visibility for one in lights], axis=0),
         inverse_depth=inverse_depth,
         aperture_mm=aperture_of(loaded.poses_rt_cam_ref),
     )
+
+
+def _colours(parts: list[NDArray[np.floating]]) -> NDArray[np.floating]:
+    """Return one array of all colours, (row, column[, colour])."""
+    return parts[0] if len(parts) == 1 else np.stack(parts, -1)

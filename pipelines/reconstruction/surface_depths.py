@@ -11,10 +11,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.pipelines.console import inform
+from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.autofocus import overlap, searched_range_mm
+from faintfield.pipelines.reconstruction.comparison import BETWEEN_PIXELS
 from faintfield.pipelines.reconstruction.luminance import luminance
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
@@ -34,9 +35,6 @@ _MIN_OVERLAP, _TRIED = 0.1, 8
 
 # Movement in samples of the outermost view from one depth to the next above which the user is warned, and refused.
 _COARSE, _TOO_COARSE = 3.5, 16.0
-
-# Place between two pixels, in pixels, at which `w² + (1 − w)²` is 2/3, see `between_pixels`.
-BETWEEN_PIXELS = 0.5 - 0.5 / 3**0.5
 
 
 def check_views(loaded: ElementalSet, wanted: str) -> None:
@@ -96,8 +94,9 @@ def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
     own = 1 / len(loaded.settings.view)  # the share of the reference view itself
     shared = (max(overlap(loaded, depth) for depth in depths.tolist()) - own) / (1 - own)
     if shared < _MIN_OVERLAP:
+        between = loaded.depths_text(near_mm, far_mm, join=" and ")
         raise GeometryMismatch(
-            f"between {near_mm:g} and {far_mm:g} mm the other views see {shared:.0%} of what the reference view sees, "
+            f"between {between} the other views see {shared:.0%} of what the reference view sees, "
             f"on average, and {_MIN_OVERLAP:.0%} are needed; correct the range, or the poses and their signs"
         )
 
@@ -129,22 +128,34 @@ def depths_of_set(
     """
     nodes, views = nodes_of(loaded), between_pixels(luminance(loaded, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
-    with naming_range(far, near):
+    with naming_range(loaded, far, near):
         if find_range:
-            far, near = found_range(views, nodes, far, near)
+            with working("searching the range of depths"):
+                far, near = found_range(views, nodes, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
-        inform(f"surface between {1 / near:.4g} and {1 / far:.4g} mm: comparing {len(depths)} depths")
-        return depths, estimate_surface(views, depths, nodes)
+        inform(f"surface {_between(loaded, far, near)}: comparing {len(depths)} depths")
+        with working("finding the depths of the surface"):
+            return depths, estimate_surface(views, depths, nodes)
 
 
 @contextmanager
-def naming_range(far: float, near: float) -> Iterator[None]:
+def naming_range(loaded: ElementalSet, far: float, near: float) -> Iterator[None]:
     """Name the range of 1/depth in which views, poses and surface do not fit together."""
     try:
         yield
     except GeometryMismatch as failure:
-        raise GeometryMismatch(f"surface between {1 / near:.4g} and {1 / far:.4g} mm: {failure}") from failure
+        raise GeometryMismatch(f"surface {_between(loaded, far, near)}: {failure}") from failure
+    except NothingInFocus as failure:
+        option = "--disparity-range-px" if loaded.units.depth == "disparity_px" else "--depth-range-mm"
+        raise NothingInFocus(
+            f"{_between(loaded, far, near)} {failure}; give the range by {option} NEAR:FAR, or more light"
+        ) from failure
+
+
+def _between(loaded: ElementalSet, far: float, near: float) -> str:
+    """Return a range of 1/depth in words."""
+    return f"between {loaded.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
 
 
 def nodes_of(loaded: ElementalSet) -> NDArray[np.intp]:
@@ -204,10 +215,10 @@ def enlarged(
 
 
 def in_unit[Numbers: (float, NDArray[np.float64])](
-    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px"]
+    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px", "relative"]
 ) -> Numbers:
-    """Return depths in mm, or disparities in px from one node to the next."""
-    if unit == "mm":
+    """Return depths as the poses have them, or disparities in px from one node to the next."""
+    if unit != "px":
         return 1 / inverse_depth
     at_zero, slope = loaded.inverse_depth_of_disparity()
     return (inverse_depth - at_zero) / slope

@@ -12,6 +12,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.exchange.ply import write_points
 from faintfield.pipelines.formats.files import remove, sha256, write_record, write_whole
 from faintfield.pipelines.formats.image_files import (
+    ONE_PIXEL,
     Picture,
     encoded,
     encoded_film,
@@ -28,6 +29,7 @@ from faintfield.pipelines.formats.results.surface import (
     SurfaceOptions,
     SurfaceRecord,
 )
+from faintfield.pipelines.formats.units import LightUnit, StatedUnits, units_of
 from faintfield.pipelines.reconstruction.map_pictures import map_picture, robust_limits
 from faintfield.pipelines.reconstruction.parallax import FRAME_MS, render_parallax, viewpoints
 from faintfield.recon.operator.grid import PlaneGrid
@@ -38,7 +40,12 @@ POINTS, FILM = "surface.ply", "parallax.webp"
 _DEPTH_FILES = {
     "mm": ("depth_mm.tiff", "depth_sigma_mm.tiff"),
     "px": ("disparity_px.tiff", "disparity_sigma_px.tiff"),
+    "relative": ("depth.tiff", "depth_sigma.tiff"),
 }
+
+
+# Unit of light on the colour bar.
+_LIGHT: dict[LightUnit, str] = {"electrons": "electrons", "dn": "DN", "relative": "1 = white"}
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ class SurfaceMaps:
     grid : PlaneGrid
         The samples' directions: positions at unit depth, x/z and y/z.
     picture, picture_sigma : float arrays (row, column[, colour])
-        Light in electrons, and its standard deviation.
+        Light in the unit of the set, and its standard deviation.
     depth, depth_sigma : float arrays (row, column)
         Depth and its standard deviation in the unit of the record; NaN where the depth is not known.
     depth_confidence : float array (row, column)
@@ -105,10 +112,10 @@ def write_surface(
     for name in (POINTS, FILM, *depths, *map(preview_name, depths)):
         remove(folder / name)
     levels = grey_levels(maps.picture, white_level(maps.picture))
-    points = _write_points(folder, maps, levels) if facts.unit == "mm" else None
+    points = _write_points(folder, maps, levels, facts.unit) if facts.unit != "px" else None
     record = _record(maps, facts, points, _write_film(folder, maps, levels))
-    for name, values, preview in _named_maps(record, maps, levels):
-        write_plane(folder / name, values, 1.0)
+    for name, values, preview in _named_maps(record, maps, levels, units_of(origin)):
+        write_plane(folder / name, values, ONE_PIXEL)
         write_whole(folder / preview_name(name), preview)
     hashes = {name: sha256(folder / name) for name in record.files}
     write_record(folder / SURFACE_FILE, SurfaceFileRecord(1, record, hashes, **msgspec.structs.asdict(origin)))
@@ -137,15 +144,19 @@ def _record(maps: SurfaceMaps, facts: SurfaceFacts, points: str | None, film: st
 
 
 def _named_maps(
-    record: SurfaceRecord, maps: SurfaceMaps, levels: Picture
+    record: SurfaceRecord, maps: SurfaceMaps, levels: Picture, units: StatedUnits
 ) -> Iterator[tuple[str, NDArray[np.floating], bytes]]:
     """Yield each map with the name of its file and its preview."""
-    what = "depth" if record.unit == "mm" else "disparity"
+    what = "disparity" if record.unit == "px" else "depth"
     yield record.picture, maps.picture, encoded(levels, ".png")
     sigma = maps.picture_sigma
     # One scale for all colours: that of their mean
     shown = sigma if sigma.ndim == 2 else sigma.mean(axis=2)
-    yield record.picture_sigma, sigma, map_picture(shown, "σ of the light (electrons)", *robust_limits(shown))
+    yield (
+        record.picture_sigma,
+        sigma,
+        map_picture(shown, f"σ of the light ({_LIGHT[units.light]})", *robust_limits(shown)),
+    )
     label = f"{what} ({record.unit})"
     yield record.depth, maps.depth, map_picture(maps.depth, label, *robust_limits(maps.depth))
     label = f"σ of the {what} ({record.unit})"
@@ -157,14 +168,14 @@ def _named_maps(
     yield record.visibility, visibility, map_picture(visibility, "views that see it", 0.0, most)
 
 
-def _write_points(folder: Path, maps: SurfaceMaps, levels: Picture) -> str:
+def _write_points(folder: Path, maps: SurfaceMaps, levels: Picture, unit: str) -> str:
     """Write the samples whose depth is known as a point cloud, and return its name."""
     grid = maps.grid
     x, y = (
         first + grid.pitch_mm * np.arange(count)
         for first, count in zip(grid.origin_mm, reversed(grid.shape), strict=True)
     )
-    write_points(folder / POINTS, maps.depth, x, y, levels)
+    write_points(folder / POINTS, maps.depth, x, y, levels, in_mm=unit == "mm")
     return POINTS
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import FileFailed
 from faintfield.pipelines.formats.large_arrays import memory_or_file
-from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of, words_of
+from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
 from faintfield.pipelines.formats.results.plane_files import Origin, PlaneFiles
 from faintfield.pipelines.formats.results.records import (
     JOINT_METHODS,
@@ -23,6 +23,7 @@ from faintfield.pipelines.formats.results.records import (
     PlaneRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.sets.stated import in_units, light_per_e
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.joint import solve_together
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
@@ -84,7 +85,7 @@ class Channel:
             try:
                 operator = self._factory.at(place, grid)
             except GeometryMismatch as failure:
-                raise GeometryMismatch(f"plane at {words_of(place)}: {failure}") from failure
+                raise GeometryMismatch(f"plane at {self._words(place)}: {failure}") from failure
             messages += self._blind_views(operator, place)
             if task.with_focus:
                 focus[place] = FocusPoint(*focus_measure(operator, self._images, self._halves()))
@@ -117,7 +118,16 @@ class Channel:
             **structs.asdict(solution.record),
             flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
         )
-        files.save_part(task.layout.name, {"plane": solution.plane, **solution.sidecars}, record, focus)
+        arrays = {"plane": solution.plane, **solution.sidecars}
+        light = light_per_e(self._loaded)
+        if light != 1:
+            arrays |= {name: light * arrays[name] for name in ("plane", "sigma") if name in arrays}
+        focus = in_units(self._loaded, focus) if focus else None
+        files.save_part(task.layout.name, arrays, in_units(self._loaded, record), focus)
+
+    def _words(self, place: Place) -> str:
+        """Return the name of a plane in messages."""
+        return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._loaded.depth_text(place)
 
     def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
@@ -131,10 +141,9 @@ class Channel:
         blind = {int(view) // self._phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
         if not blind:
             return []
-        first = self._loaded.settings.view[min(blind)].image
-        return [
-            f"{words_of(place)}: {len(blind)} views see nothing of the plane, {first} for one; are their poses right?"
-        ]
+        first, count = self._loaded.settings.view[min(blind)].image, len(blind)
+        place_words = self._words(place)
+        return [f"{place_words}: {count} views see nothing of the plane, {first} for one; are their poses right?"]
 
 
 # Does the tasks of a set in any order, with a folder for temporary files; yields each when saved, with its messages.
@@ -241,7 +250,7 @@ class Sweep:
         for files in candidates:
             key = (files.method, files.place)
             if key not in self.finished and not files.missing():
-                self.finished[key] = files.finish(self.grids[files.place].pitch_mm)
+                self.finished[key] = files.finish()
 
     @property
     def records(self) -> list[PlaneRecord]:
@@ -268,11 +277,12 @@ class Sweep:
         method = self.files[0].method
         depths = [place for place in self.grids if not isinstance(place, TiltedPlane)]
         curve = [_sum(self.finished[method, depth].focus) for depth in depths]
+        stated = self.loaded.stated_depth
         return FocusCurve(
-            depth_mm=depths,
+            depth_mm=[stated(depth) for depth in depths],
             detail_e2=[point.detail_e2 for point in curve],
             sigma_e2=[point.sigma_e2 for point in curve],
-            sharp_mm=sharp_depths_mm(depths, curve),
+            sharp_mm=[stated(depth) for depth in sharp_depths_mm(depths, curve)],
         )
 
 

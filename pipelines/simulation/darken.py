@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
-from faintfield.pipelines.formats.image_files import mask_picture, write_plane, write_png
+from faintfield.pipelines.formats.image_files import ONE_PIXEL, mask_picture, write_plane, write_png
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_set
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
@@ -85,7 +85,7 @@ def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, ov
         _write_dark_views(bright, layouts, folder, options, scale_e)
         write_png(folder / OBJECT_REGION, mask_picture(region))
         origin = provenance("darken", options, dict(bright.input_hashes()))
-        record = msgspec.structs.asdict(origin) | {"scale_e": scale_e, "photons_on_object": photons}
+        record = origin.parts() | {"scale_e": scale_e, "photons_on_object": photons}
         write_json(folder / "provenance.json", record)
     known = {"quantum_efficiency": options.quantum_efficiency, "read_noise_e": options.read_noise_e}
     return Darkened(
@@ -130,7 +130,7 @@ def _light(bright: ElementalSet, path: Path, layouts: list[ChannelLayout]) -> ND
         for lattice in layout.lattices:
             noise = lattice_noise(bright, lattice, frame)
             electrons = noise.electrons(lattice.of(layout.of(frame.pixels_dn)))
-            above = electrons - noise.background_e(bright.settings.exposure_s)
+            above = electrons - bright.background_e(noise)
             lattice.of(layout.of(light))[:] = np.maximum(above, 0)
     return light
 
@@ -152,10 +152,15 @@ def _write_dark_views(
         write_exposures(folder, names, signal_e, sensor, options.exposure_s, generator)
     camera = bright.settings.camera
     if bright.flat is not None:
-        write_plane(folder / _FLAT, bright.flat, pitch_mm=1.0)
+        write_plane(folder / _FLAT, bright.flat, ONE_PIXEL)
         camera = msgspec.structs.replace(camera, flat=_FLAT)
     views = [msgspec.structs.replace(view, image=name) for view, name in zip(bright.settings.view, names, strict=True)]
     settings = msgspec.structs.replace(
-        bright.settings, exposure_s=options.exposure_s, camera=camera, noise=stated_noise(sensor), view=views
+        bright.settings,
+        exposure_s=options.exposure_s,
+        units=msgspec.structs.replace(bright.settings.units, light="electrons"),
+        camera=camera,
+        noise=stated_noise(sensor),
+        view=views,
     )
     write_set(folder, settings)

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import write_json, writing_folder
-from faintfield.pipelines.formats.image_files import mask_picture, write_frame, write_plane, write_png
+from faintfield.pipelines.formats.image_files import (
+    ONE_PIXEL,
+    Spacing,
+    mask_picture,
+    write_frame,
+    write_plane,
+    write_png,
+)
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
@@ -173,12 +180,19 @@ class RenderedScene:
     def write_settings(self, folder: Path, poses_rt_cam_ref: NDArray[np.float64], noise: Noise) -> None:
         """Write the flat field and `elemental.toml`, which states the poses and the noise given."""
         optics = self.experiment.optics
-        write_plane(folder / _FLAT, optics.relative_illumination(), pitch_mm=1.0)
+        write_plane(folder / _FLAT, optics.relative_illumination(), ONE_PIXEL)
         lens = (optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, optics.distortion)
         camera = Camera(optics.size_px, *lens, self.mosaic, _FLAT)
         entries = zip(self.view_names, poses_rt_cam_ref, self._nodes, strict=True)
         views = [View(name, tuple(pose.tolist()), node) for name, pose, node in entries]
-        settings = ElementalSetFile(1, self.experiment.exposure_s, self.experiment.reference_view, camera, noise, views)
+        settings = ElementalSetFile(
+            format=1,
+            exposure_s=self.experiment.exposure_s,
+            reference_view=self.experiment.reference_view,
+            camera=camera,
+            noise=noise,
+            view=views,
+        )
         write_set(folder, settings)
 
 
@@ -269,7 +283,7 @@ def _write_textures(folder: Path, scene: RenderedScene, white_e: float) -> list[
         texture = f"truth/plane_{plane.depth_mm:07.1f}.tiff"
         visible = f"truth/visible_{plane.depth_mm:07.1f}.png"
         light = next(seen_by_ideal([plane if scene.mosaic else plane.grey()])).light
-        write_plane(folder / texture, light * white_e, plane.depth_mm / optics.fx_px)
+        write_plane(folder / texture, light * white_e, Spacing(plane.depth_mm / optics.fx_px))
         write_png(folder / visible, mask_picture(all_visible[plane.name] > 0.5))
         entries.append(TruePlane(plane.name, plane.depth_mm, texture, visible))
     return entries
@@ -280,6 +294,6 @@ def _write_surface(folder: Path, scene: RenderedScene, white_e: float) -> TrueSu
     coloured = scene.experiment if scene.mosaic else scene.experiment.grey()
     ideal = replace(coloured, optics=coloured.optics.ideal())
     surface = TrueSurface("truth/true_depth_mm.tiff", "truth/true_picture.tiff")
-    write_plane(folder / surface.depth_mm, true_depth_mm(ideal.surfaces, ideal.optics), pitch_mm=1.0)
-    write_plane(folder / surface.picture, next(ideal.render(np.zeros((1, 6)))).light * white_e, pitch_mm=1.0)
+    write_plane(folder / surface.depth_mm, true_depth_mm(ideal.surfaces, ideal.optics), ONE_PIXEL)
+    write_plane(folder / surface.picture, next(ideal.render(np.zeros((1, 6)))).light * white_e, ONE_PIXEL)
     return surface

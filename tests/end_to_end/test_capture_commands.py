@@ -156,16 +156,21 @@ def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
             "'noise_reference'; did you mean 'bright'?",
         ),
         ('"serpentine"', '"snake"', "BadValue", "grid.order = 'snake'; choose from 'raster', 'serpentine'"),
-        ('protocol = "simulated"', 'protocol = "klipper"', "BadValue", "choose from 'grbl', 'marlin', 'simulated'"),
+        (
+            'protocol = "simulated"',
+            'protocol = "klipper"',
+            "UnknownPlugin",
+            "stage.protocol = 'klipper'; choose from 'grbl', 'marlin', 'simulated', 'micromanager', no plug-in is",
+        ),
         ("square_mm = 40.0", "square_mm = 4.0", "BadValue", "markers smaller"),
         ('dictionary = "DICT_5X5_1000"', 'dictionary = "5X5"', "BadValue", "no dictionary of OpenCV"),
         ("exposure_s = 0.1\n", "exposure_s = 0.0\n", "BadValue", "above 0 s"),
         (
             'backend = "simulated"',
             'backend = "gphoto"',
-            "BadValue",
-            "camera.backend = 'gphoto'; choose from 'gphoto2', 'micromanager', 'folder', 'simulated'; "
-            "did you mean 'gphoto2'?",
+            "UnknownPlugin",
+            "camera.backend = 'gphoto'; choose from 'gphoto2', 'micromanager', 'aravis', 'folder', 'simulated', "
+            "no plug-in is installed; did you mean 'gphoto2'?",
         ),
         *[
             (
@@ -174,7 +179,7 @@ def test_check_remembers_the_stage_s_settings(shell: Shell) -> None:
                 "UnknownKey",
                 "'camera.size_px' is not a key that is read; it is for backend = 'simulated' alone: remove it",
             )
-            for other in ("gphoto2", "micromanager", "folder")
+            for other in ("gphoto2", "micromanager", "aravis", "folder")
         ],
         (
             "[grid]",
@@ -276,7 +281,33 @@ def test_a_session_stays_with_its_rig_and_with_one_capture(shell: Shell) -> None
         assert shell.run("verify", shell.session) == 1
     shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
     assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert "PlanRefused: [grid] of the rig.toml is not what the plan.json of the session says" in shell.words
+    assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in shell.words
+
+
+def test_check_compares_with_a_session_that_is_to_be_resumed(shell: Shell) -> None:
+    small(shell)
+    assert shell.run("check", shell.rig, "--session", shell.session) == 1
+    assert "MissingFile" in shell.words
+    with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
+        assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
+    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == []
+    assert "a resume would be accepted; no settings differ" in shell.words
+    shell.edit("leak_dn = 8.0", "leak_dn = 9.0")
+    changed = ["checks.leak_dn was 8.0 and is 9.0"]
+    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == changed
+    assert f"session: {changed[0]}; would apply from the resume on" in shell.words
+    shell.edit("pitch_mm = 50.0", "pitch_mm = 40.0")
+    assert shell.run("check", shell.rig, "--session", shell.session) == 1
+    assert f"session: {changed[0]}; would apply from the resume on" in shell.words
+    assert "session: grid.pitch_mm was 50.0 and is 40.0; the session keeps the old value" in shell.words
+    assert "PlanRefused: the rig.toml differs" in shell.words
+    with Journal(shell.session / "journal.sqlite", read_only=True) as journal:
+        assert journal.events("setting_changed") == []
+    shell.edit("pitch_mm = 40.0", "pitch_mm = 50.0")
+    assert shell.run("capture", shell.rig, shell.session, "--yes") == 0
+    assert f"{changed[0]}, from now on" in shell.words
+    assert shell.result("check", shell.rig, "--session", shell.session)["changed_since_session"] == []
+    assert "it is complete, nothing is left to capture" in shell.words
 
 
 def test_verify_says_what_is_wrong(shell: Shell) -> None:

@@ -32,7 +32,7 @@ from faintfield.rig.capture.guide import Prompt, Status
 from faintfield.rig.capture.loop import Capture
 from faintfield.rig.capture.survey import survey
 from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import CaptureStopped, RigError
+from faintfield.rig.errors import CameraError, CaptureStopped, RigError
 from faintfield.rig.plan import planned_frames
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
@@ -457,6 +457,7 @@ def test_a_capture_whose_page_fails_goes_on(
     assert verify(session).sealed
 
 
-def test_pixels_that_are_no_numbers_are_shown_nowhere(tmp_path: Path) -> None:
+def test_pixels_that_are_no_numbers_are_no_frame(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "frame.tiff", np.array([[1.0, np.nan]], np.float32))
-    assert guided.read_pixels(tmp_path / "frame.tiff") is None
+    with pytest.raises(CameraError, match=r"values that are no numbers; "):
+        guided.read_pixels(tmp_path / "frame.tiff")

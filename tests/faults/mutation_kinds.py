@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+import tifffile
 import tomli_w
 
 from faintfield.calib.board import Board
@@ -83,7 +84,7 @@ class Kind:
     files: tuple[str, ...]
     calls: tuple[Call, ...]
     usual: int = 60
-    many: int = 900
+    many: int = 300
 
 
 def _done(*words: object) -> None:
@@ -139,9 +140,39 @@ def _pictures(folder: Path) -> None:
     for depth in ("8_bits", "16_bits"):
         (folder / depth).mkdir(parents=True)
     write_frame(folder / "16_bits" / "view_r0_c0.tiff", grey)
-    cv2.imwrite(str(folder / "16_bits" / "view_r0_c1.png"), grey)
+    cv2.imwrite(str(folder / "16_bits" / "view_r0_c1.png"), grey[::-1])
     cv2.imwrite(str(folder / "8_bits" / "view_r0_c0.png"), (grey >> 4).astype(np.uint8))
-    cv2.imwrite(str(folder / "8_bits" / "view_r0_c1.jpg"), (grey >> 4).astype(np.uint8))
+    cv2.imwrite(str(folder / "8_bits" / "view_r0_c1.jpg"), (grey[::-1] >> 4).astype(np.uint8))
+
+
+def _other_pictures(folder: Path) -> None:
+    """Write pictures of less usual kinds, a stack of four, and a light field of the HCI benchmark with its truth."""
+    rng = np.random.default_rng(5)
+    grey = rng.integers(0, 4000, _SIDES_PX[::-1]).astype(np.uint16)
+    for name, pixels in {
+        "bmp/view_r0_c0.bmp": (grey >> 4).astype(np.uint8),
+        "pgm/view_r0_c0.pgm": grey,
+        "pfm/view_r0_c0.pfm": grey.astype(np.float32),
+        "hci/gt_disp_lowres.pfm": (grey / 4000).astype(np.float32),
+        **{f"hci/input_Cam00{it}.png": (np.roll(grey, it, axis=1) >> 4).astype(np.uint8) for it in range(9)},
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / name), pixels)
+    tifffile.imwrite(
+        folder / "stack.tif", np.stack([np.roll(grey, it, axis=1) for it in range(4)]), photometric="minisblack"
+    )
+    (folder / "hci" / "parameters.cfg").write_text(
+        f"[intrinsics]\nfocal_length_mm = 100\nimage_resolution_x_px = {_SIDES_PX[0]}\n"
+        f"image_resolution_y_px = {_SIDES_PX[1]}\nsensor_size_mm = 35\n"
+        "[extrinsics]\nnum_cams_x = 3\nnum_cams_y = 3\nbaseline_mm = 50\nfocus_distance_m = 6\n"
+    )
+
+
+def _pose_table(folder: Path) -> None:
+    """Write a small set of simulated views with a table of poses."""
+    _simulated(folder)
+    rows = [f"{path.name},{10 * n},0.5,{n},0,0,0,1" for n, path in enumerate(sorted(folder.glob("view_*.tiff")))]
+    (folder / "poses.csv").write_text("\n".join(["name,x_mm,y_mm,z_mm,qx,qy,qz,qw", *rows]) + "\n")
 
 
 def _raw_picture(folder: Path) -> None:
@@ -283,11 +314,16 @@ _VERIFY = Call("verify IN/session", _NOTHING, notices=("session/plan.json", _JOU
 
 KINDS: Mapping[str, Kind] = {
     "elemental set": Kind(_simulated, ("elemental.toml",), _READ_SET),
-    "frames": Kind(_simulated, ("view_*.tiff", "noise_reference.tiff"), _READ_SET[:3], usual=30, many=400),
-    "truth": Kind(_simulated, ("truth.json", "truth/*"), (Call(_RECONSTRUCT), Call(_BACKPROJECT)), usual=30, many=330),
+    "frames": Kind(_simulated, ("view_*.tiff", "noise_reference.tiff"), _READ_SET[:3], usual=30, many=300),
+    "truth": Kind(_simulated, ("truth.json", "truth/*"), (Call(_RECONSTRUCT), Call(_BACKPROJECT)), usual=30, many=300),
     "plane poses": Kind(_plane_poses, ("poses.toml",), (Call(f"{_BACKPROJECT} --plane-pose IN/poses.toml"),)),
     "pictures": Kind(_pictures, ("*/view_*",), (Call("import grid IN/8_bits OUT"), Call("import grid IN/16_bits OUT"))),
     "raw picture": Kind(_raw_picture, ("view_*",), (Call("import grid IN OUT"),), usual=8, many=60),
+    "other pictures": Kind(
+        _other_pictures,
+        ("*/view_*", "stack.tif", "hci/*.cfg", "hci/*.pfm"),
+        tuple(Call(f"import grid IN/{name} OUT") for name in ("bmp", "pgm", "pfm", "stack.tif", "hci")),
+    ),
     "rig": Kind(
         _rig,
         ("rig.toml", "rig*.json"),
@@ -301,7 +337,11 @@ KINDS: Mapping[str, Kind] = {
         many=50,
     ),
     "noise set": Kind(
-        _dark_room, ("noise.toml", "noise.toml", "*.tiff"), (Call("noise IN --out OUT"),), usual=8, many=60
+        _dark_room,
+        ("noise.toml", "noise.toml", "*.tiff"),
+        (Call("noise IN --out OUT"), Call("export emva1288 IN OUT", copies=("OUT/images/*",))),
+        usual=8,
+        many=60,
     ),
     "noise": Kind(
         _measured_noise,
@@ -310,10 +350,11 @@ KINDS: Mapping[str, Kind] = {
             Call(_RECONSTRUCT),
             Call(_BACKPROJECT),
             Call("darken IN OUT"),
+            Call("noise --compare IN IN/noise.json", _NOTHING),
             Call("verify IN", _NOTHING, notices=("noise_maps.npz",)),
         ),
         usual=30,
-        many=330,
+        many=300,
     ),
     "geometry": Kind(
         _measured_geometry,
@@ -324,7 +365,7 @@ KINDS: Mapping[str, Kind] = {
             Call("verify IN", _NOTHING, notices=("*.npz", "cameras/*")),
         ),
         usual=30,
-        many=330,
+        many=300,
     ),
     "COLMAP text": Kind(_exported("colmap"), ("model/*.txt",), (Call("import colmap IN/model OUT --images IN"),)),
     "COLMAP binary": Kind(
@@ -333,6 +374,10 @@ KINDS: Mapping[str, Kind] = {
     "camera models": Kind(
         _exported("mrcal"), ("model/*.cameramodel",), (Call("import mrcal IN/model OUT --images IN"),)
     ),
+    "transforms": Kind(
+        _exported("nerfstudio"), ("model/*.json",), (Call("import nerfstudio IN/model OUT --images IN"),)
+    ),
+    "pose table": Kind(_pose_table, ("poses.csv",), (Call("import poses IN/poses.csv OUT --fx-px 100"),)),
     "EMVA 1288": Kind(
         _emva1288,
         ("descriptor.txt", "descriptor.txt", "images/*"),
@@ -347,9 +392,9 @@ KINDS: Mapping[str, Kind] = {
             Call("noise IN/session --out OUT"),
         ),
         usual=30,
-        many=330,
+        many=300,
     ),
-    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME), usual=40, many=400),
+    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME), usual=40, many=300),
     "measured session": Kind(
         _whole_session,
         (
@@ -382,7 +427,7 @@ KINDS: Mapping[str, Kind] = {
             Call("export zarr IN/sweep OUT"),
         ),
         usual=40,
-        many=400,
+        many=300,
     ),
     "zarr": Kind(
         _zarr,

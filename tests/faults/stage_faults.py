@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 from faintfield.rig.simulation.controller.bench import Bench
+from faintfield.rig.simulation.controller.firmware import SimulatedFirmware
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.grblhal import SimulatedGrblHal
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.simulation.controller.wire import ByteFilter
-from faintfield.rig.stages.protocol import ProtocolName
 
 type Nature = Literal["wire", "controller", "mechanics"]
 
@@ -28,14 +29,17 @@ class Fault:
         Part that it affects. Faults of the mechanics show in no report; only a drift check finds them.
     strike : callable
         Makes it happen on a bench.
-    protocols : tuple of str
+    kind : type
         Controllers that can have it.
+    recovery_s : float
+        Longest recovery, without homing.
     """
 
     name: str
     nature: Nature
     strike: Callable[[Bench], None]
-    protocols: tuple[ProtocolName, ...] = ("grbl", "marlin")
+    kind: type = object
+    recovery_s: float = 2.0
 
     def __str__(self) -> str:
         return self.name
@@ -117,6 +121,21 @@ def _unplug_and_return(bench: Bench) -> None:
     bench.clock.after(0.3, bench.plug)
 
 
+def _vanish(bench: Bench) -> None:
+    """Unplug for three seconds, as when USB lists a port anew."""
+    bench.unplug()
+    bench.clock.after(3.0, bench.plug)
+
+
+def _keep_host_busy(bench: Bench) -> None:
+    bench.host_busy_until_s = bench.clock.now_s() + 1.0
+
+
+def _await_button(firmware: SimulatedMarlin) -> None:
+    firmware.wait_for_button()
+    firmware.clock.after(10.0, firmware.press_button)
+
+
 def _stick(bench: Bench) -> None:
     bench.true_position()
     bench.firmware.mechanics.axes[0].stuck = True
@@ -181,6 +200,11 @@ def _lose_settings(firmware: SimulatedGrbl) -> None:
     firmware.restart()
 
 
+def _stop_briefly(firmware: SimulatedGrblHal) -> None:
+    firmware.press_emergency_stop()
+    firmware.clock.after(4.0, firmware.release_emergency_stop)
+
+
 def _damage_every_line(bench: Bench) -> None:
     bench.wire.filters_to_controller.append(lambda data: _flip(data) if len(data) > 4 else data)
 
@@ -204,6 +228,8 @@ _COMMON = (
     Fault("every line damaged", "wire", _damage_every_line),
     Fault("unplugged", "wire", Bench.unplug),
     Fault("unplugged and back", "wire", _unplug_and_return),
+    Fault("port gone for three seconds", "wire", _vanish, recovery_s=8.0),
+    Fault("computer busy", "wire", _keep_host_busy),
     Fault("restart", "controller", lambda bench: bench.firmware.restart()),
     Fault("restart unseen", "controller", _restart_unseen),
     Fault("busy for ever", "controller", _never_end),
@@ -215,23 +241,33 @@ _COMMON = (
     Fault("steps lost the other way", "mechanics", _lose_steps(1, -0.8)),
 )
 _GRBL = (
-    *(Fault(f"alarm {code}", "controller", _alarm(code), ("grbl",)) for code in range(1, 10)),
-    Fault("hold button", "controller", _on(SimulatedGrbl, SimulatedGrbl.pause), ("grbl",)),
-    Fault("door open", "controller", _on(SimulatedGrbl, SimulatedGrbl.open_door), ("grbl",)),
-    Fault("idle told too early", "wire", _early_idle, ("grbl",)),
-    Fault("settings lost", "controller", _on(SimulatedGrbl, _lose_settings), ("grbl",)),
+    *(Fault(f"alarm {code}", "controller", _alarm(code), SimulatedGrbl) for code in range(1, 10)),
+    Fault("hold button", "controller", _on(SimulatedGrbl, SimulatedGrbl.pause), SimulatedGrbl),
+    Fault("door open", "controller", _on(SimulatedGrbl, lambda firmware: firmware.open_door()), SimulatedGrbl),
+    Fault("idle told too early", "wire", _early_idle, SimulatedGrbl),
+    Fault("settings lost", "controller", _on(SimulatedGrbl, _lose_settings), SimulatedGrbl),
+)
+_HAL = (
+    Fault(
+        "emergency stop", "controller", _on(SimulatedGrblHal, SimulatedGrblHal.press_emergency_stop), SimulatedGrblHal
+    ),
+    Fault("emergency stop for a moment", "controller", _on(SimulatedGrblHal, _stop_briefly), SimulatedGrblHal),
 )
 _MARLIN = (
     Fault(
-        "killed", "controller", _on(SimulatedMarlin, lambda firmware: firmware.kill("MINTEMP triggered")), ("marlin",)
+        "killed",
+        "controller",
+        _on(SimulatedMarlin, lambda firmware: firmware.kill("MINTEMP triggered")),
+        SimulatedMarlin,
     ),
-    Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), ("marlin",)),
+    Fault("button awaited for a moment", "controller", _on(SimulatedMarlin, _await_button), SimulatedMarlin),
+    Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), SimulatedMarlin),
 )
 
-FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
+FAULTS = (*_COMMON, *_GRBL, *_HAL, *_MARLIN)
 """All faults."""
 
 
-def faults_of(protocol: ProtocolName) -> tuple[Fault, ...]:
-    """Return the faults that a controller of `protocol` can have."""
-    return tuple(fault for fault in FAULTS if protocol in fault.protocols)
+def faults_of(controller: type[SimulatedFirmware]) -> tuple[Fault, ...]:
+    """Return the faults that a controller can have."""
+    return tuple(fault for fault in FAULTS if issubclass(controller, fault.kind))

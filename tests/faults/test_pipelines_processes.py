@@ -102,6 +102,8 @@ def test_ctrl_c_in_the_middle_of_a_reconstruction_keeps_what_was_finished(small_
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=HANG_S)
     assert (process.returncode, said) == (1, "")
+    *progress, complaint = complaint.splitlines()
+    assert all(line.startswith("reconstructing planes: ") for line in progress)
     assert complaint.startswith("faintfield: Interrupted: ")
     assert len(complaint.splitlines()) == 1
     names = [path.name for path in out.iterdir()]

@@ -17,7 +17,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth, texture_and_region
 from faintfield.pipelines.reconstruction.autofocus import searched_range_mm
-from faintfield.pipelines.reconstruction.comparison import compared_depths
+from faintfield.pipelines.reconstruction.comparison import binned_views
 from faintfield.recon.depth.focus import SURE
 from tests.pipelines.conftest import Command, Edit, SetMaker
 
@@ -174,8 +174,8 @@ def test_noise_has_no_planes_and_that_is_said(make_set: SetMaker, tmp_path: Path
     dark = [generator.normal(100, 6, (48, 64)).round().astype(np.uint16) for _ in range(6)]
     ended = faintfield("reconstruct", make_set(dark), "--out", tmp_path / "out", "--depth-mm", "auto")
     assert ended.returncode == 1
-    assert "NothingInFocus: between" in ended.stderr
-    assert "--sweep-mm" in ended.stderr
+    assert "the views agree no better than shuffled ones (p = " in ended.stderr
+    assert "give the depths by --depth" in ended.stderr
     assert not (tmp_path / "out" / "reconstruction.json").exists()
 
 
@@ -253,7 +253,8 @@ def test_the_pieces_of_a_photographed_chess_board_stand_in_their_order(
     done("import", "grid", tmp_path, tmp_path / "chess", "--disparity-px", 12)
     loaded = load_set(tmp_path / "chess")
     disparities_px = np.linspace(-12, 3.6, 27)
-    compared = compared_depths(loaded, [loaded.depth_of_disparity(d) for d in disparities_px.tolist()], tmp_path)
+    depths_mm = [loaded.depth_of_disparity(d) for d in disparities_px.tolist()]
+    compared = binned_views(loaded, depths_mm[13], tmp_path).compared(depths_mm)
     found = compared.depth_map()
     disparity_px = np.interp(found.index, np.arange(27), disparities_px) / 3
     disparity_px[found.confidence < SURE] = np.nan
@@ -277,13 +278,13 @@ def test_planes_of_one_pitch_make_one_picture(scene: Path, swept: Path, tmp_path
     assert np.corrcoef(same.ravel(), usual.ravel())[0, 1] > 0.9
 
 
-def test_bins_that_are_stated_are_taken(scene: Path, tmp_path: Path) -> None:
+def test_bins_are_as_large_as_asked(scene: Path, tmp_path: Path) -> None:
     loaded = load_set(scene)
-    chosen = compared_depths(loaded, [500.0, 700.0], tmp_path)
-    other = 2 * chosen.bins_px
-    stated = compared_depths(loaded, [500.0, 700.0], tmp_path, bins_px=other)
-    assert stated.bins_px == other
-    assert stated.planes[0].light.shape == tuple(side // other for side in (120, 160))
+    larger_px = 2 * binned_views(loaded, 700.0, tmp_path).bins_px
+    views = binned_views(loaded, 700.0, tmp_path, min_bins_px=larger_px)
+    assert views.bins_px == larger_px
+    compared = views.compared([500.0, 700.0])
+    assert [plane.light.shape for plane in compared.planes] == [tuple(side // larger_px for side in (120, 160))] * 2
 
 
 def test_depths_that_are_the_same_count_once(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

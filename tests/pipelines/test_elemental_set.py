@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.errors import BadValue, InputError, MissingFile, UnknownKey
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, Noise, View, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.units import DepthUnit, Units
 
 type SetMaker = Callable[..., Path]
 type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
@@ -56,7 +57,9 @@ def elemental_sets(draw: st.DrawFn) -> ElementalSetFile:
         draw(st.floats(1e-3, 1)),
         draw(st.none() | positive),
     )
-    return ElementalSetFile(1, draw(positive), reference, camera, noise, views)
+    return ElementalSetFile(
+        format=1, exposure_s=draw(positive), reference_view=reference, camera=camera, noise=noise, view=views
+    )
 
 
 @given(elemental_sets())
@@ -220,7 +223,9 @@ def _rectified_set(
         for row, column in nodes
     ]
     camera = Camera((40, 30), fx_px, fx_px, 20.0, 15.0)
-    return ElementalSetFile(1, 1.0, 0, camera, Noise(1.0, 0.0), views)
+    return ElementalSetFile(
+        format=1, exposure_s=1.0, reference_view=0, camera=camera, noise=Noise(1.0, 0.0), view=views
+    )
 
 
 def _loaded(settings: ElementalSetFile, folder: Path) -> Any:
@@ -250,6 +255,24 @@ def test_the_depth_of_a_disparity_is_that_of_similar_triangles(
     else:
         with pytest.raises(BadValue, match="no plane in front of the cameras"):
             loaded.depth_of_disparity(disparity_px)
+
+
+@pytest.mark.parametrize(
+    ("unit", "depth", "both"),
+    [
+        ("mm", "400 mm", "250 to 400 mm"),
+        ("disparity_px", "disparity 0 px", "disparities -1.5 to 0 px"),
+        ("relative", "depth 400", "depths 250 to 400"),
+    ],
+)
+def test_depths_are_worded_in_the_unit_of_the_set(tmp_path: Path, unit: DepthUnit, depth: str, both: str) -> None:
+    # A point at depth z moves by 2.5 - 10 * 100 / z px from node to node
+    settings = _rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1), (1, 0)])
+    loaded = _loaded(msgspec.structs.replace(settings, units=Units(depth=unit)), tmp_path)
+    assert loaded.depth_text(400.0) == depth
+    assert loaded.depth_range_text(250.0, 400.0) == both
+    assert loaded.disparity_of_depth(250.0) == pytest.approx(-1.5)
+    assert loaded.depth_of_disparity(-1.5) == pytest.approx(250.0)
 
 
 def test_a_disparity_beyond_infinity_is_refused_with_that_of_infinity(tmp_path: Path) -> None:

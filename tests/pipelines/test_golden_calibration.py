@@ -25,7 +25,13 @@ BOARDS = [Board(f"b{index}", 9, 7, 40.0, 29.0, "DICT_4X4_250", 31 * index) for i
 
 
 def layout(value: Any) -> Any:
-    """Return a JSON value with the type of each scalar in its place; keys in their order, lists by their first item."""
+    """Return a JSON value with the type of each scalar in its place; keys in their order, lists by their first item.
+
+    A quantity has a value with its error, or none with the reason: which of the two is a matter of the frames.
+    """
+    if isinstance(value, dict) and list(value) in (["value", "se", "ci95"], ["value", "why"]):
+        assert (value["value"] is None) == ("why" in value)
+        return "quantity"
     if isinstance(value, dict):
         return [(key, layout(part)) for key, part in value.items()]
     if isinstance(value, list):

@@ -53,7 +53,7 @@ def test_nodes_are_the_last_two_numbers_of_a_name_counted_from_the_first(
 ) -> None:
     src = _pictures(tmp_path / "src", names)
     (src / "README.txt").write_text("not a picture")
-    result = json.loads(done("--json", "import", "grid", src, tmp_path / "out", "--pitch-mm", 50).stdout)
+    result = json.loads(done("--json", "import", "grid", src, tmp_path / "out", "--pitch-mm", 50, "--linear").stdout)
     assert (result["rows"], result["columns"], result["size_px"]) == (2, 3, [8, 6])
     loaded = load_set(tmp_path / "out")
     assert [view.node for view in loaded.settings.view] == [(row, column) for row in range(2) for column in range(3)]
@@ -81,18 +81,28 @@ def test_one_picture_is_a_grid_of_one(tmp_path: Path, done: Command) -> None:
 @pytest.mark.parametrize(
     ("names", "options", "failure", "words"),
     [
-        ([], (), "MissingFile", "holds no pictures"),
-        (["view_r0_c0.tiff", "view_r1_c1.tiff"], (), "MissingFile", "the view of node (0, 1) is missing, 2 of 4"),
-        (_grid_names((3, 4), (7, 8))[:-1], (), "MissingFile", "the view of node (4, 8) is missing, 1 of 4"),
+        ([], (), "MissingFile", "is empty; name the folder that holds the pictures"),
+        (
+            ["view_r0_c0.tiff", "view_r1_c1.tiff"],
+            (),
+            "MissingFile",
+            "the view in row 0 and column 1, counted from 0, is missing, 2 of 4",
+        ),
+        (
+            _grid_names((3, 4, 5), (7, 8, 9))[::2][:-1],
+            (),
+            "MissingFile",
+            "the view in row 0 and column 1, counted from 0, is missing, 5 of 9",
+        ),
         (["one.tiff", "two.tiff"], (), "BadValue", "has no row and column; give --rows and --columns"),
         (["a1_1.tiff", "b1_1.tiff"], (), "BadValue", "is at node (1, 1) like a1_1.tiff"),
         (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "holds 2 pictures, a grid of 3 x 1 needs 3"),
-        (["a.jpg", "a.png"], ("--rows", 2), "BadValue", "would become a.tiff like another picture"),
+        (["a.jpg", "a.png"], ("--rows", 2), "BadValue", "holds pictures of several kinds (1 .jpg file, 1 .png file)"),
         (
             [f"PXL_20240101_1200{second:02}123.png" for second in range(4)],
             (),
             "BadValue",
-            "PXL_20240101_120000123.png would make a grid of 1 x 3001 of 4 pictures, so they are not row and column",
+            "src: names count 4 pictures by one number, from 120000123 to 120003123",
         ),
         (["DSC_1_0.png", "DSC_800000000_900000000.png"], (), "BadValue", "they are not row and column; give --rows"),
     ],
@@ -127,12 +137,12 @@ def test_pictures_that_are_not_alike_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["src"]
 
 
-def test_a_first_picture_without_whole_numbers_is_refused(tmp_path: Path, faintfield: Command) -> None:
+def test_floats_and_whole_numbers_are_not_mixed(tmp_path: Path, faintfield: Command) -> None:
     src = _pictures(tmp_path / "src", _grid_names([0], [0, 1]))
     tifffile.imwrite(src / "view_r0_c0.tiff", _picture().astype(np.float32))
     ended = faintfield("import", "grid", src, tmp_path / "out")
     assert ended.returncode == 1
-    assert f"faintfield: BadValue: {src / 'view_r0_c0.tiff'}: holds float32 pixels" in ended.stderr
+    assert f"faintfield: WrongBitDepth: {src / 'view_r0_c1.tiff'}: holds uint16 pixels, the first" in ended.stderr
 
 
 @pytest.mark.parametrize("name", ["view_r0_c0.tiff", "view_r0_c0.png"])
@@ -147,13 +157,13 @@ def test_16_bit_pictures_are_kept_byte_for_byte(name: str, tmp_path: Path, done:
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
 @pytest.mark.parametrize("shape", [(24, 32), (24, 32, 3)], ids=["grey", "colour"])
-def test_8_bit_pictures_become_16_bit_ones_of_the_same_values(
+def test_linear_8_bit_pictures_become_16_bit_ones_of_the_same_values(
     shape: tuple[int, ...], suffix: str, tmp_path: Path, done: Command
 ) -> None:
     (tmp_path / "src").mkdir()
     source = tmp_path / "src" / f"view_r0_c0.{suffix}"
     assert cv2.imwrite(str(source), np.random.default_rng(1).integers(0, 256, shape).astype(np.uint8))
-    done("import", "grid", tmp_path / "src", tmp_path / "out")
+    done("import", "grid", tmp_path / "src", tmp_path / "out", "--linear")
     loaded = load_set(tmp_path / "out")
     assert loaded.settings.view[0].image == "view_r0_c0.tiff"
     pixels = read_frame(loaded.image_paths[0]).pixels_dn
@@ -177,13 +187,22 @@ def test_noise_and_exposure_are_those_given(tmp_path: Path, done: Command) -> No
     assert loaded.settings.exposure_s == 0.25
     assert (loaded.noise.offset_dn, loaded.noise.gain_dn_per_e, loaded.noise.read_noise_e) == (64.0, 3.0, 4.0)
     assert (loaded.noise.dark_current_e_per_s, loaded.noise.quantum_efficiency) == (0.5, 0.6)
+    assert loaded.settings.units.light == "electrons"
+    assert "estimated" not in (tmp_path / "out" / "elemental.toml").read_text()
     assert "assumed" not in said
 
 
-def test_an_exposure_that_is_assumed_is_said_so(tmp_path: Path, done: Command) -> None:
+def test_an_exposure_that_nobody_states_is_not_known(tmp_path: Path, done: Command) -> None:
     ended = done("import", "grid", _pictures(tmp_path / "src", ["a.tiff"]), tmp_path / "out")
-    assert "do not state their exposure; 1 s is assumed" in ended.stderr
-    assert load_set(tmp_path / "out").settings.exposure_s == 1.0
+    assert " 1 s " not in ended.stderr
+    assert load_set(tmp_path / "out").settings.exposure_s is None
+
+
+def test_a_dark_current_needs_an_exposure(tmp_path: Path, faintfield: Command) -> None:
+    src = _pictures(tmp_path / "src", ["a.tiff"])
+    ended = faintfield("import", "grid", src, tmp_path / "out", "--dark-current-e-per-s", 2)
+    assert ended.returncode == 1
+    assert "states no exposure, without which 2 dark electrons per second mean nothing; give --exp" in ended.stderr
 
 
 def test_where_each_picture_came_from_is_recorded(tmp_path: Path, done: Command) -> None:
@@ -289,11 +308,18 @@ class TestRawFiles:
                 expected = frame.pixels_dn[row::2, column::2] - black_dn[row, column]
                 np.testing.assert_allclose(images.electrons[index], expected, atol=1e-3)
 
+    def test_one_view_has_a_depth_but_no_disparity(self, imported: Path, tmp_path: Path, faintfield: Command) -> None:
+        assert load_set(imported).units.depth == "relative"
+        ended = faintfield("reconstruct", imported, "--out", tmp_path / "planes", "--disparity-px", -1)
+        assert ended.returncode == 1
+        assert "all views are from one place" in ended.stderr
+        assert "give a depth instead" in ended.stderr
+
     def test_it_reconstructs_into_three_finite_channels(self, imported: Path, tmp_path: Path, done: Command) -> None:
-        done("reconstruct", imported, "--out", tmp_path / "planes", "--depth-mm", 1000, "--passes", 2)
+        done("reconstruct", imported, "--out", tmp_path / "planes", "--depth", 1, "--passes", 2)
         result = json.loads((tmp_path / "planes" / "reconstruction.json").read_text())
         assert [record["channel"] for record in result["planes"]] == ["red", "green", "blue"]
-        plane = tifffile.imread(tmp_path / "planes" / "plane_01000.0.tiff")
+        plane = tifffile.imread(tmp_path / "planes" / result["planes"][0]["file"])
         assert plane.shape == (578, 867, 3)
         assert np.isfinite(plane).all()
         frame = read_frame(imported / "colorchart.dng")

@@ -11,6 +11,7 @@ import pytest
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NoiseRecord
 from faintfield.pipelines.formats.results.noise_emva import EmvaRecord
+from faintfield.pipelines.pages import symbols
 from faintfield.pipelines.pages.emva_page import EMVA_PAGE, rounded
 from tests.calib.noise.darkroom import specimen
 from tests.pipelines.noise_sets import take_set, write_frames
@@ -99,8 +100,11 @@ def test_keys_stand_in_their_order(measured: tuple[Path, NoiseRecord]) -> None:
 
 def test_the_page_has_every_quantity_and_picture_and_loads_nothing(measured: tuple[Path, NoiseRecord]) -> None:
     page = (measured[0] / EMVA_PAGE).read_text()
-    for symbol in ("η", "K", "σ_d", "μ_p.min", "μ_e.sat", "SNR_max", "DR", "DSNU.row", "PRNU.col", "LE", "μ_I", "T_d"):
+    plain = ("η", "K", "1/K", "DR", "DSNU", "LE")
+    low = ("σ_d", "μ_p.min", "μ_e.sat", "SNR_max", "DSNU_row", "PRNU_col", "μ_I", "T_d")
+    for symbol in plain + tuple(it.replace("_", "<sub>") + "</sub>" for it in low):
         assert f'class="symbol">{symbol}</th>' in page, symbol
+    assert not re.search(r"[μσ]_", re.sub(r'aria-label="[^"]*"|<!--.*?-->', "", page))
     assert page.count("<svg") == 9
     assert not re.search(r"""(src|href)=["'](?!#|data:)|url\((?!#)|@import""", page.replace('xlink:href="#', 'x="'))
     assert "differ by 0 K" in page
@@ -137,5 +141,31 @@ def test_the_growth_of_dark_current_with_temperature_is_measured(tmp_path: Path)
 def test_values_have_two_digits_of_their_interval() -> None:
     assert rounded(12.3456, (12.1, 12.6)) == ("12.35", "12.10 … 12.60")
     assert rounded(-1234.5, (-1300.0, -1150.0)) == ("−1234", "−1300 … −1150")
+    assert rounded(38956.0, (38400.0, 39400.0)) == ("38960", "38400 … 39400")
     assert rounded(3.0, None) == ("3", "")
     assert rounded(0.05, (0.05, 0.05)) == ("0.0500000", "0.0500000 … 0.0500000")
+
+
+def test_symbols_have_subscripts_in_html_and_in_drawings() -> None:
+    assert symbols.html("a < μ_e.min, K σ_d(0), DSNU.row") == (
+        "a &lt; μ<sub>e.min</sub>, K σ<sub>d</sub>(0), DSNU<sub>row</sub>"
+    )
+    assert symbols.mathtext("σ_y.dark² (DN²)") == r"$σ_{\mathrm{y.dark}}^2$ (DN²)"
+    assert symbols.html("see noise.toml, quantum_efficiency and README.md") == (
+        "see noise.toml, quantum_efficiency and README.md"
+    )
+
+
+def test_the_table_has_the_units_of_other_reports(measured: tuple[Path, NoiseRecord]) -> None:
+    page, record = (measured[0] / EMVA_PAGE).read_text(), measured[1]
+    value = record.gain_dn_per_e.value
+    assert value is not None
+    row = re.search(r'symbol">1/K</th>.*?number">([\d.]+)</td>.*?unit">(.*?)</td>', page, re.DOTALL)
+    assert row is not None
+    assert float(row[1]) == pytest.approx(1 / value, rel=2e-3)
+    assert row[2] == "e⁻/DN"
+    read = record.read_noise_dn.value
+    assert read is not None
+    row = re.search(r'symbol">σ<sub>y.dark</sub>\(0\)</th>.*?number">([\d.]+)</td>', page, re.DOTALL)
+    assert row is not None
+    assert float(row[1]) == pytest.approx(np.sqrt(read**2 + 1 / 12), rel=2e-3)

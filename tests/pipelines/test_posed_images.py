@@ -51,7 +51,7 @@ def refused(ended: CompletedProcess[str], failure: str, *words: str) -> None:
 def test_principal_points_of_views_go_out_and_come_back(program: str, tmp_path: Path, done: Command) -> None:
     (tmp_path / "src").mkdir()
     for row, column in np.ndindex(2, 3):
-        tifffile.imwrite(tmp_path / "src" / f"view_r{row}_c{column}.tiff", IMAGE)
+        tifffile.imwrite(tmp_path / "src" / f"view_r{row}_c{column}.tiff", IMAGE + np.uint16(3 * row + column))
     options = ("--pitch-mm", 10, "--fx-px", 20, "--disparity-px", 2.3)
     done("import", "grid", tmp_path / "src", tmp_path / "set", *options)
     done("export", program, tmp_path / "set", tmp_path / "model")
@@ -121,6 +121,36 @@ def test_models_and_images_are_recorded(program: str, tmp_path: Path, done: Comm
     inputs = json.loads((tmp_path / "set" / "provenance.json").read_text())["inputs"]
     models = {"colmap": ("cameras.txt", "images.txt"), "mrcal": ("a.cameramodel",)}[program]
     assert inputs == {name: sha256(src / name) for name in (*models, "a.tiff")}
+
+
+@pytest.mark.parametrize(
+    ("program", "options", "depth"),
+    [
+        ("colmap", (), "relative"),
+        ("colmap", ("--mm-per-unit", 25.4), "mm"),
+        ("mrcal", (), "mm"),  # whose unit is the metre
+    ],
+)
+@pytest.mark.parametrize(("bits", "light"), [(8, "relative"), (16, "dn")])
+def test_what_is_imported_states_no_scale_gain_or_exposure_that_nobody_gave(
+    program: str, options: tuple[object, ...], depth: str, bits: int, light: str, tmp_path: Path, done: Command
+) -> None:
+    src = write_models(tmp_path / "src", IMAGE.astype(f"uint{bits}"))
+    done("import", program, src, tmp_path / "set", *options)
+    settings = load_set(tmp_path / "set").settings
+    assert (settings.units.depth, settings.units.light, settings.exposure_s) == (depth, light, None)
+
+
+@pytest.mark.parametrize(("depth", "units"), [("mm", ["mm", "m"]), ("relative", ["relative"] * 2)])
+def test_an_export_says_the_unit_of_its_lengths(
+    depth: str, units: list[str], make_set: SetMaker, edit: Edit, tmp_path: Path, done: Command
+) -> None:
+    folder = make_set([IMAGE])
+    edit(folder, lambda settings: settings.update(units={"depth": depth}))
+    for program, unit in zip(PROGRAMS, units, strict=True):
+        ended = done("--json", "export", program, folder, tmp_path / program)
+        assert json.loads(ended.stdout)["unit"] == unit
+        assert ("has no scale" in ended.stderr) == (depth == "relative")
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

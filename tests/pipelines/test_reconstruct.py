@@ -386,7 +386,7 @@ def test_a_small_penalty_settles(scene: Path, tmp_path: Path, done: Command) -> 
             2,
             "--penalty quadratic is for pmlem, joint",
         ),
-        (("--depth-mm", "auto", "--depth-map"), 2, "--depth-map compares depths of a sweep"),
+        (("--depth-mm", "auto", "--depth-map"), 2, "--depth-map compares those of a sweep"),
         (("--sweep-mm", "400:900"), 2, "give FIRST:LAST:COUNT, such as 400:900:64"),
         (("--sweep-mm", "100:100:64"), 2, "--sweep-mm 100:100:64: is no sweep; give two different ends"),
         (("--sweep-mm", "0:100:5"), 2, "two different positive depths"),

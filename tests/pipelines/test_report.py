@@ -134,7 +134,7 @@ def test_all_methods_and_depths_are_there_side_by_side_and_on_the_slider(text: s
     columns = json.loads(found[1])
     assert [column["title"] for column in columns] == list(METHOD_TITLES.values())
     for column in columns:
-        assert [plane["depth_mm"] for plane in column["planes"]] == [500.0, 600.0, 700.0]
+        assert [plane["depth"] for plane in column["planes"]] == [500.0, 600.0, 700.0]
 
 
 def test_all_planes_are_shown_on_the_grey_scale_of_the_least_noisy_method(page: _Page, original: Path) -> None:

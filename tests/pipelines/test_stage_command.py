@@ -99,7 +99,7 @@ def test_wrong_usage(shell: Shell) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--port", "simulated:plotter"), "grbl, marlin"),
+        (("--port", "simulated:plotter"), "grbl, grblhal, marlin"),
         (("--port", "simulated:grbl", "--protocol", "marlin"), "leave out --protocol"),
         (("--rig", "rig.toml", "--port", "/dev/ttyUSB0"), "leave out --port"),
         (("--rig", "rig.toml", "--baud", "9600"), "leave out --baud"),
@@ -157,7 +157,7 @@ def test_a_rig_file_brings_its_limits(shell: Shell, tmp_path: Path) -> None:
     ("old", "new", "named"),
     [
         ("port =", "prot =", "UnknownKey"),
-        ('"grbl"\n', '"klipper"\n', "BadValue"),
+        ('"grbl"\n', '"klipper"\n', "UnknownPlugin"),
         ("[-300, 0]", "[0, -300]", "BadValue"),
         ("[stage]", "[stage", "BadValue"),
     ],

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.surface_depths import BETWEEN_PIXELS, between_pixels, enlarged
+from faintfield.pipelines.reconstruction.comparison import BETWEEN_PIXELS
+from faintfield.pipelines.reconstruction.surface_depths import between_pixels, enlarged
 from tests.recon.surface_scene import expected_light, views_of
 
 

@@ -165,7 +165,7 @@ def test_a_surface_of_which_nothing_is_known_is_written(tmp_path: Path, monkeypa
 
 
 def test_a_failure_on_the_way_leaves_nothing_that_vouches(surface: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> int:
+    def fail(*_: object, **__: object) -> int:
         raise CannotWrite("no")
 
     monkeypatch.setattr(surface_files, "write_points", fail)

@@ -179,7 +179,7 @@ def test_only_files_that_all_colours_have_are_named(tmp_path: Path) -> None:
     for colour in ("green", "blue"):
         files.save_part(colour, one | {"sigma": one["plane"]}, structs.replace(record, channel=colour), None)
     assert files.missing() == []
-    for written in files.finish(1.0).planes:
+    for written in files.finish().planes:
         assert written.sigma_file == "plane_00500.0_sigma.tiff"
         assert written.opacity_file is UNSET
     assert sorted(path.name for path in tmp_path.glob("*.tiff")) == ["plane_00500.0.tiff", "plane_00500.0_sigma.tiff"]
@@ -210,4 +210,4 @@ def test_a_colour_of_another_size_than_its_record_says_is_refused(shape: tuple[i
         said = structs.replace(record, channel=colour, shape=(4, 5) if colour == "red" else shape)
         files.save_part(colour, {"plane": np.ones((4, 5))}, said, None)
     with pytest.raises(BadValue, match=r"holds 80 bytes, .* remove the folder .parts and reconstruct again"):
-        files.finish(1.0)
+        files.finish()

@@ -9,6 +9,7 @@ from faintfield.pipelines.formats.exchange.colmap import MODEL_FILES, ColmapImag
 from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
 from faintfield.pipelines.formats.files import writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 
 
 def export_colmap(
@@ -19,7 +20,9 @@ def export_colmap(
     binary: bool = False,
     overwrite: bool = False,
 ) -> dict[str, str | int]:
-    """Write the lens and poses of an elemental set as a COLMAP model without points; its unit is the mm.
+    """Write the lens and poses of an elemental set as a COLMAP model without points.
+
+    Its unit is the mm, or that of the poses if the set has no scale: then lengths are relative, and the result says so.
 
     Views with principal points of their own get cameras of their own.
 
@@ -44,6 +47,7 @@ def export_colmap(
             for view, lens, pose in zip(loaded.settings.view, lenses, loaded.poses_rt_cam_ref, strict=True)
         ],
     )
+    unit = stated_length(loaded, "mm")
     with writing_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
         write_model(folder, model, binary=binary)
-    return {"out": str(out), "views": len(model.images)}
+    return {"out": str(out), "views": len(model.images), "unit": unit}

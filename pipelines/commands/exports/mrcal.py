@@ -10,12 +10,15 @@ from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
 from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
 from faintfield.pipelines.formats.files import write_whole, writing_folder
 from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+from faintfield.pipelines.formats.sets.stated import stated_length
 
 
 def export_mrcal(
     elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
 ) -> dict[str, str | int]:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
+
+    Of a set without a scale lengths are relative, thousandths of those of its poses, and the result says so.
 
     Parameters
     ----------
@@ -33,7 +36,8 @@ def export_mrcal(
         if name in models:
             raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
         models[name] = camera_model_text(lens, lens_model_of(lens), pose)
+    unit = stated_length(loaded, "m")
     with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
         for name, text in models.items():
             write_whole(folder / name, text)
-    return {"out": str(out), "views": len(models)}
+    return {"out": str(out), "views": len(models), "unit": unit}

@@ -7,6 +7,7 @@ import msgspec
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.exchange.zarr import plane_stack, require_zarr, write_zarr
 from faintfield.pipelines.formats.results.surface import planes_below
+from faintfield.pipelines.formats.units import units_of
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -21,9 +22,10 @@ class ZarrExport(msgspec.Struct, frozen=True):
 def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> ZarrExport:
     """Write the planes of a folder as OME-Zarr 0.5, which napari, Fiji and others open at the right scale.
 
-    Axes are colour, depth, row, column; values are float32, in expected electrons per detector pixel. Lengths are in
-    mm where all planes have one pitch (reconstruct with --pitch-mm); otherwise rows and columns are in thousandths of
-    x/z, which have no unit in this format. Depths must be in equal steps.
+    Axes are colour, depth, row, column; values are float32, light per detector pixel in the unit of the set.
+    Lengths are in mm where all planes have one pitch (reconstruct with --pitch-mm); otherwise rows and columns are in
+    thousandths of x/z, which have no unit in this format. Of a set without a scale, no length has a unit: the attribute
+    `faintfield` says what it is. Depths, or disparities, must be in equal steps.
 
     Parameters
     ----------
@@ -40,6 +42,6 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Za
         names = ", ".join(str(folder) for folder in results)
         raise BadValue(f"{directory}: holds planes of {len(results)} calls or methods; name one folder of {names}")
     ((folder, result),) = results.items()
-    stack = plane_stack(folder, result.planes)
+    stack = plane_stack(folder, result.planes, units_of(result))
     write_zarr(out, stack, directory.resolve().name, overwrite=overwrite)
-    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit)
+    return ZarrExport(str(out), stack.shape, stack.levels, stack.scale.unit or "relative")

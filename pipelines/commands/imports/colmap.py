@@ -5,6 +5,7 @@ from pathlib import Path
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.formats.exchange.colmap import read_posed_images
 from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
+from faintfield.pipelines.formats.exchange.tone import asked_tone
 
 
 def import_colmap(
@@ -13,9 +14,11 @@ def import_colmap(
     /,
     *,
     images: Path | None = None,
-    mm_per_unit: Positive = 1.0,
+    mm_per_unit: Positive | None = None,
     reference: str | None = None,
     exposure_s: Positive | None = None,
+    linear: bool = False,
+    srgb: bool = False,
     overwrite: bool = False,
 ) -> ImportedSet:
     """Make an elemental set from a COLMAP model, text or binary, and its images.
@@ -29,11 +32,15 @@ def import_colmap(
     images
         Folder of the images; SRC by default.
     mm_per_unit
-        Length of the model's unit, which COLMAP cannot know: measure something, or depths are in its unit.
+        Length of the model's unit, which COLMAP cannot know: measure something, or depths are relative.
     reference
         Name of the image whose camera is the reference; the one nearest to the middle by default.
     exposure_s
-        Exposure of each image; by default that of EXIF, or 1 s where there is none.
+        Exposure of each image; by default that of EXIF; not known where there is none.
+    linear
+        Values of 8-bit images are proportional to light; without it the tone curve of sRGB is undone.
+    srgb
+        16-bit images have the tone curve of sRGB, too, which is undone.
     overwrite
         Replace an earlier set in OUT.
     """
@@ -43,6 +50,7 @@ def import_colmap(
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,
+        tone=asked_tone(linear=linear, srgb=srgb),
         command="import colmap",
         overwrite=overwrite,
     )

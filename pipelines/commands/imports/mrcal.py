@@ -5,6 +5,7 @@ from pathlib import Path
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
 from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
+from faintfield.pipelines.formats.exchange.tone import asked_tone
 
 
 def import_mrcal(
@@ -16,6 +17,8 @@ def import_mrcal(
     mm_per_unit: Positive = 1000.0,
     reference: str | None = None,
     exposure_s: Positive | None = None,
+    linear: bool = False,
+    srgb: bool = False,
     overwrite: bool = False,
 ) -> ImportedSet:
     """Make an elemental set from a folder of .cameramodel files and images of the same names.
@@ -33,7 +36,11 @@ def import_mrcal(
     reference
         Name of the image whose camera is the reference; the one nearest to the middle by default.
     exposure_s
-        Exposure of each image; by default that of EXIF, or 1 s where there is none.
+        Exposure of each image; by default that of EXIF; not known where there is none.
+    linear
+        Values of 8-bit images are proportional to light; without it the tone curve of sRGB is undone.
+    srgb
+        16-bit images have the tone curve of sRGB, too, which is undone.
     overwrite
         Replace an earlier set in OUT.
     """
@@ -44,6 +51,7 @@ def import_mrcal(
         mm_per_unit=mm_per_unit,
         reference=reference,
         exposure_s=exposure_s,
+        tone=asked_tone(linear=linear, srgb=srgb),
         command="import mrcal",
         overwrite=overwrite,
     )

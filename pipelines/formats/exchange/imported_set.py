@@ -2,7 +2,7 @@
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,27 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongBitDepth, WrongSize
+from faintfield.pipelines.formats.exchange.imported_noise import NoiseOrigin, Pictures, StatedNoise, complete_noise
+from faintfield.pipelines.formats.exchange.tone import Tone, tone_of, without_curve
 from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
-from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, exif_exposure_s, read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.limits import MAX_ANGLE_RAD, MAX_LENGTH_MM, sound_pose
-from faintfield.pipelines.formats.provenance import provenance
+from faintfield.pipelines.formats.provenance import Provenance, provenance
 from faintfield.pipelines.formats.reading import is_file
-from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, ElementalSetFile, Noise, View, write_set
+from faintfield.pipelines.formats.sets.elemental_file import (
+    FILE_NAME,
+    Arrangement,
+    Camera,
+    ElementalSetFile,
+    View,
+    write_set,
+)
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.formats.units import Units
+
+# Files whose compression changes values, and with them the noise.
+_LOSSY_SUFFIXES = {".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,13 @@ class PosedModel:
     images: list[PosedImage]
 
 
+class ImportProvenance(Provenance[dict[str, Any]], frozen=True, kw_only=True):
+    """How a set was imported: its tone curve, which was undone, and where its gain and read noise come from."""
+
+    tone: Tone
+    noise: NoiseOrigin
+
+
 class ImportedSet(msgspec.Struct, frozen=True):
     """The result of an import: the folder, the number of views, and the image whose camera is the reference."""
 
@@ -55,13 +75,16 @@ def import_posed(
     out: Path,
     model: PosedModel,
     *,
-    mm_per_unit: float,
+    mm_per_unit: float | None,
     reference: str | None,
     exposure_s: float | None,
+    tone: Tone | None = None,
     command: str,
     overwrite: bool,
 ) -> ImportedSet:
-    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`.
+    """Make an elemental set of the images of a model, whose poses are in units of `mm_per_unit`, None if not known.
+
+    Without it they are relative, to a scale that is not known. Light is in DN, or relative of pictures of 8 bits.
 
     Raises
     ------
@@ -70,8 +93,8 @@ def import_posed(
     """
     if not model.images:
         raise BadValue(f"{model.files[-1]}: names no image; export a model of the images")
-    _check_images(model.images, mm_per_unit)
-    scale = np.repeat([1.0, mm_per_unit], 3)
+    _check_images(model.images, mm_per_unit or 1.0)
+    scale = np.repeat([1.0, mm_per_unit or 1.0], 3)
     images = [
         replace(image, rt_cam_world=image.rt_cam_world * scale, node=node)
         for image, node in zip(model.images, _nodes(model.images), strict=True)
@@ -81,14 +104,16 @@ def import_posed(
         out,
         images,
         reference=index,
-        noise=Noise(gain_dn_per_e=1.0, read_noise_e=0.0),
+        noise=StatedNoise(),
         exposure_s=exposure_s,
+        tone=tone,
         command=command,
         options={"mm_per_unit": mm_per_unit, "reference": reference, "exposure_s": exposure_s},
         models=model.files,
+        units=None if mm_per_unit else Units(depth="relative"),
         overwrite=overwrite,
     )
-    inform(f"{out}: {len(images)} views; state the sensor's [noise] in elemental.toml, or run `faintfield noise`")
+    inform(f"{out}: {len(images)} views")
     return ImportedSet(str(out), len(images), images[index].path.name)
 
 
@@ -129,11 +154,16 @@ def write_imported_set(
     images: Sequence[PosedImage],
     *,
     reference: int,
-    noise: Noise,
+    noise: StatedNoise,
     exposure_s: float | None,
+    tone: Tone | None = None,
     command: str,
     options: dict[str, Any],
     models: Sequence[Path] = (),
+    sources: Sequence[Path] | None = None,
+    units: Units | None = None,
+    arrangement: Arrangement | None = None,
+    also: Callable[[Path], None] | None = None,
     overwrite: bool,
 ) -> None:
     """Copy images into an elemental set whose reference frame is the camera of one of them.
@@ -142,52 +172,63 @@ def write_imported_set(
     ----------
     reference : int
         Index of the image whose camera is the reference.
-    noise : Noise
-        The sensor; saturation and black level are filled in from the pictures.
+    noise : StatedNoise
+        What is stated of the sensor; what is not is estimated from the views, or assumed and said so.
     exposure_s : float, optional
-        Exposure of each image; by default what the first one states.
+        Exposure of each image; by default what the first one states, and not known if it states none.
+    tone : {"linear", "srgb"}, optional
+        The tone curve of the images; by default that of sRGB for 8-bit images, and none for others.
+    units : Units, optional
+        What depths are stated in; light is stated in what noise and tone allow.
     models : sequence of Path
         Files that lens and poses were read from, for the record; no file that is read is overwritten.
+    sources : sequence of Path, optional
+        Files that the images were unpacked from, for the record; the images' own by default.
+    arrangement : Arrangement, optional
+        What was found in the pictures of a grid.
+    also : callable, optional
+        Writes further files into the folder of the set.
 
     Raises
     ------
     BadValue
-        The lenses differ in more than their principal points, or two images would have one name.
+        The lenses differ in more than their principal points, two images would have one name, or a dark current is
+        stated but no exposure.
     WrongSize, WrongBitDepth
         The images are not alike, or not of the size of their lens.
     """
     lens = images[reference].lens
     first = read_picture(images[0].path)
     _check_lenses([image.lens for image in images], images[0].path, first)
-    exposure_s = exposure_s or _stated_exposure_s(first)
-    noise = _complete_noise(noise, first)
-    inputs = [*models, *(image.path for image in images)]
+    exposure_s = exposure_s or first.exposure_s or exif_exposure_s(images[0].path)
+    noise.check_exposure(images[0].path, exposure_s)
+    tone = tone_of(images[0].path, first, tone)
+    inputs = [*models, *([image.path for image in images] if sources is None else sources)]
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=inputs) as folder:
         views = [
-            _view(_copy(image.path, folder, first), image, images[reference])
+            _view(_copy(image.path, folder, first, tone), image, images[reference])
             for image in progress(images, "copying pictures")
         ]
+        lossy = inputs[-1].suffix.lower() in _LOSSY_SUFFIXES
+        pictures = Pictures(folder, views, first, tone, lossy)
+        complete, origin = complete_noise(noise, pictures)
         camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
-        write_set(folder, ElementalSetFile(1, exposure_s, reference, camera, noise, views))
+        settings = ElementalSetFile(
+            format=1,
+            exposure_s=exposure_s,
+            reference_view=reference,
+            units=msgspec.structs.replace(units or Units(), light=noise.light_unit(tone)),
+            arrangement=arrangement,
+            camera=camera,
+            noise=complete,
+            view=views,
+        )
+        write_set(folder, settings)
+        if also is not None:
+            also(folder)
         hashes = {path.name: sha256(path) for path in inputs}
-        write_json(folder / "provenance.json", provenance(command, options, hashes))
-
-
-def _stated_exposure_s(first: Frame) -> float:
-    """Return the exposure that a picture states, 1 s if it states none."""
-    if first.exposure_s is not None:
-        return first.exposure_s
-    inform("the pictures do not state their exposure; 1 s is assumed, which matters for dark current only")
-    return 1.0
-
-
-def _complete_noise(noise: Noise, first: Frame) -> Noise:
-    """Return the noise with black level and saturation of a picture filled in."""
-    return msgspec.structs.replace(
-        noise,
-        offset_dn=0.0 if noise.offset_dn is None and first.black_dn is None else noise.offset_dn,
-        saturation_dn=first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max),
-    )
+        made = msgspec.to_builtins(provenance(command, options, hashes))
+        write_json(folder / "provenance.json", ImportProvenance(**made, tone=tone, noise=origin))
 
 
 def read_picture(path: Path, expected_px: tuple[int, int] | None = None) -> Frame:
@@ -231,8 +272,8 @@ def _view(name: str, image: PosedImage, reference: PosedImage) -> View:
     return View(name, (rx, ry, rz, x, y, z), image.node, **own)
 
 
-def _copy(path: Path, folder: Path, first: Frame) -> str:
-    """Copy a picture as it is, or as 16-bit TIFF when it has 8 bits; return its name in the set."""
+def _copy(path: Path, folder: Path, first: Frame, tone: Tone) -> str:
+    """Copy a picture as it is, or as linear 16-bit TIFF if it has 8 bits or a curve; return its name in the set."""
     pixels = read_picture(path, first.pixels_dn.shape[1::-1]).pixels_dn
     if pixels.shape != first.pixels_dn.shape:
         raise WrongSize(
@@ -244,14 +285,15 @@ def _copy(path: Path, folder: Path, first: Frame) -> str:
             f"{path}: has {8 * pixels.itemsize} bits per pixel, the first picture {8 * first.pixels_dn.itemsize}; "
             "all pictures of a set saturate at one value; export all of them alike"
         )
-    as_it_is = path.suffix.lower() in RAW_SUFFIXES or pixels.dtype == np.uint16
+    as_it_is = path.suffix.lower() in RAW_SUFFIXES or (tone == "linear" and pixels.dtype == np.uint16)
     name = path.name if as_it_is else f"{path.stem}.tiff"
     if (folder / name).exists():
         raise BadValue(f"{path}: would become {name} like another picture; give it another name")
     if as_it_is:
         shutil.copyfile(path, folder / name)
     else:
-        write_frame(folder / name, pixels.astype(np.uint16))
+        light = without_curve(pixels, first.saturation_dn) if tone == "srgb" else pixels.astype(np.uint16)
+        write_frame(folder / name, light, few_values=pixels.dtype == np.uint8)
     return name
 
 

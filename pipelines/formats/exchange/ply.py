@@ -1,7 +1,7 @@
 """Point clouds in PLY, binary and little-endian, which MeshLab, CloudCompare and Blender open.
 
-Points are in mm in the frame of the reference camera: x right, y down, z forward. Each has a unit normal towards the
-camera and a colour.
+Points are in mm, or in the unit of the poses, in the frame of the reference camera: x right, y down, z forward. Each
+has a unit normal towards the camera and a colour.
 """
 
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ _POINT = np.dtype([("xyz_mm", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)]
 
 _HEADER = """ply
 format binary_little_endian 1.0
-comment faintfield: mm in the frame of the reference camera: x right, y down, z forward
+comment faintfield: {unit} in the frame of the reference camera: x right, y down, z forward
 comment normals are unit vectors towards the camera
 element vertex {count}
 property float x
@@ -33,6 +33,8 @@ property uchar blue
 end_header
 """
 
+_UNKNOWN = "lengths are relative, in a unit that nobody measured,"
+
 # Rows that are computed at a time.
 _ROWS = 256
 
@@ -42,7 +44,13 @@ _STEEPEST = 10.0
 
 
 def write_points(
-    path: Path, depth_mm: NDArray[np.floating], x: NDArray[np.floating], y: NDArray[np.floating], picture: Picture
+    path: Path,
+    depth_mm: NDArray[np.floating],
+    x: NDArray[np.floating],
+    y: NDArray[np.floating],
+    picture: Picture,
+    *,
+    in_mm: bool = True,
 ) -> int:
     """Write the samples of a depth map whose depth is known, and return their number.
 
@@ -56,6 +64,8 @@ def write_points(
         Directions of the samples: x/z and y/z, in ascending order.
     picture : uint8 array (row, column[, RGB])
         Their colours.
+    in_mm : bool
+        The depths are in mm; else in a unit of unknown length, which the file says.
 
     Raises
     ------
@@ -70,7 +80,7 @@ def write_points(
         )
     count = int(np.isfinite(depth_mm).sum())
     with writing(path) as file:
-        file.write(_HEADER.format(count=count).encode())
+        file.write(_HEADER.format(count=count, unit="mm" if in_mm else _UNKNOWN).encode())
         for points in _bands(depth_mm, x, y, picture):
             file.write(points.tobytes())
     return count

@@ -16,6 +16,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import read_json
 from faintfield.pipelines.formats.results.records import PlaneRecord
 from faintfield.pipelines.formats.results.stacks import Scale, at_depths, planes_in_order, stack_scale
+from faintfield.pipelines.formats.units import StatedUnits, named_by
 
 # Planes are halved until no side is longer, px; viewers load the rest only where they look closer.
 _COARSEST_PX = 512
@@ -40,12 +41,15 @@ class PlaneStack:
         Colours, planes, rows, columns.
     scale : Scale
         Of the samples.
+    units : StatedUnits
+        Of depths and light.
     """
 
     folder: Path
     planes: Sequence[PlaneRecord]
     shape: tuple[int, int, int, int]
     scale: Scale
+    units: StatedUnits
 
     @property
     def levels(self) -> int:
@@ -56,7 +60,7 @@ class PlaneStack:
         return levels
 
 
-def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
+def plane_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits) -> PlaneStack:
     """Return the planes of a folder as one stack.
 
     Parameters
@@ -65,6 +69,8 @@ def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
         Where they lie.
     records : sequence of PlaneRecord
         The `planes` of its reconstruction.json.
+    units : StatedUnits
+        The units that it states.
 
     Raises
     ------
@@ -77,14 +83,14 @@ def plane_stack(folder: Path, records: Sequence[PlaneRecord]) -> PlaneStack:
     shapes = sorted({record.shape for record in planes})
     if len(shapes) > 1:
         raise BadValue(f"{folder}: planes are of {len(shapes)} sizes, {shapes[0]} and others; a stack takes one")
-    scale = stack_scale(planes)
+    scale = stack_scale(planes, units)
     if scale.step_mm is None and len(planes) > 1:
         raise BadValue(
-            f"{folder}: the {len(planes)} depths are not in equal steps, and OME-Zarr states only one; "
-            "reconstruct with --sweep-mm"
+            f"{folder}: the {len(planes)} planes are not in equal steps of {units.quantity}, and OME-Zarr states only "
+            f"one; reconstruct with {'--sweep-px' if units.length == 'px' else '--sweep-mm'}"
         )
     colours = len(at_depths(records)) // len(planes)
-    return PlaneStack(folder, planes, (colours, len(planes), *shapes[0]), scale)
+    return PlaneStack(folder, planes, (colours, len(planes), *shapes[0]), scale, units)
 
 
 def write_zarr(out: Path, stack: PlaneStack, name: str, *, overwrite: bool = False) -> None:
@@ -157,7 +163,7 @@ def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
     unit = "millimeter" if stack.scale.unit == "mm" else None
     axes = (
         Axis(name="c", type="channel"),
-        Axis(name="z", type="space", unit="millimeter"),
+        Axis(name="z", type="space", unit="millimeter" if stack.units.depth == "mm" else None),
         Axis(name="y", type="space", unit=unit),
         Axis(name="x", type="space", unit=unit),
     )
@@ -165,9 +171,10 @@ def _write_metadata(group: Any, stack: PlaneStack, name: str) -> None:
     multiscale = Multiscale(axes=axes, datasets=datasets, name=name)
     group.attrs["ome"] = ImageAttrs(version="0.5", multiscales=[multiscale]).model_dump(mode="json", exclude_none=True)
     group.attrs["faintfield"] = {
-        "value": "expected electrons per detector pixel of the reference view",
-        "row_and_column": stack.scale.unit,
-        "planes": msgspec.to_builtins(list(stack.planes)),
+        "value": stack.units.light_in_words,
+        "row_and_column": stack.scale.unit or "relative",
+        "units": msgspec.to_builtins(stack.units),
+        "planes": [named_by(msgspec.to_builtins(record), stack.units) for record in stack.planes],
     }
 
 

@@ -11,6 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 from msgspec import UNSET, Meta, Struct, UnsetType
+from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.errors import BadValue, MissingFile
@@ -57,6 +58,15 @@ class NodeRecord(Struct, frozen=True):
         return x, y, z
 
 
+class HomingRecord(Struct, frozen=True):
+    """Shift of all cameras from one homing of the stage to a later one, in the reference frame, with its error."""
+
+    before: int
+    after: int
+    shift_mm: tuple[float, float, float]
+    sigma_mm: tuple[float, float, float]
+
+
 class CameraPoses(Struct, frozen=True, kw_only=True):
     """The part of `geometry.json` that a reconstruction needs; a file written by hand may hold nothing else."""
 
@@ -65,11 +75,34 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
     size_px: tuple[int, int]
     reference_node: tuple[int, int]
     nodes: Annotated[list[NodeRecord], Meta(min_length=1)]
+    homings: list[HomingRecord] | UnsetType = UNSET
 
     def camera_lens(self) -> Lens:
         """Return the lens."""
         lens = self.lens
         return Lens(self.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+
+    def homing_shift_mm(self, before: int, after: int) -> tuple[float, float, float] | None:
+        """Return the shift from one homing to another, of which either may be the later; None if it is not known."""
+        known: dict[int, NDArray[np.float64]] = {before: np.zeros(3)}
+        waiting = [before]
+        while waiting:
+            here = waiting.pop()
+            for one in self.homings or ():
+                for start, end, sign in ((one.before, one.after, 1.0), (one.after, one.before, -1.0)):
+                    if start == here and end not in known:
+                        known[end] = known[here] + sign * np.array(one.shift_mm)
+                        waiting.append(end)
+        if after not in known:
+            return None
+        x, y, z = known[after].tolist()
+        return x, y, z
+
+
+class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
+    """The poses, and what they were measured from: the homings are those of one session only."""
+
+    inputs: dict[str, str] = {}
 
 
 class RepeatabilityRecord(Struct, frozen=True):
@@ -80,7 +113,10 @@ class RepeatabilityRecord(Struct, frozen=True):
 
 
 class BoardRecord(Struct, frozen=True):
-    """A board as it stood during a sweep, with what is printed on it and how far it bulges along x and y."""
+    """A board as it stood during a sweep, with what is printed on it and how far it bulges along x and y.
+
+    `homing` is there if a homing of the stage shifted the cameras within the sweep.
+    """
 
     name: str
     columns: int
@@ -92,6 +128,7 @@ class BoardRecord(Struct, frozen=True):
     sweep: int
     rt_ref_board: Pose
     warp_mm: tuple[float, float]
+    homing: int | UnsetType = UNSET
 
 
 class StageFigure(Struct, frozen=True):
@@ -171,6 +208,12 @@ def read_geometry[Kind: CameraPoses](path: Path, kind: type[Kind]) -> Kind:
             raise BadValue(
                 f"{path}: node {list(entry.node)} at {list(entry.rt_cam_ref)} is impossible; a node's numbers are at "
                 f"most {MAX_NODE}, its angles {MAX_ANGLE_RAD:g} rad, and its lengths {MAX_LENGTH_MM:g} mm in size: "
+                "run `faintfield geometry` again"
+            )
+    for shift in geometry.homings or ():
+        if not max(map(abs, shift.shift_mm)) <= MAX_LENGTH_MM:
+            raise BadValue(
+                f"{path}: the homing shift {list(shift.shift_mm)} mm is impossible, limit {MAX_LENGTH_MM:g} mm; "
                 "run `faintfield geometry` again"
             )
     return geometry

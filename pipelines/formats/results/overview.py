@@ -3,12 +3,13 @@
 from msgspec import UNSET, Struct, UnsetType
 
 from faintfield.pipelines.formats.results.records import Poses
+from faintfield.pipelines.formats.units import StatedUnits
 
 OVERVIEW_FILE = "overview.json"
 
 
 class Brightness(Struct, frozen=True):
-    """The SNR and photon figures of a set's reference view.
+    """The SNR and photon figures of a set's reference view; light is in the units of the overview.
 
     Attributes
     ----------
@@ -37,12 +38,13 @@ class Brightness(Struct, frozen=True):
 class Overview(Struct, frozen=True, kw_only=True):
     """`overview.json`: a set at a glance, beside its pictures."""
 
+    units: StatedUnits | UnsetType = UNSET
     set: str
     views: int
     grid: tuple[int, int] | UnsetType | None = UNSET
     poses: Poses = "stated"
     size_px: tuple[int, int]
-    exposure_s: float
+    exposure_s: float | None
     frames_per_view: int = 1
     read_noise_e: float
     has_noise_reference: bool = False

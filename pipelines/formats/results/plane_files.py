@@ -14,7 +14,7 @@ from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.digests import digest_holds
 from faintfield.pipelines.formats.files import remove, sha256, write_record, writing
-from faintfield.pipelines.formats.image_files import grey_levels, white_level, write_plane, write_png
+from faintfield.pipelines.formats.image_files import Spacing, grey_levels, white_level, write_plane, write_png
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.provenance import Provenance, first_difference
 from faintfield.pipelines.formats.reading import JSON_FAILURES, read_content, read_json
@@ -30,6 +30,7 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.results.result_files import problem_of_file
 from faintfield.pipelines.formats.results.surface import SurfaceFileRecord, SurfaceOptions
+from faintfield.pipelines.formats.units import record_of, units_of
 
 # Folder of the colours of planes that still lack others.
 PARTS = ".parts"
@@ -46,7 +47,7 @@ type Origin = Provenance[ReconstructionOptions]
 
 
 def plane_name(place: Place) -> str:
-    """Return the file name, without suffix, of a plane."""
+    """Return the file name, without suffix, of a plane whose depth is in mm."""
     return f"plane_{place.name}" if isinstance(place, TiltedPlane) else f"plane_{place:07.1f}"
 
 
@@ -75,6 +76,8 @@ class PlaneFiles:
         Its colours, in their order.
     origin : Provenance
         Its provenance, if it were made now: files with another are made again.
+    stem : str
+        File name of the plane without suffix; by default that of a depth in mm.
     """
 
     folder: Path
@@ -82,11 +85,17 @@ class PlaneFiles:
     place: Place
     channels: tuple[str, ...]
     origin: Origin
+    stem: str = ""
+
+    @property
+    def name(self) -> str:
+        """File name of the plane, without suffix."""
+        return self.stem or plane_name(self.place)
 
     @property
     def path(self) -> Path:
         """Path of the plane itself."""
-        return self.folder / f"{plane_name(self.place)}.tiff"
+        return self.folder / f"{self.name}.tiff"
 
     def finished(self) -> PlaneFileRecord | None:
         """Return the record of the plane, None unless it and its files are whole and current."""
@@ -121,7 +130,7 @@ class PlaneFiles:
             _Part(record, focus, list(arrays), hashes, **msgspec.structs.asdict(self.origin)),
         )
 
-    def finish(self, pitch_mm: float) -> PlaneFileRecord:
+    def finish(self) -> PlaneFileRecord:
         """Write the plane and its preview from its colours, then the record that vouches for them, and return that.
 
         Raises
@@ -133,10 +142,11 @@ class PlaneFiles:
         entries = [read_json(path.with_suffix(".json"), _Part, what=_A_COLOUR, remedy=_ANEW) for path in paths]
         parts = [_arrays(path, entry, entries[0].record.shape) for path, entry in zip(paths, entries, strict=True)]
         plane = _joined(parts, "plane")
-        write_plane(self.path, plane, pitch_mm)
+        spacing = _spacing(entries[0])
+        write_plane(self.path, plane, spacing)
         preview = self.path.with_suffix(".png")
         write_png(preview, grey_levels(plane, white_level(plane)))
-        sidecars = self._write_sidecars(parts, pitch_mm)
+        sidecars = self._write_sidecars(parts, spacing)
         written = [self.path, preview, *sidecars.values()]
         names = {f"{name}_file": path.name for name, path in sidecars.items()}
         record = PlaneFileRecord(
@@ -152,20 +162,20 @@ class PlaneFiles:
             path.with_suffix(".json").unlink()
         return record
 
-    def _write_sidecars(self, parts: list[dict[str, NDArray[Any]]], pitch_mm: float) -> dict[str, Path]:
+    def _write_sidecars(self, parts: list[dict[str, NDArray[Any]]], spacing: Spacing) -> dict[str, Path]:
         """Write what else is known of the samples, remove the files of an earlier plane, return the paths."""
         written = {}
         for name in _SIDECARS:
-            path = self.folder / f"{plane_name(self.place)}_{name}.tiff"
+            path = self.folder / f"{self.name}_{name}.tiff"
             if all(name in part for part in parts):
-                write_plane(path, _joined(parts, name), pitch_mm)
+                write_plane(path, _joined(parts, name), spacing)
                 written[name] = path
             else:
                 remove(path)
         return written
 
     def _part(self, channel: str) -> Path:
-        return self.folder / PARTS / f"{plane_name(self.place)}_{channel}{_SUFFIX_OF_PARTS}"
+        return self.folder / PARTS / f"{self.name}_{channel}{_SUFFIX_OF_PARTS}"
 
     def _has(self, channel: str) -> bool:
         """Return whether a colour is there, whole and current."""
@@ -192,7 +202,7 @@ def read_current[Record: (PlaneFileRecord, DepthMapFileRecord, SurfaceFileRecord
         return None
     try:
         content = read_content(path)
-        record = msgspec.json.decode(content, type=kind)
+        record = record_of(content, kind)
         if first_difference(content, origin) is not None:
             return None
         problem = None if digest_holds(content) else "was altered, or is of an earlier version and has no digest"
@@ -217,6 +227,12 @@ def _arrays(path: Path, part: _Part, shape: tuple[int, int]) -> dict[str, NDArra
         )
     arrays = np.frombuffer(read_content(path, needed), _STORED).reshape(-1, *shape)
     return dict(zip(part.arrays, arrays, strict=True))
+
+
+def _spacing(part: _Part) -> Spacing:
+    """Return the spacing of the samples of a plane, whose values are light."""
+    units = units_of(part)
+    return Spacing(part.record.pitch_mm, in_mm=units.depth == "mm")
 
 
 def _joined(parts: list[dict[str, NDArray[Any]]], name: str) -> NDArray[Any]:

@@ -1,16 +1,21 @@
 """The records of planes and reconstructions: one type per JSON file, for its writer, its readers and its tests.
 
+Fields are named for sets in mm and electrons; their numbers are in the `units` that the record states, and the keys in
+its file are named by these (`formats.units`).
+
 Keys stand in a file in the order of the fields; a field that is UNSET is left out. Fields that reports, views and
 exports can do without have defaults, so that results of earlier versions and those made by hand can be read.
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from faintfield.pipelines.formats.provenance import Provenance
+from faintfield.pipelines.formats.units import StatedUnits
 
 RECONSTRUCTION_FILE = "reconstruction.json"
 DEPTH_MAP_FILE = "depth_map.json"
@@ -24,8 +29,13 @@ type FileName = Annotated[str, Meta(pattern=r"^(?!\.{1,2}\Z)[^/\\\x00-\x1f\x7f]+
 
 type Sha256 = Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]
 
-# Lengths of a plane in mm, from atoms to a thousand km: what is outside can only be damage.
+# Lengths of a plane, in mm from atoms to a thousand km: what is outside can only be damage.
 type LengthMm = Annotated[float, Meta(ge=1e-6, le=1e9)]
+
+# A depth is such a length, and positive unless it is stated as a disparity, see `check_depths`.
+type DepthMm = Annotated[float, Meta(ge=-1e9, le=1e9)]
+
+_LEAST_DEPTH = 1e-6
 
 type Count = Annotated[int, Meta(ge=0, le=1_000_000)]
 
@@ -107,11 +117,11 @@ class SolveRecord(Struct, frozen=True, kw_only=True):
 class PlaneRecord(Struct, frozen=True, kw_only=True):
     """One colour of one plane, in reconstruction.json and in the plane's own record.
 
-    A plane given by a pose has a `name` and `rt_ref_plane`. Lengths are in mm, light in electrons.
+    A plane given by a pose has a `name` and `rt_ref_plane`, whose lengths are those of the poses of the set.
     """
 
     name: str | UnsetType = UNSET
-    depth_mm: LengthMm
+    depth_mm: DepthMm
     rt_ref_plane: tuple[float, float, float, float, float, float] | UnsetType = UNSET
     method: Method
     channel: str
@@ -142,6 +152,12 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
         return [name for name in (self.file, self.sigma_file, self.opacity_file) if name is not UNSET]
 
 
+def check_depths(planes: Sequence[PlaneRecord], units: StatedUnits | UnsetType) -> None:
+    """Refuse depths that are none, unless they are stated as disparities (ValueError)."""
+    if (units or StatedUnits()).depth != "disparity_px" and any(plane.depth_mm < _LEAST_DEPTH for plane in planes):
+        raise ValueError(f"a depth is below {_LEAST_DEPTH:g}")
+
+
 class FocusPoint(Struct, frozen=True):
     """The power of detail on a plane, and its standard deviation."""
 
@@ -164,13 +180,20 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
 
 
 class BestFocusRecord(Struct, frozen=True):
-    """How `--depth-mm auto` found its depths."""
+    """How `--depth-mm auto` found its depths.
+
+    `p_value` is the share of `shuffles`, views exchanged between their places, whose views agree at least as well, and
+    `z_shuffled` by how many of their standard deviations the stated places are better.
+    """
 
     depth_mm: list[float]
     searched_mm: list[tuple[float, float]]
     depths_per_search: int
     bins_px: int
     share_of_sure: list[float]
+    p_value: float | UnsetType = UNSET
+    z_shuffled: float | UnsetType = UNSET
+    shuffles: int | UnsetType = UNSET
 
 
 class DepthMapRecord(Struct, frozen=True):
@@ -179,7 +202,7 @@ class DepthMapRecord(Struct, frozen=True):
     file: FileName
     confidence: FileName
     all_in_focus: FileName
-    unit: Literal["mm", "px"]
+    unit: Literal["mm", "px", "relative"]
     bins_px: int
     sure_above: float
     sure_share: float
@@ -203,7 +226,7 @@ class ReconstructionOptions(Struct, frozen=True):
     passes: int | UnsetType | None = UNSET
     pitch_mm: float | UnsetType | None = UNSET
     focus: bool | UnsetType = UNSET
-    depth_map: Literal["mm", "px"] | UnsetType | None = UNSET
+    depth_map: Literal["mm", "px", "relative"] | UnsetType | None = UNSET
     plane_pose: dict[str, list[float]] | UnsetType = UNSET
     poses: Poses = "stated"
 
@@ -215,6 +238,9 @@ class PlaneFileRecord(Provenance[ReconstructionOptions], frozen=True):
     planes: list[PlaneRecord]
     focus: list[FocusPoint | None]
     sha256: dict[FileName, Sha256]
+
+    def __post_init__(self) -> None:
+        check_depths(self.planes, self.units)
 
 
 class DepthMapFileRecord(Provenance[ReconstructionOptions], frozen=True):
@@ -234,10 +260,14 @@ class ReconstructionRecord(Struct, frozen=True, kw_only=True):
     best_focus: BestFocusRecord | None = None
     depth_map: DepthMapRecord | None = None
     wall_time_s: float
+    units: StatedUnits | UnsetType = UNSET
     command: str = "reconstruct"
     options: ReconstructionOptions
     inputs: dict[str, str]
     versions: dict[str, str]
+
+    def __post_init__(self) -> None:
+        check_depths(self.planes, self.units)
 
     @property
     def files(self) -> list[str]:
@@ -297,5 +327,6 @@ class Metrics(Struct, frozen=True, kw_only=True):
     geometry: GeometryErrors | UnsetType = UNSET
     noise: dict[str, KnownValue] | UnsetType = UNSET
     planes: list[PlaneErrors]
+    units: StatedUnits | UnsetType = UNSET
     snr: SnrRecord | UnsetType = UNSET
     photons_per_px: PhotonsRecord | UnsetType = UNSET

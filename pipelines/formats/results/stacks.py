@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.files import writing
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import PlaneRecord
+from faintfield.pipelines.formats.units import StatedUnits
 
 STACK_FILE = "stack.tiff"
 
@@ -29,12 +30,13 @@ class Scale:
     across : float
         Distance of neighbouring samples, in `unit`.
     unit : str
-        "mm" if all planes have the same pitch. By default the pitch of a plane grows with its depth, and its samples
-        are a constant angle apart: then "mrad", thousandths of x/z, which is the same at every depth.
+        That of the records ("mm", "px", or none if it has no name) if all planes have the same pitch. By default the
+        pitch of a plane grows with its depth, and its samples are a constant angle apart: then "mrad", thousandths of
+        x/z, which is the same at every depth.
     origin : (float, float)
         x, y of the first sample, in `unit`.
     step_mm : float, optional
-        From one depth to the next; None if the steps differ.
+        From one depth or disparity to the next; None if the steps differ.
     """
 
     across: float
@@ -43,8 +45,8 @@ class Scale:
     step_mm: float | None
 
 
-def stack_scale(records: Sequence[PlaneRecord]) -> Scale:
-    """Return the scale of planes, given their records in the order of their depths."""
+def stack_scale(records: Sequence[PlaneRecord], units: StatedUnits) -> Scale:
+    """Return the scale of planes, given their records in the order of their depths, and their units."""
     depths = np.array([record.depth_mm for record in records])
     pitches = np.array([record.pitch_mm for record in records])
     first = records[0]
@@ -52,7 +54,7 @@ def stack_scale(records: Sequence[PlaneRecord]) -> Scale:
     equal = len(steps) > 0 and bool(np.ptp(steps) <= _EQUAL_STEPS * np.abs(steps).max())
     step_mm = float(steps.mean()) if equal else None
     if np.allclose(pitches, pitches[0], rtol=1e-9):
-        return Scale(float(pitches[0]), "mm", first.origin_mm, step_mm)
+        return Scale(float(pitches[0]), units.length, first.origin_mm, step_mm)
     per_mrad = 1e3 / first.depth_mm
     x, y = (start * per_mrad for start in first.origin_mm)
     return Scale(float(np.mean(pitches / depths)) * 1e3, "mrad", (x, y), step_mm)
@@ -69,7 +71,7 @@ def planes_in_order(records: Sequence[PlaneRecord]) -> list[PlaneRecord]:
     return sorted(by_file.values(), key=lambda record: record.depth_mm)
 
 
-def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
+def write_stack(folder: Path, records: Sequence[PlaneRecord], units: StatedUnits) -> Path | None:
     """Write the planes of a folder as one ImageJ hyperstack, and return its path.
 
     Axes are depth, colour (if any), row, column; the calibration makes ImageJ show x, y and depth in their units, and
@@ -81,11 +83,13 @@ def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
         Folder of the planes; the stack is written there, too.
     records : sequence of PlaneRecord
         The `planes` of reconstruction.json, of one method.
+    units : StatedUnits
+        Their units.
     """
     planes = planes_in_order(records)
     if len({record.shape for record in planes}) > 1:
         return None
-    scale = stack_scale(planes)
+    scale = stack_scale(planes, units)
     colours = max(len(at_depths(records)) // len(planes), 1)
     path = folder / STACK_FILE
     with writing(path) as file:
@@ -98,7 +102,7 @@ def write_stack(folder: Path, records: Sequence[PlaneRecord]) -> Path | None:
             byteorder="<",
             photometric="minisblack",
             resolution=(1 / scale.across, 1 / scale.across),
-            metadata=_imagej_metadata(planes, scale, colours),
+            metadata=_imagej_metadata(planes, scale, colours, units),
         )
     return path
 
@@ -110,13 +114,13 @@ def _slices(folder: Path, planes: Sequence[PlaneRecord]) -> Iterator[NDArray[np.
         yield from [pixels] if pixels.ndim == 2 else np.ascontiguousarray(np.moveaxis(pixels, 2, 0))
 
 
-def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int) -> dict[str, Any]:
+def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int, units: StatedUnits) -> dict[str, Any]:
     """Return the calibration of a stack in the words of ImageJ; origins are in samples there."""
-    labels = [f"{record.depth_mm:g} mm, {record.pitch_mm:.4g} mm/px" for record in planes]
+    labels = [f"{units.depths_text([record.depth_mm])}{_pitch_text(record, units)}" for record in planes]
     metadata: dict[str, Any] = {
         "axes": "ZCYX",
-        "unit": scale.unit,
-        "zunit": "mm",
+        "unit": scale.unit or "relative",
+        "zunit": units.length or "relative",
         "xorigin": -scale.origin[0] / scale.across,
         "yorigin": -scale.origin[1] / scale.across,
         "Labels": [label for label in labels for _ in range(colours)],
@@ -126,3 +130,8 @@ def _imagej_metadata(planes: Sequence[PlaneRecord], scale: Scale, colours: int) 
     if colours > 1:
         metadata["mode"] = "composite"
     return metadata
+
+
+def _pitch_text(record: PlaneRecord, units: StatedUnits) -> str:
+    """Return the pitch of a plane for its label; nothing if it is that of the detector whatever the depth."""
+    return f", {record.pitch_mm:.4g} mm/px" if units.depth == "mm" else ""

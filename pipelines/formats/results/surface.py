@@ -1,7 +1,8 @@
 """`surface.json`: the record of a picture that is sharp everywhere, with its depth, and of the files beside it.
 
-Its writer, its readers and its tests share these types. Light is in electrons, lengths are in the unit that the record
-states: mm, or px of disparity from one node to the next if the set knows no lengths.
+Its writer, its readers and its tests share these types. Light is in the unit that the record
+states. Depths are in the `unit` of the surface: mm; those of the poses if their scale is not known ("relative"); or px
+of disparity from one node to the next.
 """
 
 from pathlib import Path
@@ -35,7 +36,7 @@ class SurfaceOptions(Struct, frozen=True, kw_only=True):
     """
 
     depth_range_mm: tuple[float, float] | None
-    unit: Literal["mm", "px"] = "mm"
+    unit: Literal["mm", "px", "relative"] = "mm"
     penalty_weight: float | Literal["auto"]
     penalty: str
     likelihood: str
@@ -87,7 +88,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
     Attributes
     ----------
     unit : str
-        Of all depths: "mm", or "px" of disparity from one node to the next.
+        Of all depths: "mm"; "relative", that of the poses; or "px" of disparity from one node to the next.
     searched : (float, float)
         Nearest and farthest depth that were considered.
     range_found : bool
@@ -108,7 +109,7 @@ class SurfaceFacts(Struct, frozen=True, kw_only=True):
         How long it took.
     """
 
-    unit: Literal["mm", "px"]
+    unit: Literal["mm", "px", "relative"]
     searched: tuple[float, float]
     range_found: bool
     depths: int
@@ -126,7 +127,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     Attributes
     ----------
     picture, picture_sigma : str
-        The light of each sample and its standard deviation, in electrons.
+        The light of each sample and its standard deviation.
     depth, depth_sigma : str
         The depth of each sample and its standard deviation, in `unit`; NaN where the depth is not known.
     depth_confidence : str
@@ -134,7 +135,7 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     visibility : str
         Number of views that see each sample.
     points : str, optional
-        The samples whose depth is known as a point cloud, in mm; None if the unit is px.
+        The samples whose depth is known as a point cloud, in `unit`; None if that is px.
     film : str, optional
         The picture from viewpoints between the nodes; None if these do not differ, or it could not be encoded.
     shape : (int, int)

@@ -31,6 +31,7 @@ from faintfield.pipelines.formats.results.records import (
 )
 from faintfield.pipelines.formats.results.result_files import files_below, problem_of_file, read_result
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord
+from faintfield.pipelines.formats.units import record_of
 
 # The type of each record, by a pattern of its name; of geometry.json, a person may write the poses alone.
 _KINDS: dict[str, tuple[type[Struct], ...]] = {
@@ -276,8 +277,8 @@ def _decoded(text: bytes, kinds: Sequence[type[Struct]]) -> Struct:
     """Return a record of the first type that it fits."""
     for kind in kinds[:-1]:
         with suppress(msgspec.ValidationError):
-            return msgspec.json.decode(text, type=kind)
-    return msgspec.json.decode(text, type=kinds[-1])
+            return record_of(text, kind)
+    return record_of(text, kinds[-1])
 
 
 def _kinds_of(path: Path) -> tuple[type[Struct], ...]:

@@ -18,6 +18,7 @@ from faintfield.pipelines.formats.limits import MAX_NODE, sound_node
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml
 from faintfield.rig.plan import centre_node
+from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 FILE_NAME = "charuco.toml"
@@ -40,11 +41,15 @@ class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ImageEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One `[[image]]`; images of the same node and sweep are repeated frames, which are averaged."""
+    """One `[[image]]`; images of the same node and sweep are repeated frames, which are averaged.
+
+    `homing` counts the homings of the stage: frames before and after one may be shifted.
+    """
 
     file: str
     node: tuple[int, int]
     sweep: int = 0
+    homing: int = 0
 
 
 class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -58,12 +63,13 @@ class BoardSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
 @dataclass(frozen=True)
 class BoardView:
-    """The view of a node in a sweep: the files of its repeated frames, and their colour filters."""
+    """The view of a node in a sweep after a homing: the files of its repeated frames, and their colour filters."""
 
     node: Node
     sweep: int
     paths: tuple[Path, ...]
     mosaic: tuple[str, ...] | None = None
+    homing: int = 0
 
     def image(self, expected_px: tuple[int, int] | None = None) -> NDArray[np.float32]:
         """Return the mean of the frames (row, column), the colours of RGB frames averaged.
@@ -102,6 +108,8 @@ class BoardSet:
         Commanded distance of neighbouring nodes.
     one_sided : bool
         Whether the stage approached every node from the same side, in whatever order.
+    switches_repeat : bool
+        Whether homings are known to lead to the same place.
     """
 
     source: Path
@@ -110,6 +118,7 @@ class BoardSet:
     reference: Node
     pitch_mm: float | None
     one_sided: bool = False
+    switches_repeat: bool = False
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that was read."""
@@ -133,7 +142,7 @@ def load_board_set(folder: Path) -> BoardSet:
     boards = _boards(path, settings.board)
     if not settings.image:
         raise BadValue(f"{path}: names no [[image]]; give each its file, node and sweep")
-    files: dict[tuple[Node, int], list[Path]] = {}
+    files: dict[tuple[Node, int, int], list[Path]] = {}
     for index, entry in enumerate(settings.image):
         file = inside(path.parent, entry.file, f"{path}: image[{index}].file")
         if not is_file(file):
@@ -142,32 +151,35 @@ def load_board_set(folder: Path) -> BoardSet:
             raise BadValue(
                 f"{path}: image[{index}].node = {list(entry.node)}; rows and columns count from 0, to {MAX_NODE}"
             )
-        files.setdefault((entry.node, entry.sweep), []).append(file)
+        files.setdefault((entry.node, entry.sweep, entry.homing), []).append(file)
     if settings.pitch_mm is not None and not settings.pitch_mm > 0:
         raise BadValue(f"{path}: pitch_mm = {settings.pitch_mm}; it must be positive")
-    rows, columns = (1 + max(node[axis] for node, _ in files) for axis in (0, 1))
+    rows, columns = (1 + max(node[axis] for node, *_ in files) for axis in (0, 1))
     return BoardSet(path, boards, _views(files), centre_node(rows, columns), settings.pitch_mm)
 
 
 def _of_session(folder: Path) -> BoardSet:
     """Return the charuco frames of a session; each charuco step is a sweep, with the boards at rest."""
     frozen = read_plan(folder)
-    files: dict[tuple[Node, int], list[Path]] = {}
-    for planned, _, path in taken_frames(folder):
+    files: dict[tuple[Node, int, int], list[Path]] = {}
+    homings = read_homing_groups(folder)
+    for planned, taken, path in taken_frames(folder):
         if planned.kind == "charuco":
             if not is_file(path):
                 raise MissingFile(f"{path}: is in the journal but missing; restore it from a copy")
-            files.setdefault((planned.stop.node, planned.sweep), []).append(path)
+            files.setdefault((planned.stop.node, planned.sweep, homings.groups.get(taken.intent) or 0), []).append(path)
     if not files:
         raise BadValue(f"{folder}: the session has no charuco frame yet; capture its charuco steps first")
     boards = _boards(folder / PLAN, [BoardEntry(**msgspec.structs.asdict(board)) for board in frozen.rig.board])
     views = _views(files, frozen.rig.mosaic)
     one_sided = frozen.plan.approach_mm > 0
-    return BoardSet(folder / PLAN, boards, views, frozen.plan.centre.node, frozen.rig.grid.pitch_mm, one_sided)
+    return BoardSet(
+        folder / PLAN, boards, views, frozen.plan.centre.node, frozen.rig.grid.pitch_mm, one_sided, homings.repeat()
+    )
 
 
-def _views(files: dict[tuple[Node, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
-    return [BoardView(node, sweep, tuple(paths), mosaic) for (node, sweep), paths in files.items()]
+def _views(files: dict[tuple[Node, int, int], list[Path]], mosaic: tuple[str, ...] | None = None) -> list[BoardView]:
+    return [BoardView(*key[:2], tuple(paths), mosaic, key[2]) for key, paths in files.items()]
 
 
 def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None) -> NDArray[np.float32]:

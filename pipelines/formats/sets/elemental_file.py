@@ -19,6 +19,7 @@ from faintfield.pipelines.formats.limits import (
 )
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
+from faintfield.pipelines.formats.units import Units
 
 FILE_NAME = "elemental.toml"
 
@@ -40,7 +41,10 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defau
 
 
 class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated."""
+    """The `[noise]` table; a raw file's own masked pixels give the offset where it is not stated.
+
+    `estimated` says that nobody measured gain or read noise: an import estimated them from the views, or assumed them.
+    """
 
     gain_dn_per_e: float
     read_noise_e: float
@@ -48,10 +52,14 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     dark_current_e_per_s: float = 0.0
     quantum_efficiency: float | None = None
     saturation_dn: float | None = None
+    estimated: bool = False
 
 
 class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first."""
+    """One `[[view]]`: an image and the pose it was taken from; `repeats` are further frames, added to the first.
+
+    `homing` counts the homings of the stage; measured poses are shifted by what `faintfield geometry` found of them.
+    """
 
     image: str
     rt_cam_ref: tuple[float, float, float, float, float, float]
@@ -59,14 +67,57 @@ class View(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
     cx_px: float | None = None
     cy_px: float | None = None
     repeats: tuple[str, ...] = ()
+    homing: int = 0
 
 
-class ElementalSetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together."""
+class Arrangement(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[arrangement]` table: what an import found in the pictures of a grid.
+
+    Parameters
+    ----------
+    disparity_range_px : (float, float), optional
+        Least and largest disparity of the scene: how far points move from one node to the next, right, and
+        down, too, unless rows are nearer or farther from one another than columns.
+    told_by : {"pictures", "signs", "names", "options"}
+        What told where rows and columns begin: parts that near objects hide; the sign of all disparities, negative
+        where pictures are not aligned; only the names of the files; options of the command.
+    transposed, rows_flipped, columns_flipped : bool
+        The first number of a name is the column; rows, columns were reversed to run down and right.
+    aligned : bool, optional
+        The pictures are aligned (rectified) on a plane in the scene; None where nothing was seen.
+    pitch_ratio : float
+        Pitch along columns over pitch along rows. The range of disparities is that down a column of the grid.
+    missing : tuple of (int, int)
+        Nodes without a view.
+    odd_views : tuple of str
+        Pictures that fit none of their neighbours, and were left out.
+    turn_deg : float
+        Largest rotation of a view about its axis, against the others.
+    relative_light : tuple of float
+        Mean of each view's picture over their median, where they differ.
+    """
+
+    disparity_range_px: tuple[float, float] | None = None
+    told_by: Literal["pictures", "signs", "names", "options"] = "names"
+    transposed: bool = False
+    rows_flipped: bool = False
+    columns_flipped: bool = False
+    aligned: bool | None = None
+    pitch_ratio: float = 1.0
+    missing: tuple[tuple[int, int], ...] = ()
+    odd_views: tuple[str, ...] = ()
+    turn_deg: float = 0.0
+    relative_light: tuple[float, ...] = ()
+
+
+class ElementalSetFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The whole of `elemental.toml`; `exposure_s` is that of all frames of a view together, None if it is not known."""
 
     format: Literal[1]
-    exposure_s: float
+    exposure_s: float | None = None
     reference_view: int
+    units: Units = Units()
+    arrangement: Arrangement | None = None
     camera: Camera
     noise: Noise | str
     view: list[View]
@@ -103,10 +154,15 @@ def named_files(settings: ElementalSetFile) -> list[str]:
 
 def _check_numbers(path: Path, settings: ElementalSetFile) -> None:
     """Refuse an impossible exposure or mosaic."""
-    if not 0 < settings.exposure_s <= MAX_EXPOSURE_S:
+    if settings.exposure_s is not None and not 0 < settings.exposure_s <= MAX_EXPOSURE_S:
         raise BadValue(
             f"{path}: exposure_s = {settings.exposure_s}; it must be positive and at most {MAX_EXPOSURE_S:g}: give the "
             "exposure in seconds"
+        )
+    if settings.exposure_s is None and isinstance(settings.noise, Noise) and settings.noise.dark_current_e_per_s:
+        raise BadValue(
+            f"{path}: noise.dark_current_e_per_s = {settings.noise.dark_current_e_per_s:g} has no meaning without an "
+            "exposure; give exposure_s"
         )
     mosaic = settings.camera.mosaic
     if mosaic is not None and not sound_mosaic(mosaic, "RGB"):

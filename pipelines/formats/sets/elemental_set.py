@@ -9,13 +9,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.homography import rotation_matrix
 from faintfield.calib.lens import Lens
 from faintfield.calib.noise_model import Map, NoiseModel
+from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, Pose, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.sets.elemental_file import (
@@ -25,6 +27,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     named_files,
     read_set_file,
 )
+from faintfield.pipelines.formats.units import StatedUnits
 
 # Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
@@ -89,6 +92,12 @@ class ElementalSet:
         return np.array([view.rt_cam_ref for view in self.settings.view])
 
     @property
+    def units(self) -> StatedUnits:
+        """The units of all that is made from the set."""
+        units = self.settings.units
+        return StatedUnits(units.depth, units.light, "unknown" if self.settings.exposure_s is None else "s")
+
+    @property
     def image_paths(self) -> list[Path]:
         """Path of the first frame of each view."""
         return [self.folder / view.image for view in self.settings.view]
@@ -105,7 +114,7 @@ class ElementalSet:
 
     def background_e(self, noise: NoiseModel) -> Map:
         """Return the dark electrons expected in all frames of a view, by the noise model of all pixels or a part."""
-        return noise.background_e(self.settings.exposure_s)
+        return noise.background_e(self.settings.exposure_s or 0.0)
 
     def read_variance_e2(self, noise: NoiseModel) -> Map:
         """Return the variance in e⁻² that reading adds to a view, once per frame."""
@@ -131,9 +140,14 @@ class ElementalSet:
         Raises
         ------
         BadValue
-            The views have no nodes, or no plane in front of the cameras has this disparity.
+            The views have no nodes, do not move, or no plane in front of the cameras has this disparity.
         """
         at_zero, slope = self.inverse_depth_of_disparity()
+        if slope == 0:
+            raise BadValue(
+                f"{self.folder}: all views are from one place, so no plane has a disparity of {disparity_px:g} px; "
+                "give a depth instead"
+            )
         inverse_depth = at_zero + slope * disparity_px
         if not inverse_depth > 0:
             steps, shift_px = self._steps_and_shifts()
@@ -145,6 +159,27 @@ class ElementalSet:
                 "that were aligned on a plane again, with its --disparity-px"
             )
         return 1 / inverse_depth
+
+    def disparity_of_depth(self, depth_mm: float) -> float:
+        """Return by how many px a point at a depth moves from one node to the next; see `depth_of_disparity`."""
+        at_zero, slope = self.inverse_depth_of_disparity()
+        return (1 / depth_mm - at_zero) / slope
+
+    def stated_depth(self, depth_mm: float) -> float:
+        """Return a depth in the unit of the set: the same number, or the disparity in px to a millionth."""
+        return depth_mm if self.units.depth != "disparity_px" else round(self.disparity_of_depth(depth_mm), 6) + 0.0
+
+    def depth_text(self, depth_mm: float) -> str:
+        """Return a depth in words, in the unit of the set: "892.857 mm", "disparity -3.25 px", "depth 1.234"."""
+        return self.depths_text(depth_mm)
+
+    def depths_text(self, *depths_mm: float, join: str = ", ") -> str:
+        """Return several depths in words, in the unit of the set: "500, 700 mm", "disparities -3.25, 0.5 px"."""
+        return self.units.depths_text([self.stated_depth(depth) for depth in depths_mm], join)
+
+    def depth_range_text(self, first_mm: float, last_mm: float) -> str:
+        """Return a range of depths in words, in the unit of the set: "400 to 900 mm", "disparities -3.5 to 0.8 px"."""
+        return self.depths_text(first_mm, last_mm, join=" to ")
 
     def inverse_depth_of_disparity(self) -> tuple[float, float]:
         """Return 1/depth in 1/mm of the disparity zero, and by how much it grows with each px of disparity.
@@ -163,13 +198,16 @@ class ElementalSet:
     def _steps_and_shifts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return for each view the columns and rows of nodes from the reference, and the shift of its principal point.
 
-        Both are arrays (view, 2): right, down.
+        Both are arrays (view, 2): right, down. Disparities are those from column to column; where rows are nearer or
+        farther from one another, a row counts as so many columns.
         """
         nodes = np.array([view.node or (np.nan, np.nan) for view in self.settings.view], float)
         if np.isnan(nodes).any():
             raise BadValue(f"{self.folder}: disparities need the node of every view; give depths in mm instead")
         centres = self.principal_points_px()
-        return (nodes - nodes[self.reference_view])[:, ::-1], centres - centres[self.reference_view]
+        ratio = self.settings.arrangement.pitch_ratio if self.settings.arrangement is not None else 1.0
+        steps = (nodes - nodes[self.reference_view])[:, ::-1] / [1.0, ratio]
+        return steps, centres - centres[self.reference_view]
 
     def input_hashes(self) -> Iterator[tuple[str, str]]:
         """Yield name and SHA-256 of every file that a reconstruction reads."""
@@ -226,6 +264,7 @@ def _noise(folder: Path, settings: ElementalSetFile) -> FittedNoise:
     if isinstance(settings.noise, str):
         return read_fitted_noise(folder / settings.noise, camera.size_px)
     numbers = msgspec.structs.asdict(settings.noise)
+    del numbers["estimated"]
     numbers["offset_dn"] = numbers["offset_dn"] or 0.0
     numbers["saturation_dn"] = np.inf if numbers["saturation_dn"] is None else numbers["saturation_dn"]
     return FittedNoise(NoiseModel(**numbers), np.zeros(camera.size_px[::-1], bool), None)
@@ -257,13 +296,40 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
     lens = geometry.camera_lens()
     stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
     camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
+    shifts_mm = _homing_shifts_mm(path, geometry, loaded)
     views = [
-        msgspec.structs.replace(view, rt_cam_ref=poses[view.node], cx_px=None, cy_px=None)
+        msgspec.structs.replace(
+            view, rt_cam_ref=_shifted(poses[view.node], shifts_mm[view.homing]), cx_px=None, cy_px=None
+        )
         for view in settings.view
         if view.node is not None
     ]
     measured = msgspec.structs.replace(settings, camera=camera, view=views)
     return replace(loaded, settings=measured, lens=lens, measured_in=path, poses="measured")
+
+
+def _homing_shifts_mm(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> dict[int, NDArray[np.float64]]:
+    """Return by how much the cameras of each homing are shifted from those of the reference view's."""
+    views = loaded.settings.view
+    of_reference = views[loaded.settings.reference_view].homing
+    shifts = {homing: geometry.homing_shift_mm(of_reference, homing) for homing in {view.homing for view in views}}
+    unknown = [view for view in views if shifts[view.homing] is None]
+    if unknown:
+        inform(
+            f"{loaded.folder}: the stage homed while the views were taken; {path} knows no shift by that, so "
+            f"{len(unknown)} of {len(views)} views ({unknown[0].image} is the first) may be off by as much as the "
+            "switches repeat; show boards before and after within one sweep, or take the scene again"
+        )
+    return {homing: np.zeros(3) if shift is None else np.array(shift) for homing, shift in shifts.items()}
+
+
+def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
+    """Return the pose of a camera whose centre is shifted in the reference frame."""
+    if not shift_mm.any():
+        return rt_cam_ref
+    turned = rotation_matrix(np.array(rt_cam_ref)) @ shift_mm
+    a, b, c, x, y, z = (np.array(rt_cam_ref) - np.append(np.zeros(3), turned)).tolist()
+    return a, b, c, x, y, z
 
 
 def _check_match(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> None:

@@ -1,7 +1,7 @@
-"""The ground truth of a simulated set, and its object at a depth."""
+"""The ground truth of a simulated set, its object at a depth, and the true depth that an imported set may bring."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -15,6 +15,9 @@ from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.toml_files import inside
 
 TRUTH_FILE = "truth.json"
+
+# Of an imported set whose scene somebody else rendered.
+TRUE_DEPTH_FILE = "true_depth.json"
 
 # A plane within this distance of an object's depth is compared with it.
 _SAME_DEPTH_MM = 0.05
@@ -56,6 +59,43 @@ class Truth(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaul
     true_rt_cam_ref: list[tuple[float, float, float, float, float, float]]
     planes: list[TruePlane]
     surface: TrueSurface | None = None
+
+
+class TrueDepth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`true_depth.json`: the depth of each pixel of the reference view.
+
+    Attributes
+    ----------
+    format : int
+        Version of the file.
+    depth_mm : str
+        File of the depths along the camera's axis, at the centres of the pixels, NaN where there is none.
+    source, sha256 : str
+        The file that it was made from, and its hash.
+    """
+
+    format: Literal[1]
+    depth_mm: str
+    source: str
+    sha256: str
+
+
+def read_true_depth_mm(folder: Path) -> NDArray[np.float64] | None:
+    """Return the true depth (row, column) of the pixels of the reference view; None for a set without it.
+
+    Raises
+    ------
+    MissingFile, BadValue, UnreadableImage
+        A file is missing or damaged.
+    """
+    path = folder / TRUE_DEPTH_FILE
+    if not is_file(path):
+        return None
+    truth = read_json(path, TrueDepth, what="the true depth of a set", remedy="import the set again, or remove it")
+    depth_mm = read_frame(inside(folder, truth.depth_mm, f"{path}: depth_mm")).pixels_dn
+    if depth_mm.ndim != 2:
+        raise UnreadableImage(f"{folder / truth.depth_mm}: has colours, a depth has none; import the set again")
+    return np.asarray(depth_mm, np.float64)
 
 
 def read_truth(folder: Path) -> Truth | None:

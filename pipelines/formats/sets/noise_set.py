@@ -8,14 +8,15 @@ import msgspec
 import numpy as np
 
 from faintfield.calib.noise import Conditions
-from faintfield.calib.noise.drift import dark_factor
+from faintfield.calib.noise.misfit.drift import dark_factor
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.frames import RAW_SUFFIXES, exif_exposure_s
 from faintfield.pipelines.formats.limits import MAX_EXPOSURE_S, MAX_PERIOD_PX, sound_mosaic
 from faintfield.pipelines.formats.reading import is_file
 from faintfield.pipelines.formats.results.noise import NoiseFrame, TemperatureRange
 from faintfield.pipelines.formats.toml_files import inside, read_toml, write_toml
-from faintfield.rig.session.session import has_session, read_plan, taken_frames
+from faintfield.rig.session.changes import present_settings
+from faintfield.rig.session.session import has_session, taken_frames
 
 FILE_NAME = "noise.toml"
 
@@ -24,6 +25,10 @@ _MAX_PHOTONS = 1e9
 
 # Range of temperatures, in kelvins, that counts as steady, and limits of those over which dark current doubles.
 _STEADY_K, _MIN_DOUBLING_K, _MAX_DOUBLING_K = 0.5, 2.0, 30.0
+
+# Largest difference in kelvins between a dark frame and the scene, over which dark current changes by a fifth, and the
+# number of files that a warning names.
+_NEAR_SCENE_K, _MAX_NAMED = 2.0, 3
 
 
 class Region(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -88,7 +93,7 @@ def load_noise_set(folder: Path) -> tuple[Path, NoiseSet]:
 
 def _of_session(folder: Path) -> NoiseSet:
     """Return the dark and flat frames of a session; each step of flats is a light level."""
-    rig = read_plan(folder).rig
+    rig = present_settings(folder)
     light = [step.photons_per_s for step in rig.step]
     frames = [
         NoiseFrame(
@@ -120,8 +125,7 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
     BadValue
         A frame's exposure is neither stated nor in its EXIF.
     """
-    groups: dict[Conditions, list[Path]] = {}
-    warmth: dict[Conditions, list[float]] = {}
+    groups: dict[Conditions, list[tuple[Path, float | None]]] = {}
     for frame in settings.frame:
         path = folder / frame.file
         exposure_s = frame.exposure_s
@@ -135,22 +139,52 @@ def group_frames(folder: Path, settings: NoiseSet) -> dict[Conditions, list[Path
         # EXIF states exposures as ratios; the same setting must not differ in its last digit.
         level, photons = (frame.level, frame.photons) if frame.kind == "flat" else (0, None)
         conditions = Conditions(frame.kind, float(f"{exposure_s:.6g}"), level, photons)
-        groups.setdefault(conditions, []).append(path)
-        if frame.temperature_c is not None:
-            warmth.setdefault(conditions, []).append(frame.temperature_c)
-    groups = {_at_temperature(one, warmth, settings.dark_current_doubling_k): paths for one, paths in groups.items()}
-    return dict(sorted(groups.items(), key=lambda item: (item[0].kind, item[0].exposure_s, item[0].level)))
+        groups.setdefault(conditions, []).append((path, frame.temperature_c))
+    found = _by_temperature(groups, settings)
+    return dict(sorted(found.items(), key=lambda item: _order(item[0])))
 
 
-def _at_temperature(
-    conditions: Conditions, warmth: dict[Conditions, list[float]], doubling_k: float | None
-) -> Conditions:
-    """Return the conditions of a series with its dark current over that at the mean temperature of all frames."""
-    if doubling_k is None or conditions not in warmth:
-        return conditions
-    reference_c = float(np.mean([temperature for series in warmth.values() for temperature in series]))
-    factor = dark_factor(float(np.mean(warmth[conditions])), reference_c, doubling_k)
-    return replace(conditions, dark_factor=factor)
+def _order(conditions: Conditions) -> tuple[str, float, int, float]:
+    """Return what series are sorted by."""
+    return conditions.kind, conditions.exposure_s, conditions.level, conditions.temperature_c or 0.0
+
+
+def _by_temperature(
+    groups: dict[Conditions, list[tuple[Path, float | None]]], settings: NoiseSet
+) -> dict[Conditions, list[Path]]:
+    """Return the series, darks of different temperatures apart, with what their dark current was."""
+    known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
+    warmth = [it.temperature_c for it in settings.frame if it.kind == "dark" and it.temperature_c is not None]
+    several, doubling_k = bool(warmth) and np.ptp(warmth) > _STEADY_K, settings.dark_current_doubling_k
+    found: dict[Conditions, list[Path]] = {}
+    for conditions, frames in groups.items():
+        for part in _alike(frames) if several and conditions.kind == "dark" else [frames]:
+            of_part, own = [it for _, it in part if it is not None], conditions
+            if of_part and several:
+                own = replace(own, temperature_c=float(np.mean(of_part)))
+            if of_part and doubling_k is not None:
+                factor = dark_factor(float(np.mean(of_part)), float(np.mean(known)), doubling_k)
+                own = replace(own, dark_factor=factor)
+            found.setdefault(own, []).extend(path for path, _ in part)
+    return found
+
+
+def _alike(frames: list[tuple[Path, float | None]]) -> list[list[tuple[Path, float | None]]]:
+    """Return darks of one exposure, those of different temperatures apart, each part in the order of the frames.
+
+    A part ends at a gap, or where a slow drift would make its dark current differ. Frames without a temperature are one
+    part.
+    """
+    known = sorted({it for _, it in frames if it is not None})
+    firsts: list[float] = []
+    for index, warmth in enumerate(known):
+        if index == 0 or warmth - known[index - 1] > _STEADY_K or warmth - firsts[-1] > _NEAR_SCENE_K:
+            firsts.append(warmth)
+    parts: dict[float | None, list[tuple[Path, float | None]]] = {}
+    for path, it in frames:
+        first = None if it is None else max(first for first in firsts if first <= it)
+        parts.setdefault(first, []).append((path, it))
+    return list(parts.values())
 
 
 def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list[str]]:
@@ -176,6 +210,32 @@ def temperature_notes(settings: NoiseSet) -> tuple[TemperatureRange | None, list
             f"{10 * np.ptp(known):.0f} %; let the camera settle before recording"
         )
     return TemperatureRange(float(np.mean(known)), min(known), max(known)), warnings
+
+
+def scene_temperature_warnings(folder: Path, settings: NoiseSet) -> list[str]:
+    """Return a warning about the darks of a session that are warmer or colder than its dark scene, if there are any.
+
+    Frames whose temperature is not known are passed over, and so are sets that belong to no session.
+    """
+    if not has_session(folder) or is_file(folder / FILE_NAME):
+        return []
+    temperatures = [it.record.temperature_c for frame, it, _ in taken_frames(folder) if frame.kind == "dark_scene"]
+    scene = [found for found in temperatures if found is not None]
+    if not scene:
+        return []
+    scene_c = float(np.median(scene))
+    darks = [(it.file, it.temperature_c) for it in settings.frame if it.kind == "dark" and it.temperature_c is not None]
+    away = [(file, found) for file, found in darks if abs(found - scene_c) > _NEAR_SCENE_K]
+    if not away:
+        return []
+    low, high = min(found for _, found in away), max(found for _, found in away)
+    names = ", ".join(file for file, _ in away[:_MAX_NAMED]) + (", …" if len(away) > _MAX_NAMED else "")
+    return [
+        f"{len(away)} of {len(darks)} dark frames are more than {_NEAR_SCENE_K:g} K away from the scene ({names}): "
+        f"they have {low:.1f} to {high:.1f} °C, the {len(scene)} frames of the scene {min(scene):.1f} to "
+        f"{max(scene):.1f} °C; "
+        "take them again at the scene's temperature, as camera.settle_temperature_c makes sure of"
+    ]
 
 
 def _check_numbers(path: Path, frame: NoiseFrame) -> None:

@@ -1,5 +1,6 @@
 """The frames of one kind of a session as an elemental set, in the session's own files."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -9,12 +10,14 @@ from numpy.typing import NDArray
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.reading import is_file, is_folder
-from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, PosesOfSession, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, read_fitted_noise
 from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile, View
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
 from faintfield.rig.plan import CapturePlan, StepKind, Stop, planned_frames
+from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 RECONSTRUCTIONS = "reconstructions"
@@ -64,11 +67,15 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
     lens = read_geometry(measured_in, CameraPoses).camera_lens()
     noise = read_fitted_noise(folder / NOISE_FILE, lens.size_px)
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
-    views = [_view(stop, plan.centre, names) for stop, names in frames]
+    homings = _homings_apart(folder, measured_in)
+    _tell_of_mixed(folder, frames, homings)
+    views = [_view(stop, plan.centre, names, homings.get(names[0], 0)) for stop, names in frames]
     reference = [view.node for view in views].index(plan.centre.node)
     return ElementalSet(
         folder,
-        ElementalSetFile(1, exposure_s, reference, camera, NOISE_FILE, views),
+        ElementalSetFile(
+            format=1, exposure_s=exposure_s, reference_view=reference, camera=camera, noise=NOISE_FILE, view=views
+        ),
         lens,
         noise.model,
         offset_from_files=False,
@@ -126,7 +133,31 @@ def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_]
     return (response / np.float32(level)) if level > 0 else response
 
 
-def _view(stop: Stop, centre: Stop, names: list[str]) -> View:
+def _homings_apart(folder: Path, measured_in: Path) -> dict[str, int]:
+    """Return the homing of each frame by name; of none where all homings are known to lead to one place.
+
+    Where the geometry is that of another session, whose homings are others, the numbers are negative: their shifts are
+    not known.
+    """
+    homings, geometry = read_homing_groups(folder), read_geometry(measured_in, PosesOfSession)
+    own = geometry.inputs.get(PLAN) == sha256(folder / PLAN)
+    if homings.repeat() and not (own and geometry.homings):
+        return {}
+    frames = [(str(path.relative_to(folder)), taken.intent) for _, taken, path in taken_frames(folder)]
+    return {name: (homings.groups.get(intent) or 0) * (1 if own else -1) for name, intent in frames}
+
+
+def _tell_of_mixed(folder: Path, frames: Sequence[tuple[Stop, list[str]]], homings: Mapping[str, int]) -> None:
+    """Name the views whose frames were taken after different homings, and may not lie upon one another."""
+    mixed = [stop.node for stop, names in frames if len({homings.get(name, 0) for name in names}) > 1]
+    if mixed:
+        inform(
+            f"{folder}: the stage homed between the frames of {len(mixed)} of {len(frames)} nodes ({list(mixed[0])} is "
+            "the first); they are added up at the pose of the first, and may be off by as much as the switches repeat"
+        )
+
+
+def _view(stop: Stop, centre: Stop, names: list[str], homing: int) -> View:
     """Return the view of a node, with the pose that the stage was told."""
     right_mm, down_mm = stop.target.x_mm - centre.target.x_mm, stop.target.y_mm - centre.target.y_mm
-    return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]))
+    return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]), homing=homing)

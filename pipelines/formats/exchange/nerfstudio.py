@@ -1,0 +1,209 @@
+"""`transforms.json` of nerfstudio and instant-ngp: lens and poses of images.
+
+There a pose is the matrix from camera to world, of a camera that looks along its −z with y up (OpenGL); here cameras
+look along +z with y down. There the first pixel's centre is at (0.5, 0.5), here at (0, 0).
+"""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world, turn_and_centre
+from faintfield.pipelines.formats.exchange.imported_set import PosedImage, PosedModel
+from faintfield.pipelines.formats.exchange.picture_folder import picture_named
+from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.reading import is_file, is_folder, read_json
+
+FILE_NAME = "transforms.json"
+
+_HALF_PX = 0.5
+
+# A camera of OpenGL in axes of OpenCV: x stays, y and z point the other way.
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+# Lenses that have a counterpart here; None is that of instant-ngp, which names none.
+_MODELS = (None, "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+
+_WRITTEN_MODEL = "OPENCV"
+
+type _Row = tuple[float, float, float, float]
+
+
+class _Intrinsics(msgspec.Struct, omit_defaults=True, kw_only=True):
+    """A lens; a frame may state its own values of each."""
+
+    camera_model: str | None = None
+    w: float | None = None
+    h: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    is_fisheye: bool | None = None
+
+
+class _Frame(_Intrinsics, omit_defaults=True, kw_only=True):
+    """An image: its file beside this one, with or without suffix, and its camera's pose."""
+
+    file_path: str
+    transform_matrix: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
+
+
+class _Transforms(_Intrinsics, omit_defaults=True, kw_only=True):
+    """The file."""
+
+    frames: list[_Frame]
+
+
+def read_transforms(src: Path, images: Path | None = None) -> PosedModel:
+    """Return the images of a `transforms.json` with their lenses and poses, in its own unit.
+
+    Parameters
+    ----------
+    src : Path
+        The file, or its folder.
+    images : Path, optional
+        Folder from which the names of images count; that of the file by default.
+
+    Raises
+    ------
+    MissingFile
+        There is no such file.
+    BadValue
+        It is damaged, a lens has no counterpart here, a pose is none, or a name leads out of the folder.
+    """
+    path = src / FILE_NAME if is_folder(src) else src
+    if not is_file(path):
+        raise MissingFile(f"{path}: no such file; name a {FILE_NAME} or the folder that holds it")
+    remedy = "export it again"
+    content = read_json(path, _Transforms, what=f"a {FILE_NAME} that can be read", remedy=remedy)
+    folder = images or path.parent
+    posed: list[PosedImage] = []
+    sizes: dict[Path, tuple[int, int]] = {}
+    for index, frame in enumerate(content.frames):
+        place = f"{path}: frames[{index}]"
+        image = picture_named(folder, frame.file_path, f"{place}.file_path")
+        try:
+            lens = _lens(content, frame, image, sizes)
+            matrix = np.array(frame.transform_matrix)[:3]
+            pose = rt_cam_world(matrix[:, :3] @ _FLIP, matrix[:, 3])
+        except (ValueError, OverflowError) as failure:
+            raise BadValue(f"{place} ({frame.file_path}): {failure}; {remedy}") from failure
+        posed.append(PosedImage(image, lens, pose))
+    return PosedModel([path], posed)
+
+
+def _lens(content: _Transforms, frame: _Frame, image: Path, sizes: dict[Path, tuple[int, int]]) -> Lens:
+    """Return the lens of a frame: its own values, else those of the file, else what follows from the picture's size.
+
+    `sizes` keeps the size of the first picture, which is read if the file states none.
+    """
+
+    def value(name: str) -> float | None:
+        own = getattr(frame, name)
+        found = getattr(content, name) if own is None else own
+        return None if found is None else float(found)
+
+    model = frame.camera_model or content.camera_model
+    if model not in _MODELS or frame.is_fisheye or content.is_fisheye or value("k4"):
+        told = "k4" if value("k4") else model if model not in _MODELS else "is_fisheye"
+        raise ValueError(f"its lens has no counterpart here ({told}); undistort the images to a pinhole camera")
+    width, height = value("w"), value("h")
+    if width is None or height is None:
+        if not sizes:
+            sizes[image] = read_frame(image).pixels_dn.shape[1::-1]
+        width, height = next(iter(sizes.values()))
+    fx_px, fy_px = value("fl_x"), value("fl_y")
+    if fx_px is None and (angle := value("camera_angle_x")) is not None:
+        fx_px = _focal_px(width, angle, "camera_angle_x")
+    if fy_px is None and (angle := value("camera_angle_y")) is not None:
+        fy_px = _focal_px(height, angle, "camera_angle_y")
+    if fx_px is None:
+        raise ValueError("states neither fl_x nor camera_angle_x")
+    distortion = tuple(value(name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
+    cx, cy = value("cx"), value("cy")
+    return Lens(
+        (_whole(width, "w"), _whole(height, "h")),
+        fx_px,
+        fx_px if fy_px is None else fy_px,
+        (width / 2 if cx is None else cx) - _HALF_PX,
+        (height / 2 if cy is None else cy) - _HALF_PX,
+        distortion if any(distortion) else (),
+    )
+
+
+def _focal_px(size: float, angle: float, name: str) -> float:
+    """Return the focal length of a picture that spans an angle."""
+    if not 0 < angle < math.pi:
+        raise ValueError(f"{name} = {angle:g} rad is not between 0 and π")
+    return 0.5 * size / math.tan(0.5 * angle)
+
+
+def _whole(number: float, name: str) -> int:
+    """Return a size in px."""
+    if not number.is_integer():
+        raise ValueError(f"{name} = {number:g} is no whole number of pixels")
+    return int(number)
+
+
+def write_transforms(folder: Path, names: list[str], lenses: list[Lens], poses: NDArray[np.float64]) -> None:
+    """Write a `transforms.json` of images that are to lie beside it.
+
+    Parameters
+    ----------
+    folder : Path
+        Where to write it.
+    names : list of str
+        File of each image.
+    lenses : list of Lens
+        Its lens; each frame states its own where they differ.
+    poses : array (view, 6)
+        From the world to each camera, Rodrigues rad and any unit.
+
+    Raises
+    ------
+    BadValue
+        The distortion has terms for which nerfstudio has no names.
+    """
+    if any(any(lens.distortion[5:]) for lens in lenses):
+        raise BadValue(
+            f"{names[0]}: its lens has the distortion {list(lenses[0].distortion)}, of which transforms.json holds the "
+            "first five terms; calibrate with --lens opencv5, or export COLMAP"
+        )
+    shared = lenses[0] if len(set(lenses)) == 1 else None
+    frames = [
+        _Frame(file_path=name, transform_matrix=_matrix(pose), **({} if shared is not None else _stated(lens)))
+        for name, lens, pose in zip(names, lenses, poses, strict=True)
+    ]
+    whole = {"camera_model": _WRITTEN_MODEL} if shared is None else _stated(shared)
+    write_json(folder / FILE_NAME, _Transforms(**whole, frames=frames))
+
+
+def _matrix(pose: NDArray[np.float64]) -> list[_Row]:
+    """Return the matrix from a camera of OpenGL to the world."""
+    turn, centre = turn_and_centre(pose)
+    rows = np.column_stack([turn @ _FLIP, centre]).tolist()
+    return [(a, b, c, d) for a, b, c, d in [*rows, [0.0, 0.0, 0.0, 1.0]]]
+
+
+def _stated(lens: Lens) -> dict[str, Any]:
+    """Return the values that state a lens."""
+    k1, k2, p1, p2, k3 = [*lens.distortion, *[0.0] * 5][:5]
+    stated: dict[str, Any] = {"camera_model": _WRITTEN_MODEL, "w": lens.size_px[0], "h": lens.size_px[1]}
+    stated |= {"fl_x": lens.fx_px, "fl_y": lens.fy_px, "cx": lens.cx_px + _HALF_PX, "cy": lens.cy_px + _HALF_PX}
+    return stated | {"k1": k1, "k2": k2, "p1": p1, "p2": p2} | ({"k3": k3} if k3 else {})

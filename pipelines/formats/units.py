@@ -1,0 +1,181 @@
+"""The units of a set and of what is made from it: nothing is stated in a unit that nobody measured.
+
+Records are of one type whatever their units: `depth_mm`, `mean_e` and their like hold numbers in the units that the
+record states. Files name them by these units, `disparity_px`, `mean_dn`: `json_of` names them so, `record_of` back.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import msgspec
+from msgspec import UNSET, UnsetType
+
+type DepthUnit = Literal["mm", "relative", "disparity_px"]
+type LightUnit = Literal["electrons", "dn", "relative"]
+type ExposureUnit = Literal["s", "unknown"]
+
+# Keys that state a depth or a length across the planes, and their endings by unit.
+_DEPTH_KEYS = ("depth_mm", "pitch_mm", "origin_mm", "sharp_mm", "searched_mm", "depth_range_mm")
+_DEPTH_ENDINGS: dict[DepthUnit, str] = {"mm": "_mm", "relative": "", "disparity_px": "_px"}
+
+# Keys that state light or its square, with the place of its unit, and what stands there by unit.
+_LIGHT_KEYS = (
+    *("mean{}", "flux{}", "smoothing{}", "epsilon{}2", "detail{}2", "sigma{}2"),
+    *("read_noise{}", "dark{}", "mean_signal{}"),
+)
+_LIGHT_PLACES: dict[LightUnit, str] = {"electrons": "_e", "dn": "_dn", "relative": ""}
+_ELECTRONS_KEYS = ("electrons_linear", "electrons_from_moments")
+
+# Keys that photons need, and what marks those that are left out.
+_PHOTON_KEYS, _LEFT_OUT = ("photons_linear", "photons_from_moments", "quantum_efficiency"), "-"
+
+# Keys whose content is named by others (files, packages, planes), or names the units themselves.
+_FOREIGN = frozenset({"units", "inputs", "versions", "sha256", "plane_pose"})
+
+# A surface states the unit of its depths by a key of its own.
+_SURFACE = "surface"
+
+
+class Units(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """The `[units]` table of `elemental.toml`.
+
+    Parameters
+    ----------
+    depth : {"mm", "relative", "disparity_px"}
+        What depths are stated in. "relative": poses are to scale, but the scale is not known. "disparity_px": only how
+        many pixels a point moves from one node to the next is known, right or down; lengths in the poses mean nothing.
+    light : {"electrons", "dn", "relative"}
+        What light is stated in. "dn": values of the files, above the dark level, because the gain is not known or only
+        estimated. "relative": linear in light up to an unknown factor, 1 is white; the files had a tone curve.
+    """
+
+    depth: DepthUnit = "mm"
+    light: LightUnit = "electrons"
+
+
+class StatedUnits(msgspec.Struct, frozen=True):
+    """The `units` of a record: those of its set, and whether its exposure is known.
+
+    A record without them, of an earlier version, has these defaults.
+    """
+
+    depth: DepthUnit = "mm"
+    light: LightUnit = "electrons"
+    exposure: ExposureUnit = "s"
+
+    @property
+    def quantity(self) -> str:
+        """What tells planes apart: depth or disparity."""
+        return "disparity" if self.depth == "disparity_px" else "depth"
+
+    @property
+    def length(self) -> str:
+        """Unit of depths, disparities and lengths on planes; empty if it has no name."""
+        return {"mm": "mm", "relative": "", "disparity_px": "px"}[self.depth]
+
+    @property
+    def quantity_label(self) -> str:
+        """What tells planes apart, with its unit, for axes and table heads."""
+        return f"{self.quantity}, {self.length or 'relative'}"
+
+    @property
+    def light_symbol(self) -> str:
+        """Unit of light after a number; 1 is white if it is relative."""
+        return {"electrons": "e⁻", "dn": "DN", "relative": "of white"}[self.light]
+
+    @property
+    def light_in_words(self) -> str:
+        """What the values of a plane are."""
+        return {
+            "electrons": "expected electrons per detector pixel of the reference view",
+            "dn": "expected DN above the dark level per detector pixel of the reference view",
+            "relative": "expected light per detector pixel of the reference view, 1 = white",
+        }[self.light]
+
+    @property
+    def light_per_pixel(self) -> str:
+        """Unit of the light of a sample after a number, in the words of a page."""
+        return "of the views’ white" if self.light == "relative" else f"{self.light_symbol} per pixel"
+
+    @property
+    def quantities(self) -> str:
+        """Several of what tells planes apart."""
+        return "disparities" if self.depth == "disparity_px" else "depths"
+
+    def numbers_text(self, values: Sequence[float], join: str = ", ") -> str:
+        """Return depths with their unit: "500, 700 mm", "-3.25, 0.5 px", "1.234"."""
+        if self.depth == "disparity_px":
+            return f"{join.join(f'{round(value, 3) + 0.0:g}' for value in values)} px"
+        if self.depth == "relative":
+            return join.join(f"{value:.4g}" for value in values)
+        return f"{join.join(f'{value:g}' for value in values)} mm"
+
+    def depths_text(self, values: Sequence[float], join: str = ", ") -> str:
+        """Return depths in words: "500, 700 mm", "disparities -3.25, 0.5 px", "depth 1.234"."""
+        numbers = self.numbers_text(values, join)
+        return numbers if self.depth == "mm" else f"{self.quantities if len(values) > 1 else self.quantity} {numbers}"
+
+
+def units_of(record: object) -> StatedUnits:
+    """Return the units that a record states; the defaults if it states none."""
+    return getattr(record, "units", UNSET) or StatedUnits()
+
+
+def json_of(record: object) -> bytes:
+    """Return a record as JSON, its keys named by the units that it states."""
+    if not any(_names(units_of(record))):
+        return msgspec.json.encode(record)
+    return msgspec.json.encode(named_by(msgspec.to_builtins(record), units_of(record)))
+
+
+def named_by(content: Any, units: StatedUnits) -> Any:
+    """Return what JSON holds of a record, or of a part of one, with its keys named by units; no photons without e⁻."""
+    depths, lights = _names(units)
+    return _renamed(content, depths, lights | dict.fromkeys(_PHOTON_KEYS if lights else (), _LEFT_OUT))
+
+
+def record_of[Record](content: bytes, kind: type[Record]) -> Record:
+    """Return a record from its JSON; its keys may be named by the units that it states.
+
+    Raises
+    ------
+    msgspec.MsgspecError, UnicodeDecodeError, RecursionError
+        It is not JSON, or not of this kind.
+    """
+    if b'"units"' in content:
+        whole = msgspec.json.decode(content)
+        stated = whole.get("units") if isinstance(whole, dict) else None
+        names = _names(msgspec.convert(stated, StatedUnits)) if stated is not None else ({}, {})
+        if any(names):
+            return msgspec.convert(_renamed(whole, *({new: old for old, new in one.items()} for one in names)), kind)
+    return msgspec.json.decode(content, type=kind)
+
+
+def _names(units: StatedUnits) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the keys that are named otherwise in these units: those of depths, and those of light."""
+    depths: dict[str, str] = {}
+    lights: dict[str, str] = {}
+    if units.depth != "mm":
+        ending = _DEPTH_ENDINGS[units.depth]
+        depths = {key: key.replace("depth", units.quantity).removesuffix("_mm") + ending for key in _DEPTH_KEYS}
+    if units.light != "electrons":
+        place = _LIGHT_PLACES[units.light]
+        lights = {key.format("_e"): key.format(place) for key in _LIGHT_KEYS}
+        lights |= {key: key.replace("electrons", "light") for key in _ELECTRONS_KEYS}
+    return depths, lights
+
+
+def _renamed(value: Any, depths: Mapping[str, str], lights: Mapping[str, str]) -> Any:
+    """Return JSON values with their keys renamed."""
+    if isinstance(value, dict):
+        return {
+            depths.get(key) or lights.get(key) or key: (
+                part if key in _FOREIGN else _renamed(part, {} if key == _SURFACE else depths, lights)
+            )
+            for key, part in value.items()
+            if lights.get(key) != _LEFT_OUT
+        }
+    return [_renamed(part, depths, lights) for part in value] if isinstance(value, list) else value
+
+
+type UnitsOrUnset = StatedUnits | UnsetType

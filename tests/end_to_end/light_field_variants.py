@@ -1,0 +1,218 @@
+"""The variants of the corpus: what each is, and whether its set is as rendered, or refused by which name."""
+
+from collections.abc import Callable
+from itertools import product
+
+import numpy as np
+
+from tests.calib.light_fields import Layer, light_field
+from tests.end_to_end.light_field_files import (
+    COLUMNS,
+    FILES,
+    HCI,
+    HEIGHT,
+    ROWS,
+    WIDTH,
+    Names,
+    Pictures,
+    Variant,
+    lettered,
+    other_scene,
+    positions_only,
+    running,
+    stanford,
+)
+
+# Aligned by so many px, the farthest, a middle, and the nearest thing stand nearly still.
+FAR_PX, MIDDLE_PX, NEAR_PX = 1, 2, 4
+
+SIZES = ("--rows", str(ROWS), "--columns", str(COLUMNS))
+
+
+def _without(*nodes: tuple[int, int]) -> Callable[[Pictures], Pictures]:
+    return lambda views: {node: view for node, view in views.items() if node not in nodes}
+
+
+def _exposed(views: Pictures) -> Pictures:
+    generator = np.random.default_rng(8)
+    return {node: view * np.float32(generator.uniform(0.8, 1.2)) for node, view in views.items()}
+
+
+def _every_second_column(views: Pictures) -> Pictures:
+    return {(row, column // 2): view for (row, column), view in views.items() if column % 2 == 0}
+
+
+def _at_first_and_last_row(row: int, column: int) -> bool:
+    return row in (0, 4) or (row, column) == (2, 2)
+
+
+def _first_and_last_row(views: Pictures) -> Pictures:
+    return {node: view for node, view in views.items() if _at_first_and_last_row(*node)}
+
+
+def _noise(views: Pictures) -> Pictures:
+    generator = np.random.default_rng(4)
+    return {node: generator.random(view.shape, np.float32) for node, view in views.items()}
+
+
+def _shuffled(views: Pictures) -> Pictures:
+    order = np.random.default_rng(6).permutation(len(views))
+    pictures = list(views.values())
+    return {node: pictures[index] for node, index in zip(views, order, strict=True)}
+
+
+def _flat_wall(views: Pictures) -> Pictures:
+    """Return views of one plane without edges, which moves with the camera: its order may be reversed, too."""
+    wall = light_field((Layer(1.5),), grid=(ROWS, COLUMNS), size_px=(WIDTH, HEIGHT))
+    return {node: wall[node] for node in views}
+
+
+def _serpentine(line: int, place: int) -> str:
+    return f"{line * COLUMNS + (place if line % 2 == 0 else COLUMNS - 1 - place):04}"
+
+
+TURNS = {
+    " ".join(words): Names(transpose="transposed" in words, flip_rows="rows" in words, flip_columns="columns" in words)
+    for flags in product((False, True), repeat=3)
+    if (words := [it for it, on in zip(("transposed", "rows", "columns"), flags, strict=True) if on])
+}
+
+CORPUS: dict[str, Variant] = {
+    "as documented": Variant(),
+    **{f"numbers turned: {name}": Variant(names) for name, names in TURNS.items()},
+    **{
+        f"aligned {where}, numbers turned: {name}": Variant(names, aligned_px=moved_px)
+        for where, moved_px in {"far": FAR_PX, "middle": MIDDLE_PX, "near": NEAR_PX}.items()
+        for name, names in {"no": Names(), **TURNS}.items()
+    },
+    "two plain numbers": Variant(Names(lambda r, c: f"{r}_{c}")),
+    "two plain numbers, column first": Variant(Names(lambda r, c: f"{r}_{c}", transpose=True), aligned_px=MIDDLE_PX),
+    "numbers from one": Variant(Names(lambda r, c: f"cam-{r + 1:02}-{c + 1:02}")),
+    "numbers in steps of two": Variant(Names(lambda r, c: lettered(10 + 2 * r, 2 * c)), aligned_px=MIDDLE_PX),
+    "x and y": Variant(Names(lambda r, c: f"x{c}_y{r}")),
+    "running numbers of a square": Variant(Names(running(7)), square=True),
+    "running numbers of a square, from one": Variant(Names(running(7, 1, "{}")), square=True, aligned_px=MIDDLE_PX),
+    "running numbers of a square, by column": Variant(Names(running(7), transpose=True), square=True),
+    "running numbers, sizes given": Variant(Names(running(COLUMNS)), options=SIZES),
+    "running numbers by column, sizes given": Variant(
+        Names(running(ROWS), transpose=True), options=SIZES, aligned_px=MIDDLE_PX
+    ),
+    "running numbers, rows reversed": Variant(
+        Names(running(COLUMNS), flip_rows=True), options=SIZES, aligned_px=MIDDLE_PX
+    ),
+    "Stanford": Variant(Names(stanford), aligned_px=MIDDLE_PX),
+    "Stanford, columns reversed": Variant(Names(stanford, flip_columns=True), aligned_px=MIDDLE_PX),
+    "Stanford, rows reversed": Variant(Names(stanford, flip_rows=True), aligned_px=NEAR_PX),
+    "positions only": Variant(Names(positions_only), aligned_px=MIDDLE_PX),
+    "HCI": Variant(Names(running(COLUMNS, 0, "input_Cam{:03}")), aligned_px=MIDDLE_PX, beside={"parameters.cfg": HCI}),
+    "HCI, both reversed": Variant(
+        Names(running(COLUMNS, 0, "input_Cam{:03}"), flip_rows=True, flip_columns=True),
+        aligned_px=MIDDLE_PX,
+        beside={"parameters.cfg": HCI},
+    ),
+    "a pattern": Variant(
+        Names(lambda r, c: f"take3-{c:02}{r:02}-final"), options=("--pattern", "{name}-{column:2}{row:2}-final.png")
+    ),
+    "a pattern, fields exchanged": Variant(
+        Names(lambda r, c: f"take3-{c:02}{r:02}-final"),
+        options=("--pattern", "{name}-{row:2}{column:2}-final.png"),
+        aligned_px=MIDDLE_PX,
+    ),
+    "one view missing": Variant(change=_without((2, 3)), kept=lambda r, c: (r, c) != (2, 3), said="missing"),
+    "three views missing": Variant(
+        Names(flip_columns=True),
+        change=_without((0, 0), (1, 5), (4, 2)),
+        kept=lambda r, c: (r, c) not in ((0, 0), (1, 5), (4, 2)),
+        aligned_px=MIDDLE_PX,
+        said="missing",
+    ),
+    "a whole row missing": Variant(
+        change=_without(*((2, column) for column in range(COLUMNS))),
+        kept=lambda r, c: r != 2,
+        aligned_px=MIDDLE_PX,
+        said="missing",
+    ),
+    "exposures that differ": Variant(Names(flip_rows=True), aligned_px=MIDDLE_PX, change=_exposed),
+    "exposures that differ, not aligned": Variant(Names(transpose=True), change=_exposed),
+    "every second column": Variant(change=_every_second_column, kept=lambda r, c: c % 2 == 0, ratio=2.0),
+    "every second column, numbered so": Variant(
+        Names(lambda r, c: lettered(r, 2 * c)),
+        change=_every_second_column,
+        kept=lambda r, c: c % 2 == 0,
+        ratio=2.0,
+        aligned_px=MIDDLE_PX,
+    ),
+    "a view of another scene": Variant(
+        aligned_px=MIDDLE_PX,
+        change=lambda views: {**views, (2, 2): other_scene(70)},
+        kept=lambda r, c: (r, c) != (2, 2),
+        said="fit none of their neighbours, and are left out: view_r2_c2.png",
+    ),
+    "a view of noise": Variant(
+        Names(flip_columns=True),
+        change=lambda views: {**views, (2, 2): _noise(views)[2, 2]},
+        kept=lambda r, c: (r, c) != (2, 2),
+        said="fit none of their neighbours, and are left out: view_r2_c4.png",
+    ),
+    "back and forth by row": Variant(Names(_serpentine), options=SIZES, said="names run back and forth"),
+    "back and forth by row, aligned far": Variant(
+        Names(_serpentine), options=SIZES, aligned_px=FAR_PX, said="names run back and forth"
+    ),
+    "back and forth by row, columns reversed": Variant(
+        Names(_serpentine, flip_columns=True), options=SIZES, aligned_px=MIDDLE_PX, said="names run back and forth"
+    ),
+    "back and forth by column, of a square": Variant(
+        Names(_serpentine, transpose=True), square=True, aligned_px=MIDDLE_PX, said="names run back and forth"
+    ),
+    "rows and columns that run back and forth": Variant(
+        Names(lambda r, c: lettered(r, 6 - c if r % 2 else c)), aligned_px=NEAR_PX, said="names run back and forth"
+    ),
+    "sizes exchanged": Variant(
+        Names(running(COLUMNS)), options=("--rows", "7", "--columns", "5"), aligned_px=MIDDLE_PX
+    ),
+    "first and last row": Variant(change=_first_and_last_row, kept=_at_first_and_last_row, said="missing", ratio=0.5),
+    **{f"files: {kind}": Variant(write=write, aligned_px=MIDDLE_PX) for kind, write in FILES.items()},
+    **{
+        f"files: {kind}": Variant(write=FILES[kind], aligned_px=MIDDLE_PX, options=SIZES)
+        for kind in ("multi-page TIFF", "mosaic in one file")
+    },
+    "files: multi-page TIFF of a square": Variant(
+        Names(flip_columns=True), write=FILES["multi-page TIFF"], square=True, aligned_px=MIDDLE_PX
+    ),
+}
+
+# What no set can be made of, or none that is sure, with the name of the failure.
+REFUSED: dict[str, tuple[str, Variant]] = {
+    "noise": ("NotOneScene", Variant(change=_noise)),
+    "a scene for each picture": (
+        "NotOneScene",
+        Variant(change=lambda views: {node: other_scene(50 + index) for index, node in enumerate(views)}),
+    ),
+    "two scenes": (
+        "NotOneScene",
+        Variant(
+            aligned_px=MIDDLE_PX,
+            change=lambda views: views | {node: _noise(views)[node] for node in views if node[1] > 3},
+        ),
+    ),
+    "one picture for all": ("CopiedPicture", Variant(change=lambda views: dict.fromkeys(views, views[0, 0]))),
+    "one picture for all, of a square": (
+        "CopiedPicture",
+        Variant(square=True, change=lambda views: dict.fromkeys(views, views[3, 3])),
+    ),
+    "one picture twice": ("CopiedPicture", Variant(change=lambda views: {**views, (1, 1): views[3, 3]})),
+    "shuffled": ("AmbiguousOrder", Variant(change=_shuffled, aligned_px=MIDDLE_PX)),
+    "running numbers, no square": ("BadValue", Variant(Names(running(COLUMNS)))),
+    "running numbers with a gap": ("BadValue", Variant(Names(running(7)), square=True, change=_without((3, 3)))),
+    "sizes of other pictures": (
+        "MissingFile",
+        Variant(Names(running(COLUMNS)), options=("--rows", "5", "--columns", "6")),
+    ),
+    "half of the views missing": (
+        "MissingFile",
+        Variant(change=lambda views: {node: view for node, view in views.items() if 0 in node}),
+    ),
+    "a pattern that does not match": ("BadValue", Variant(options=("--pattern", "{row}-{column}.png"))),
+    "a smaller picture": ("WrongSize", Variant(change=lambda views: {**views, (4, 6): views[4, 6][10:, 10:]})),
+    "a flat wall": ("AmbiguousOrder", Variant(aligned_px=NEAR_PX, change=_flat_wall)),
+}

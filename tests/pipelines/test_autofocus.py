@@ -1,0 +1,166 @@
+"""Depths that auto finds, or refuses: views that mean nothing, and those in another order than stated."""
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import tomli_w
+from numpy.typing import NDArray
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.reconstruction.autofocus import best_focus, searched_range_mm
+from faintfield.pipelines.reconstruction.comparison import BinnedViews, binned_views
+from faintfield.pipelines.reconstruction.significance import MAX_P_VALUE, check_places
+from faintfield.recon.errors import NothingInFocus
+from tests.calib.light_fields import Layer, light_field, with_noise
+from tests.pipelines.conftest import Command
+
+type Node = tuple[int, int]
+
+NODES, SIZE_PX = 5, (128, 96)
+OFFSET_DN, GAIN_DN_PER_E, READ_NOISE_E = 100.0, 2.0, 3.0
+CARDS = (Layer(-1.0), Layer(-2.5, (-30, -20), (25, 20)), Layer(-4.0, (30, 10), (20, 25)))
+
+
+def _grid(folder: Path, picture: Callable[[Node], NDArray[np.floating]]) -> Path:
+    """Write a set of a square grid, 10 mm apart, of what each node sees, in electrons."""
+    folder.mkdir()
+    random, middle, views = np.random.default_rng(7), NODES // 2, []
+    for row, column in np.ndindex(NODES, NODES):
+        electrons = random.poisson(picture((row, column))) + random.normal(0, READ_NOISE_E, SIZE_PX[::-1])
+        name = f"view_r{row}_c{column}.tiff"
+        cv2.imwrite(str(folder / name), (OFFSET_DN + GAIN_DN_PER_E * electrons).round().astype(np.uint16))
+        pose = [0.0, 0.0, 0.0, -10.0 * (column - middle), -10.0 * (row - middle), 0.0]
+        views.append({"image": name, "rt_cam_ref": pose, "node": [row, column]})
+    width, height = SIZE_PX
+    settings = {
+        "format": 1,
+        "exposure_s": 0.5,
+        "reference_view": len(views) // 2,
+        "camera": {
+            "size_px": [width, height],
+            **{"fx_px": 100.0, "fy_px": 100.0, "cx_px": (width - 1) / 2, "cy_px": (height - 1) / 2},
+        },
+        "noise": {"offset_dn": OFFSET_DN, "gain_dn_per_e": GAIN_DN_PER_E, "read_noise_e": READ_NOISE_E},
+        "view": views,
+    }
+    (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    views = light_field(CARDS, (NODES, NODES), SIZE_PX)
+    return _grid(tmp_path_factory.mktemp("auto") / "scene", lambda node: 200 * views[node])
+
+
+def _reordered(scene: Path, folder: Path, seen_by: Callable[[int, int], Node]) -> ElementalSet:
+    """Return the scene with each node's picture replaced by that of another."""
+    folder.mkdir()
+    settings = tomllib.loads((scene / "elemental.toml").read_text())
+    for view in settings["view"]:
+        row, column = seen_by(*view["node"])
+        view["image"] = str(scene / f"view_r{row}_c{column}.tiff")
+        (folder / Path(view["image"]).name).write_bytes(Path(view["image"]).read_bytes())
+        view["image"] = Path(view["image"]).name
+    (folder / "elemental.toml").write_text(tomli_w.dumps(settings))
+    return load_set(folder)
+
+
+def test_depths_of_a_scene_in_order_are_found(scene: Path, tmp_path: Path) -> None:
+    found = best_focus(load_set(scene), tmp_path)
+    assert (found.p_value, found.shuffles) == (0.01, 99)
+    assert found.z_shuffled is not None
+    disparities_px = -1000 / np.array(found.depth_mm)  # 100 px of focal length, nodes 10 mm apart
+    for layer in CARDS:
+        assert np.abs(disparities_px - layer.disparity_px).min() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("seen_by", "remedy"),
+    [
+        (lambda r, c: (r, NODES - 1 - c), "reversed columns (--flip-columns)"),
+        (lambda r, c: (NODES - 1 - r, c), "reversed rows (--flip-rows)"),
+        (lambda r, c: (c, r), "rows and columns exchanged (--transpose)"),
+        (lambda r, c: (NODES - 1 - c, r), "rows and columns exchanged, and rows reversed (--transpose --flip-rows)"),
+    ],
+)
+def test_another_order_of_the_pictures_is_refused_with_its_option(
+    seen_by: Callable[[int, int], Node], remedy: str, scene: Path, tmp_path: Path
+) -> None:
+    loaded = _reordered(scene, tmp_path / "set", seen_by)
+    with pytest.raises(NothingInFocus, match=re.escape(f"the views agree better with {remedy}: by ")):
+        best_focus(loaded, tmp_path)
+
+
+def _noise(node: Node) -> NDArray[np.floating]:
+    return np.random.default_rng([1, *node]).uniform(0, 200, SIZE_PX[::-1])
+
+
+def _one_picture(node: Node) -> NDArray[np.floating]:
+    del node
+    return 200 * light_field(CARDS, (1, 1), SIZE_PX)[0, 0]
+
+
+def _other_scene(node: Node) -> NDArray[np.floating]:
+    return 200 * light_field(CARDS, (1, 1), SIZE_PX, seed=2010 + NODES * node[0] + node[1])[0, 0]
+
+
+@pytest.mark.parametrize("picture", [_noise, _one_picture, _other_scene])
+def test_views_that_show_no_depth_are_refused(
+    picture: Callable[[Node], NDArray[np.floating]], tmp_path: Path, faintfield: Command
+) -> None:
+    ended = faintfield("reconstruct", _grid(tmp_path / "set", picture), "--depth-mm", "auto", "--out", tmp_path / "out")
+    assert ended.returncode == 1
+    assert re.search(r"NothingInFocus: .* no better than shuffled ones \(p = [0-9.]+ of 99 shuffles", ended.stderr)
+    assert not (tmp_path / "out" / "reconstruction.json").exists()
+
+
+def test_of_sets_of_noise_no_more_are_accepted_than_is_stated(scene: Path, tmp_path: Path) -> None:
+    loaded = load_set(scene)
+    range_mm = searched_range_mm(loaded)
+    views = binned_views(loaded, range_mm[0], tmp_path, min_bins_px=16)
+    (layout, images), accepted = views.colours[0], 0
+    for seed in range(100):
+        electrons = np.random.default_rng([seed, 3]).poisson(200, images.electrons.shape).astype(np.float32)
+        noise = BinnedViews(loaded, [(layout, replace(images, electrons=electrons))], views.bins_px)
+        try:
+            found = check_places(noise, range_mm)
+        except NothingInFocus:
+            continue
+        accepted += found is not None and found.p_value <= MAX_P_VALUE
+    assert accepted <= 4  # one is expected; more than four in 3 of 1000 such tests
+
+
+def _imported(views: dict[Node, NDArray[np.float32]], folder: Path, *options: object) -> ElementalSet:
+    folder.mkdir()
+    for (row, column), view in views.items():
+        cv2.imwrite(str(folder / f"view_r{row}_c{column}.png"), np.clip(view * 40_000, 0, 65535).astype(np.uint16))
+    out = folder.with_name(f"{folder.name}_set")
+    assert run([str(word) for word in ("import", "grid", folder, out, *options)]) == 0
+    return load_set(out)
+
+
+def test_the_depth_of_the_plane_that_views_are_aligned_on_does_not_matter(tmp_path: Path) -> None:
+    views = with_noise(light_field(CARDS, (NODES, NODES), SIZE_PX, aligned_px=2.2), 20)
+    found = []
+    for name, options in (("own", ()), ("six", ("--disparity-px", 6)), ("twelve", ("--disparity-px", 12))):
+        loaded = _imported(views, tmp_path / name, *options)
+        at_zero, slope = loaded.inverse_depth_of_disparity()
+        depths = np.array(best_focus(loaded, tmp_path).depth_mm)
+        found.append(np.sort((1 / depths - at_zero) / slope))
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=0.1)
+
+
+def test_the_page_says_what_p_is_about(scene: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", scene, "--depth", "auto", "--out", tmp_path, "--method", "backprojection")
+    page = " ".join((tmp_path / "report.html").read_text().split())
+    assert "views shuffled 99 times: none agreed as well (p = 0.01)" in page
+    assert "This is about the set, not about each plane." in page

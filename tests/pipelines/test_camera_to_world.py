@@ -1,0 +1,334 @@
+"""Poses by transforms.json and by tables: axes checked by hand on one point, round trips, and what is refused."""
+
+import contextlib
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.errors import InputError
+from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world, turn_and_centre
+from faintfield.pipelines.formats.exchange.nerfstudio import read_transforms
+from faintfield.pipelines.formats.exchange.pose_table import PoseTable
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+
+type Command = Callable[..., CompletedProcess[str]]
+
+IMAGE = np.arange(192, dtype=np.uint16).reshape(12, 16)
+POINT = np.array([0.4, -0.7, 5.0])
+
+
+def images(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        tifffile.imwrite(folder / name, IMAGE)
+    return folder
+
+
+def refused(ended: CompletedProcess[str], failure: str, *words: str) -> None:
+    assert ended.returncode == 1, ended.stderr
+    assert f"faintfield: {failure}: " in ended.stderr
+    assert all(word in ended.stderr for word in words), ended.stderr
+
+
+def turned_camera() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Right, down and forward of a camera in the world, as columns, and where it is: nothing symmetric about it."""
+    forward = np.array([0.2, -0.3, 1.0])
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.1, 1.0, 0.05], forward)
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(forward, right), forward]), np.array([0.5, -0.25, -1.5])
+
+
+def seen_by_hand(axes: NDArray[np.float64], centre: NDArray[np.float64], fx: float, fy: float) -> tuple[float, float]:
+    """Return how many px right of and below its principal point a camera sees the point, from its axes alone."""
+    ray = POINT - centre
+    right, down, forward = (float(ray @ axis) for axis in axes.T)
+    return fx * right / forward, fy * down / forward
+
+
+def seen_by_set(
+    folder: Path, name: str, to_reference: Callable[[NDArray[np.float64]], NDArray[np.float64]]
+) -> list[float]:
+    """Return where the lens and pose of a view put the point, in px from the first pixel's centre."""
+    loaded = load_set(folder)
+    index = [view.image for view in loaded.settings.view].index(name)
+    rt = loaded.poses_rt_cam_ref[index]
+    in_camera = Rotation.from_rotvec(rt[:3]).apply(to_reference(POINT)) + rt[3:]
+    return list(map(float, loaded.lens.project(in_camera[np.newaxis])[0]))
+
+
+def transforms(**changes: Any) -> dict[str, Any]:
+    """One camera at the origin that looks along z with y down, and one that is turned, in axes of OpenGL."""
+    axes, centre = turned_camera()
+    right, down, forward = axes.T
+    matrix = np.eye(4)
+    matrix[:3] = np.column_stack([right, -down, -forward, centre])
+    straight = np.diag([1.0, -1.0, -1.0, 1.0])
+    frames = [
+        {"file_path": "images/a.tiff", "transform_matrix": straight.tolist()},
+        {"file_path": "./images/b", "transform_matrix": matrix.tolist(), "sharpness": 3.5},
+    ]
+    lens = {"w": 16, "h": 12, "fl_x": 20.0, "fl_y": 22.0, "cx": 9.0, "cy": 5.5}
+    return lens | {"camera_model": "OPENCV", "aabb_scale": 16, "frames": frames} | changes
+
+
+def write_transforms(folder: Path, content: object) -> Path:
+    path = images(folder, "images/a.tiff", "images/b.tiff") / "transforms.json"
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_cameras_of_a_transforms_json_see_a_point_where_their_axes_say(tmp_path: Path, done: Command) -> None:
+    path = write_transforms(tmp_path / "src", transforms())
+    done("import", "nerfstudio", path, tmp_path / "set", "--mm-per-unit", 100, "--reference", "a.tiff")
+    across, below = seen_by_hand(*turned_camera(), 20.0, 22.0)
+    assert (across, below) != pytest.approx((below, across), abs=1)
+    # Centres of pixels are whole numbers here, and halves there
+    expected = [8.5 + across, 5.0 + below]
+    assert seen_by_set(tmp_path / "set", "b.tiff", lambda point: 100 * point) == pytest.approx(expected, abs=1e-9)
+    expected = [8.5 + 20 * 0.4 / 5, 5.0 + 22 * -0.7 / 5]
+    assert seen_by_set(tmp_path / "set", "a.tiff", lambda point: 100 * point) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(("words", "unit"), [((), "relative"), (("--mm-per-unit", 100), "mm")])
+def test_depths_are_relative_unless_the_unit_is_given(
+    words: tuple[object, ...], unit: str, tmp_path: Path, done: Command
+) -> None:
+    path = write_transforms(tmp_path / "src", transforms())
+    done("import", "nerfstudio", path.parent, tmp_path / "set", *words)
+    assert load_set(tmp_path / "set").settings.units.depth == unit
+
+
+def test_a_file_without_lens_takes_the_angle_and_the_picture(tmp_path: Path) -> None:
+    content = transforms(camera_angle_x=0.8)
+    for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_model"):
+        del content[key]
+    lens = read_transforms(write_transforms(tmp_path, content)).images[1].lens
+    assert lens.size_px == (16, 12)
+    assert (lens.cx_px, lens.cy_px) == (7.5, 5.5)
+    # The left edge of the picture is half the angle off the axis, half a pixel beyond the first pixel's centre
+    assert math.atan((lens.cx_px + 0.5) / lens.fx_px) == pytest.approx(0.4)
+    assert lens.fy_px == lens.fx_px
+
+
+def test_a_frame_s_own_lens_comes_before_the_file_s(tmp_path: Path) -> None:
+    content = transforms(k1=-0.1, k2=0.02, p1=0.003, p2=-0.004, k3=0.005)
+    content["frames"][1] |= {"cx": 7.25, "k1": -0.2}
+    first, second = (image.lens for image in read_transforms(write_transforms(tmp_path, content)).images)
+    assert (first.cx_px, second.cx_px, first.cy_px, second.cy_px) == (8.5, 6.75, 5.0, 5.0)
+    assert first.distortion == (-0.1, 0.02, 0.003, -0.004, 0.005)
+    assert second.distortion == (-0.2, 0.02, 0.003, -0.004, 0.005)
+
+
+@pytest.mark.parametrize("disparity_px", [0.0, 2.5])
+def test_what_goes_out_comes_back(disparity_px: float, tmp_path: Path, done: Command) -> None:
+    path = write_transforms(tmp_path / "src", transforms(k1=-0.05, p2=0.001))
+    frames = json.loads(path.read_text())["frames"]
+    frames[1]["cx"] = 9.0 + disparity_px
+    path.write_text(json.dumps(transforms(k1=-0.05, p2=0.001, frames=frames)))
+    done("import", "nerfstudio", path, tmp_path / "set", "--mm-per-unit", 10)
+    done("export", "nerfstudio", tmp_path / "set", tmp_path / "out")
+    words = ("--images", tmp_path / "set", "--mm-per-unit", 1)
+    done("import", "nerfstudio", tmp_path / "out", tmp_path / "back", *words)
+    given_set, back = load_set(tmp_path / "set"), load_set(tmp_path / "back")
+    np.testing.assert_allclose(back.poses_rt_cam_ref, given_set.poses_rt_cam_ref, atol=1e-9)
+    np.testing.assert_allclose(back.principal_points_px(), given_set.principal_points_px(), atol=1e-12)
+    assert back.lens.fy_px == given_set.lens.fy_px
+    assert back.lens.distortion[:4] == (-0.05, 0.0, 0.0, 0.001)
+    written = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert ("fl_x" in written) == (disparity_px == 0.0)
+    assert all(frame["transform_matrix"][3] == [0, 0, 0, 1] for frame in written["frames"])
+
+
+def test_a_lens_beyond_nerfstudio_is_refused(tmp_path: Path, done: Command, faintfield: Command) -> None:
+    path = write_transforms(tmp_path / "src", transforms())
+    done("import", "nerfstudio", path, tmp_path / "set")
+    settings_file = tmp_path / "set" / "elemental.toml"
+    settings_file.write_text(
+        settings_file.read_text().replace("cy_px = 5.0", "cy_px = 5.0\ndistortion = [0,0,0,0,0,0.1]")
+    )
+    ended = faintfield("export", "nerfstudio", tmp_path / "set", tmp_path / "out")
+    refused(ended, "BadValue", "calibrate with --lens opencv5, or export COLMAP")
+    assert not (tmp_path / "out").exists()
+
+
+def changed_frame(**changes: Any) -> dict[str, Any]:
+    content = transforms()
+    content["frames"][1] |= changes
+    return content
+
+
+@pytest.mark.parametrize(
+    ("content", "failure", "words"),
+    [
+        (transforms(frames=[]), "BadValue", "names no image; export a model of the images"),
+        (transforms(camera_model="OPENCV_FISHEYE"), "BadValue", "no counterpart here (OPENCV_FISHEYE); undistort"),
+        (transforms(is_fisheye=True), "BadValue", "no counterpart here (is_fisheye)"),
+        (transforms(k4=0.1), "BadValue", "no counterpart here (k4)"),
+        (transforms(fl_x=None), "BadValue", "states neither fl_x nor camera_angle_x; export it again"),
+        (transforms(fl_x=None, camera_angle_x=4.0), "BadValue", "camera_angle_x = 4 rad is not between 0 and π"),
+        (transforms(fl_x=-3), "BadValue", "focal lengths must be"),
+        (transforms(w=16.5), "BadValue", "w = 16.5 is no whole number of pixels"),
+        (transforms(w=1e300), "BadValue", "frames[0] (images/a.tiff)"),
+        (transforms(w=17), "WrongSize", "is 16 x 12 px, its lens 17 x 12 px"),
+        (
+            changed_frame(transform_matrix=np.eye(4)[:2].tolist()),
+            "BadValue",
+            "is not a transforms.json that can be read",
+        ),
+        (changed_frame(transform_matrix=np.diag([1, 1, 2, 1]).tolist()), "BadValue", "frames[1] (./images/b): its rot"),
+        (changed_frame(transform_matrix=np.diag([-1, 1, 1, 1]).tolist()), "BadValue", "its rotation mirrors the world"),
+        (changed_frame(file_path="images/c.tiff"), "MissingFile", "images/c.tiff: has a pose but is missing"),
+        (changed_frame(file_path="../../etc/passwd"), "BadValue", "leaves the folder"),
+        (changed_frame(file_path="/etc/passwd"), "BadValue", "leaves the folder"),
+        (changed_frame(file_path="a\0b"), "BadValue", "leaves the folder"),
+        (changed_frame(file_path=""), "BadValue", "leaves the folder"),
+        ({"frames": 3}, "BadValue", "is not a transforms.json that can be read"),
+    ],
+)
+def test_a_transforms_json_that_cannot_be_is_refused(
+    content: object, failure: str, words: str, tmp_path: Path, faintfield: Command
+) -> None:
+    path = write_transforms(tmp_path / "src", content)
+    refused(faintfield("import", "nerfstudio", path, tmp_path / "set"), failure, words)
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize("number", ["NaN", "1e999", "-1e400", '"x"'])
+def test_numbers_that_are_none_are_refused(number: str, tmp_path: Path, faintfield: Command) -> None:
+    path = write_transforms(tmp_path / "src", transforms())
+    path.write_text(path.read_text().replace("-1.5", number))
+    refused(faintfield("import", "nerfstudio", path, tmp_path / "set"), "BadValue", "export it again")
+
+
+def test_a_link_that_leads_out_is_refused(tmp_path: Path, faintfield: Command) -> None:
+    path = write_transforms(tmp_path / "src", changed_frame(file_path="images/link"))
+    (path.parent / "images" / "link.tiff").symlink_to(images(tmp_path / "else", "x.tiff") / "x.tiff")
+    refused(faintfield("import", "nerfstudio", path, tmp_path / "set"), "BadValue", "leaves the folder")
+
+
+angles = st.floats(-1.5, 1.5)
+
+
+@given(st.tuples(angles, angles, angles), st.tuples(*[st.floats(-1e6, 1e6)] * 3))
+def test_turn_and_centre_undo_a_pose(angle: tuple[float, ...], centre: tuple[float, ...]) -> None:
+    turn = Rotation.from_rotvec(angle).as_matrix()
+    found, place = turn_and_centre(rt_cam_world(turn, centre))
+    np.testing.assert_allclose(found, turn, atol=1e-12)
+    np.testing.assert_allclose(place, centre, atol=1e-9 * 1e6)
+
+
+class TestPoseTables:
+    """CSV: the header decides."""
+
+    def table(self, folder: Path, text: str) -> Path:
+        path = images(folder, "a.tiff", "b.tiff") / "poses.csv"
+        path.write_text(text)
+        return path
+
+    @pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+    def test_a_turned_camera_sees_a_point_where_its_axes_say(
+        self, delimiter: str, tmp_path: Path, done: Command
+    ) -> None:
+        axes, (x, y, z) = turned_camera()
+        qx, qy, qz, qw = Rotation.from_matrix(axes).as_quat()
+        rows: list[list[Any]] = [
+            ["qw", "z", "Name", "x", "y", "qz", "qy", "qx"],
+            [1, 0, "a.tiff", 0, 0, 0, 0, 0],
+            [qw, z, "b", x, y, qz, qy, qx],
+        ]
+        path = self.table(tmp_path, "\n".join(delimiter.join(map(str, row)) for row in rows) + "\n")
+        lens = ("--fx-px", 20, "--fy-px", 22, "--cx-px", 8.5, "--cy-px", 5, "--reference", "a.tiff")
+        done("import", "poses", path, tmp_path / "set", *lens)
+        across, below = seen_by_hand(axes, np.array([x, y, z]), 20.0, 22.0)
+        assert seen_by_set(tmp_path / "set", "b.tiff", lambda it: it) == pytest.approx(
+            [8.5 + across, 5 + below], abs=1e-9
+        )
+        assert load_set(tmp_path / "set").settings.units.depth == "relative"
+
+    @pytest.mark.parametrize(
+        ("header", "words", "unit", "distance"),
+        [
+            ("name,x_mm,y_mm,z_mm", (), "mm", 3.0),
+            ("file, X_m, Y_m, Z_m", (), "mm", 3000.0),
+            ("image,x,y,z", ("--mm-per-unit", 10), "mm", 30.0),
+            ("name,x,y,z", (), "relative", 3.0),
+        ],
+    )
+    def test_the_header_says_the_unit(
+        self, header: str, words: tuple[object, ...], unit: str, distance: float, tmp_path: Path, done: Command
+    ) -> None:
+        path = self.table(tmp_path, f"\ufeff# by hand\n{header}\na.tiff,0,0,0\nb.tiff,3,0,0\n")
+        options = ("--fx-px", 20, "--distortion", -0.1, "--distortion", 0.01, "--reference", "a.tiff")
+        done("import", "poses", path, tmp_path / "set", *options, *words)
+        loaded = load_set(tmp_path / "set")
+        assert loaded.settings.units.depth == unit
+        # A camera further right sees the reference frame shifted left
+        expected = np.array([[0.0] * 6, [0.0, 0.0, 0.0, -distance, 0.0, 0.0]])
+        np.testing.assert_allclose(loaded.poses_rt_cam_ref, expected, atol=1e-12)
+        assert (loaded.lens.cx_px, loaded.lens.cy_px, loaded.lens.distortion) == (7.5, 5.5, (-0.1, 0.01))
+
+    @pytest.mark.parametrize(
+        ("text", "failure", "words"),
+        [
+            ("", "BadValue", "has 0 lines; a line that names the columns and 1 to 100000 rows are needed"),
+            ("name,x,y\na.tiff,0,0\n", "BadValue", "its columns are name, x, y; needed are name, x, y, z (or x_mm"),
+            ("name,x,y,z,qw\na.tiff,0,0,0,1\n", "BadValue", "all or none of qw, qx, qy, qz: correct the first line"),
+            ("name,x,y,z\na.tiff,0,0\n", "BadValue", "row 1: has 3 columns, the first line 4; correct it"),
+            ("name,x,y,z\na.tiff,0,nan,0\n", "BadValue", "row 1: y = 'nan' is no finite number"),
+            ("name,x,y,z\na.tiff,0,1e999,0\n", "BadValue", "row 1: y = '1e999' is no finite number"),
+            ("name,x,y,z\na.tiff,0,1e99,0\n", "BadValue", "is not finite, or beyond 10 rad or 1e+09 mm"),
+            ("name,x,y,z\na.tiff,0,0,0\na,1,0,0\n", "BadValue", "row 2: a.tiff has a pose already"),
+            ("name,x,y,z\na.tiff,0,0,0\n../x.tiff,1,0,0\n", "BadValue", "row 2: name = '../x.tiff' leaves the folder"),
+            ("name,x,y,z\n/etc/passwd,0,0,0\n", "BadValue", "leaves the folder"),
+            ("name,x,y,z\na.tiff,0,0,0\nc.tiff,1,0,0\n", "MissingFile", "c.tiff: has a pose but is missing"),
+            (
+                "name,x,y,z,qx,qy,qz,qw\na.tiff,0,0,0,0,0,0,0\n",
+                "BadValue",
+                "have the length 0, that of a rotation is 1",
+            ),
+            ('name,x,y,z\na".tiff,0,0,"\n', "BadValue", "is no table that can be read"),
+            ("name,x,y,z\n" + "a" * 200_000 + ",0,0,0\n", "BadValue", "is no table that can be read"),
+        ],
+    )
+    def test_a_table_that_cannot_be_is_refused(
+        self, text: str, failure: str, words: str, tmp_path: Path, faintfield: Command
+    ) -> None:
+        path = self.table(tmp_path, text)
+        refused(faintfield("import", "poses", path, tmp_path / "set", "--fx-px", 20), failure, words)
+        assert not (tmp_path / "set").exists()
+
+    def test_images_may_lie_elsewhere(self, tmp_path: Path, done: Command) -> None:
+        path = self.table(tmp_path / "src", "name,x,y,z\nviews/c,0,0,0\n")
+        folder = images(tmp_path / "else", "views/c.tiff")
+        done("import", "poses", path, tmp_path / "set", "--fx-px", 20, "--images", folder)
+        assert [view.image for view in load_set(tmp_path / "set").settings.view] == ["c.tiff"]
+
+    def test_two_units_are_wrong_usage(self, tmp_path: Path, faintfield: Command) -> None:
+        path = self.table(tmp_path, "name,x_mm,y_mm,z_mm\na.tiff,0,0,0\n")
+        ended = faintfield("import", "poses", path, tmp_path / "set", "--fx-px", 20, "--mm-per-unit", 10)
+        assert ended.returncode == 2
+        assert "its header states the unit of positions; leave --mm-per-unit out" in ended.stderr
+
+    @settings(max_examples=60)
+    @given(st.text(alphabet='name,xyz;\t\n"#0123456789.-eqw_m', max_size=80))
+    def test_any_text_is_a_table_or_a_named_failure(self, tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+        path = tmp_path_factory.mktemp("table") / "poses.csv"
+        path.write_text("name,x,y,z\n" + text)
+        lens = Lens((16, 12), 20.0, 20.0, 7.5, 5.5)
+        with contextlib.suppress(InputError):
+            model = PoseTable(path).posed(lens, path.parent)
+            assert 1 <= len(model.images) <= len(text)
+            assert all(np.isfinite(image.rt_cam_world).all() for image in model.images)

@@ -1,0 +1,193 @@
+"""What names of pictures say: archives, patterns, running numbers; and what is not said is asked for."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.exchange.grid_names import by_number, places_by_habit, places_by_pattern
+from faintfield.pipelines.formats.exchange.grid_places import Node, measured_steps, nodes_of
+
+NODES = [(row, column) for row in range(3) for column in range(4)]
+
+
+def read(names: Sequence[str], pattern: str | None = None) -> list[Node]:
+    """Return the nodes that names say."""
+    return nodes_of(places_by_habit(names) if pattern is None else places_by_pattern(pattern, names))[0]
+
+
+@pytest.mark.parametrize(
+    "template",
+    [
+        "out_{r:02}_{c:02}_{y:.3f}_{x:.6f}_.png",
+        "out_{r:02}_{c:02}.png",
+        "view_r{r}_c{c}.jpg",
+        "0123-row{r}-col{c}-v2.png",
+        "c{c:02}_r{r:02}.tif",
+        "x{c}_y{r}.bmp",
+        "scene7_{r}_{c}_left.png",
+        "{r}x{c}.png",
+        "2024_05_01_{r}-{c}.png",
+        "1.5mm_{r}_{c}_0.25s.png",
+        "{n:04}_{r}_{c}.png",
+    ],
+)
+def test_row_and_column_are_found_wherever_they_stand(template: str) -> None:
+    names = [template.format(n=5 * c - r + 90, r=r, c=c, y=10.5 - 60 * r, x=-20.25 + 61 * c) for r, c in NODES]
+    assert read(names) == NODES
+
+
+def test_positions_of_stanford_are_read_as_y_and_x() -> None:
+    (place, other) = places_by_habit(["out_00_01_-381.909_1124.376_.png", "out_16_02_-777.25_1000.5.png"])
+    assert (place.row, place.column, place.y, place.x) == (0, 1, -381.909, 1124.376)
+    assert (other.row, other.column, other.y, other.x) == (16, 2, -777.25, 1000.5)
+
+
+def test_positions_alone_give_rows_and_columns() -> None:
+    generator = np.random.default_rng(20261122)
+    names = [
+        f"IMG_{7000 + n}_{60 * r + y:.3f}_{-61 * c + x:.3f}.png"
+        for n, ((r, c), (x, y)) in enumerate(zip(NODES, generator.uniform(-8, 8, (12, 2)), strict=True))
+    ]
+    assert read(names) == [(r, 3 - c) for r, c in NODES]
+
+
+@pytest.mark.parametrize(
+    "template", ["{:04}.png", "input_Cam{:03}.png", "img{}.png", "scene2024_{:03}.png", "s1frame{}.png"]
+)
+def test_one_running_number_is_a_square_row_by_row(template: str) -> None:
+    names = [template.format(number) for number in range(5, 14)]
+    nodes, said = nodes_of(places_by_habit(names))
+    assert nodes == [divmod(number, 3) for number in range(9)]
+    assert "9 pictures by one number; they are taken as 3 x 3, row by row" in said
+
+
+@given(
+    first=st.integers(0, 10**6),
+    side=st.integers(2, 12),
+    width=st.integers(1, 8),
+    text=st.sampled_from(["", "IMG_", "a-"]),
+)
+def test_a_running_number_is_never_split_into_digits(first: int, side: int, width: int, text: str) -> None:
+    names = [f"{text}{first + number:0{width}}.png" for number in range(side**2)]
+    assert read(names) == [divmod(number, side) for number in range(side**2)]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ([f"{n:04}.png" for n in range(1, 25)], "from 1 to 24, which is no square grid"),
+        ([f"{n:04}.png" for n in range(1, 26) if n != 13], "from 1 to 25 without 13, which"),
+        ([f"{n:04}.png" for n in (*range(1, 25), 90)], "from 1 to 90, which"),
+        (["0101.png", "0102.png", "0201.png", "0202.png"], "by one number, from 101 to 202"),
+        ([f"cam_0_{n}.png" for n in range(9)], "fits a grid of 1 x 9 as well as one of 3 x 3"),
+        ([f"cam_{n}_0.png" for n in range(4)], "fits a grid of 4 x 1 as well as one of 2 x 2"),
+        (["a.png", "b.png"], "a.png: its name has no row and column; give --rows and --columns"),
+        (["a_1_2.png", "b3.png"], "b3.png: its name has no row and column, while others have"),
+        (["a_1_1234567890.png", "a_2_1.png"], "more than 9 digits, which is no column"),
+        ([f"v_{y}.5_{x}.5.png" for y, x in ((10**12, 1), (1, 2))], "is beyond 1e+09; correct the name"),
+    ],
+)
+def test_what_names_do_not_say_is_asked_for(names: list[str], words: str) -> None:
+    with pytest.raises(BadValue, match=re.escape(words)):
+        read(names)
+
+
+def test_one_row_that_can_be_no_square_is_one_row() -> None:
+    assert read([f"cam_0_{n}.png" for n in range(7)]) == [(0, n) for n in range(7)]
+    assert read([f"cam_{n}_3.png" for n in range(7)]) == [(n, 3) for n in range(7)]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names", "nodes"),
+    [
+        ("{name}_{row}_{column}_{y}_{x}.png", ["s_7_3_4_-1.5_2e1.png", "_0_1_0_+7.png"], [(3, 4), (0, 1)]),
+        ("{column}{name}x{row}", ["12abx3.png", "4x05.jpg"], [(3, 12), (5, 4)]),
+        ("v{row:2}{column:2}*.png", ["v0112.png", "v1203_b.png"], [(1, 12), (12, 3)]),
+        ("({row}+{column}).png", ["(1+2).png"], [(1, 2)]),
+        ("{index}_*", ["0_a.png", "1_b.png", "3_d.png", "2_c.png"], [(0, 0), (0, 1), (1, 1), (1, 0)]),
+        ("p{x},{y}.png", ["p0,1.png", "p0,0.png", "p1.2,0.1.png", "p1,1.png"], [(1, 0), (0, 0), (0, 1), (1, 1)]),
+    ],
+)
+def test_a_pattern_says_what_names_say(pattern: str, names: list[str], nodes: list[Node]) -> None:
+    assert read(names, pattern) == nodes
+
+
+def test_positions_of_a_pattern_are_those_of_its_fields() -> None:
+    (place,) = places_by_pattern("{name}_{row}_{column}_{y}_{x}.png", ["s_7_3_4_-1.5_2e1.png"])
+    assert (place.x, place.y) == (20.0, -1.5)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        ("{row}_{column}.tif", "1_2.png does not match it, 0 of 2 pictures do; correct the pattern"),
+        ("1_{row}{column:1}_*", "1_2.png does not match it, 1 of 2 pictures do"),
+        ("{row}_*.png", "says neither {row} and {column}, nor {x} and {y}, nor {index}"),
+        ("{row}_{row}.png", "{row} is no field, or is there twice; use each of {name}, {row}"),
+        ("{row}_{line}.png", "{line} is no field"),
+        ("{row}_{column}_{x:2}.png", "{x:2} is no field"),
+    ],
+)
+def test_a_pattern_that_does_not_fit_is_refused(pattern: str, words: str) -> None:
+    with pytest.raises(BadValue, match=re.escape(words)):
+        read(["1_2.png", "1_34_5.png"], pattern)
+
+
+def answer(names: Sequence[str], pattern: str | None) -> list[Node] | str:
+    """Return the nodes that names say, or what the named failure says."""
+    try:
+        return read(names, pattern)
+    except BadValue as failure:
+        return str(failure)
+
+
+@given(st.lists(st.text(max_size=40), min_size=1, max_size=6), st.text(max_size=12))
+def test_any_names_give_nodes_or_a_named_failure(names: list[str], pattern: str) -> None:
+    for given_pattern in (None, pattern, "{row}*{column}" + pattern):
+        said = answer(names, given_pattern)
+        if isinstance(said, str):
+            assert re.search(r"give|correct|name them|use each|say which|leave", said)
+        else:
+            assert len(said) == len(names)
+
+
+def test_numbers_count_as_people_count() -> None:
+    names = ["b1.png", "a10.png", "a9.png", "a09.png", "a.png", "10.png", "²3.png"]
+    assert sorted(names, key=by_number) == ["10.png", "a09.png", "a9.png", "a10.png", "a.png", "b1.png", "²3.png"]
+
+
+class TestMeasuredSteps:
+    """Positions of any unit and direction become steps right and down."""
+
+    @pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1), (-1, -1)])
+    def test_they_are_the_true_ones_whatever_unit_and_directions(self, signs: tuple[int, int]) -> None:
+        generator = np.random.default_rng(4)
+        true = {(r, c): np.array([c, 1.5 * r]) + generator.uniform(-0.1, 0.1, 2) for r in range(5) for c in range(6)}
+        stated = {node: tuple(np.array([1000.0, -3.0]) + 61.5 * place * signs) for node, place in true.items()}
+        found = measured_steps(stated)
+        # The mean distance of columns is 1 by least squares, which the errors of the true ones change a little
+        scale = np.polyfit([c for _, c in true], [place[0] for place in true.values()], 1)[0]
+        for node, place in true.items():
+            np.testing.assert_allclose(found[node], (place - true[0, 0]) / scale, atol=1e-9)
+
+    def test_across_one_row_nothing_is_known(self) -> None:
+        found = measured_steps({(0, c): (10.0 * c, 0.3 * c % 0.7) for c in range(5)})
+        np.testing.assert_allclose([found[0, c] for c in range(5)], [(c, 0) for c in range(5)], atol=1e-12)
+
+    @pytest.mark.parametrize(
+        "positions",
+        [
+            {(r, c): (float(r), float(c)) for r in range(3) for c in range(3)},  # exchanged
+            {(r, c): (1.0, 1.0) for r in range(3) for c in range(3)},
+            {(r, c): (float(c), 0.0) for r in range(3) for c in range(3)},
+            {(r, c): (float((5 * c + r) % 7), float((3 * r + c) % 5)) for r in range(3) for c in range(3)},
+        ],
+    )
+    def test_positions_that_follow_no_grid_are_refused(self, positions: dict[Node, tuple[float, float]]) -> None:
+        with pytest.raises(BadValue, match=r"exchange \{x\} and \{y\} in --pattern, or put \* in their place"):
+            measured_steps(positions)

@@ -1,0 +1,326 @@
+"""Units: records named and converted by those of their set, and none that nobody gave in anything that is written."""
+
+import html
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from subprocess import CompletedProcess
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.records import PlaneFileRecord, ReconstructionRecord
+from faintfield.pipelines.formats.sets.elemental_file import read_set_file, write_set
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem, rounded_depth
+from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits, Units, json_of, record_of
+from faintfield.pipelines.pages.napari_layers import show_planes
+from tests.pipelines.test_golden import GOLDEN, KINDS
+
+type Command = Callable[..., CompletedProcess[str]]
+
+SMALL = ("--size-px", 96, 72, "--rows", 3, "--columns", 3)
+BRIGHT = ("--snr", 60, "--position-error-mm", 0, "--rotation-error-mrad", 0, "--objects", "surfaces")
+
+# What states a unit, in words, keys and names; options of the command line are not meant.
+UNITS_IN_TEXT = {
+    "mm": re.compile(r"(?<![\w-])mm\b|_mm\b|_mm(?=[_.])|millimet|µm"),
+    "electrons": re.compile(r"e⁻|electron|photon|_e2?\b", re.IGNORECASE),
+    "s": re.compile(r"\d s\b|exposure_s\W+[\d.]+"),
+}
+
+# Times that were measured: of the command itself.
+WALL_TIMES = re.compile(
+    r"in \d+\.\d s\b|wall time, s|: (\d+ of \d+, )?\d+ s(, about \d+ (s|min) to go)?$", re.MULTILINE
+)
+
+# TIFF's tag of the unit of its resolution, and the value for the centimetre.
+RESOLUTION_UNIT, CENTIMETRE = 296, 3
+
+
+# The golden records that are made of a set.
+RECORDS = [
+    pytest.param(path, kind, id=path.stem)
+    for name, kind in KINDS.items()
+    for path in sorted(GOLDEN.glob(f"{name}_*.json"))
+    if path.stem != "metrics_demo"  # also of a calibration
+]
+
+
+@pytest.mark.parametrize("light", ["electrons", "dn", "relative"])
+@pytest.mark.parametrize("depth", ["mm", "relative", "disparity_px"])
+@pytest.mark.parametrize(("path", "kind"), RECORDS)
+def test_every_record_is_read_as_it_was_written_in_any_units(
+    path: Path, kind: type[msgspec.Struct], depth: DepthUnit, light: LightUnit
+) -> None:
+    record: Any = msgspec.json.decode(path.read_bytes(), type=kind)
+    record = msgspec.structs.replace(record, units=StatedUnits(depth, light))
+    if light != "electrons" and hasattr(record, "quantum_efficiency"):
+        bare = msgspec.structs.replace(record.brightness, photons_linear=None, photons_from_moments=None)
+        record = msgspec.structs.replace(record, quantum_efficiency=None, brightness=bare)
+    content = json_of(record)
+    assert record_of(content, kind) == record
+    keys = set(_keys(json.loads(content)))
+    if depth != "mm":
+        assert not [key for key in keys if key.endswith("_mm")]
+    if light != "electrons":
+        assert not [key for key in keys if re.search(r"_e2?$|electrons|photons_from|photons_lin|efficiency", key)]
+
+
+def _keys(value: Any) -> Iterator[str]:
+    if isinstance(value, dict):
+        yield from value
+        value = list(value.values())
+    if isinstance(value, list):
+        for part in value:
+            yield from _keys(part)
+
+
+def test_a_key_that_others_named_is_kept() -> None:
+    record = msgspec.json.decode((GOLDEN / "plane_pmlem.json").read_bytes(), type=PlaneFileRecord)
+    options = msgspec.structs.replace(record.options, plane_pose={"depth": [0.0] * 6, "mean": [1.0] * 6})
+    units = StatedUnits("relative", "relative")
+    odd = msgspec.structs.replace(record, options=options, units=units, inputs={"mean_e": "0" * 64})
+    assert record_of(json_of(odd), PlaneFileRecord) == odd
+    assert json.loads(json_of(odd))["inputs"] == {"mean_e": "0" * 64}
+
+
+def test_a_depth_below_zero_is_read_as_a_disparity_only() -> None:
+    content = (GOLDEN / "plane_pmlem.json").read_bytes().replace(b'"depth_mm": 500.0', b'"depth_mm": -500.0')
+    with pytest.raises(msgspec.ValidationError, match="a depth is below"):
+        record_of(content, PlaneFileRecord)
+    keys = {b"depth_mm": b"disparity_px", b"pitch_mm": b"pitch_px", b"origin_mm": b"origin_px"}
+    keys |= {b'"mm"': b'"disparity_px"'}  # the value of units.depth
+    for old, new in keys.items():
+        content = content.replace(old, new)
+    assert record_of(content, PlaneFileRecord).planes[0].depth_mm == -500.0
+
+
+@pytest.fixture(scope="module")
+def with_scale(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bright set in mm and electrons, of 9 views, at exactly the nodes of a grid."""
+    folder = tmp_path_factory.mktemp("units") / "set"
+    assert run([str(word) for word in ("simulate", folder, *SMALL, *BRIGHT)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def pictures(with_scale: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its views alone: pictures of which nobody knows anything."""
+    folder = tmp_path_factory.mktemp("pictures")
+    for path in with_scale.glob("view_*.tiff"):
+        shutil.copy(path, folder)
+    return folder
+
+
+def without_scale(folder: Path, depth: DepthUnit, light: LightUnit) -> Path:
+    """Make a set one whose depth and light are in these units, and whose exposure is not known."""
+    settings = read_set_file(folder / "elemental.toml")
+    noise = settings.noise
+    assert not isinstance(noise, str)
+    noise = msgspec.structs.replace(noise, dark_current_e_per_s=0.0, quantum_efficiency=None)
+    changed = msgspec.structs.replace(settings, units=Units(depth, light), exposure_s=None, noise=noise)
+    write_set(folder, changed)
+    return folder
+
+
+@pytest.fixture
+def imported(pictures: Path, tmp_path: Path, done: Command) -> tuple[Path, str]:
+    """A set of the pictures by disparity, 1 = white, and what its import said."""
+    ended = done("import", "grid", pictures, tmp_path / "set", "--offset-dn", 100, "--read-noise-e", 3)
+    return without_scale(tmp_path / "set", "disparity_px", "relative"), ended.stdout + ended.stderr
+
+
+def test_planes_are_written_in_the_units_of_their_set(with_scale: Path, tmp_path: Path, done: Command) -> None:
+    """The same set in DN, and relative to white, gives the same planes times the gain, and times that over white."""
+    planes, records = {}, {}
+    for light in ("electrons", "dn", "relative"):
+        folder = Path(shutil.copytree(with_scale, tmp_path / light / "set"))
+        settings = read_set_file(folder / "elemental.toml")
+        write_set(folder, msgspec.structs.replace(settings, units=Units("mm", light)))
+        out = tmp_path / light / "out"
+        quick = ("--penalty-weight", 1, "--passes", 2, "--uncertainty")
+        done("reconstruct", folder, "--out", out, "--depth-mm", 700, *quick)
+        planes[light] = [read_frame(out / f"plane_00700.0{name}.tiff").pixels_dn for name in ("", "_sigma")]
+        records[light] = record_of((out / "reconstruction.json").read_bytes(), ReconstructionRecord)
+    noise = load_set(with_scale).settings.noise
+    assert not isinstance(noise, str)
+    assert noise.saturation_dn is not None
+    white_dn = noise.saturation_dn - (noise.offset_dn or 0)
+    for light, factor in (("dn", noise.gain_dn_per_e), ("relative", noise.gain_dn_per_e / white_dn)):
+        for made, of_electrons in zip(planes[light], planes["electrons"], strict=True):
+            np.testing.assert_allclose(made, factor * of_electrons, rtol=1e-5)
+        for field in ("mean_e", "flux_e"):
+            made, of_electrons = (getattr(records[key].planes[0], field) for key in (light, "electrons"))
+            assert made == pytest.approx(factor * of_electrons, rel=1e-6)
+
+
+def test_lengths_by_disparity_are_in_pixels(imported: tuple[Path, str], tmp_path: Path, done: Command) -> None:
+    folder, _ = imported
+    done("reconstruct", folder, "--out", tmp_path / "out", "--disparity-px=-3.25", "--method", "backprojection")
+    (plane,) = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["planes"]
+    # The reference view has 96 x 72 px, and its principal point in the middle; samples are its pixels
+    assert plane["disparity_px"] == pytest.approx(-3.25, abs=1e-6)
+    assert plane["pitch_px"] == pytest.approx(1.0)
+    assert plane["origin_px"] == pytest.approx([-47.5, -35.5])
+    assert plane["file"] == "plane_px_-003.250.tiff"
+
+
+@pytest.mark.parametrize(
+    ("unit", "depth", "name"),
+    [("mm", 500.0, "plane_00500.0"), ("relative", 4.6315789, "plane_rel_4.63158"), ("relative", 12.0, "plane_rel_12")],
+)
+def test_planes_are_named_by_the_unit_of_their_depth(
+    unit: DepthUnit, depth: float, name: str, with_scale: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(with_scale, tmp_path / "set"))
+    assert plane_stem(load_set(without_scale(folder, unit, "electrons")), depth) == name
+
+
+def test_records_of_a_set_in_mm_and_electrons_stay_as_they_are(with_scale: Path) -> None:
+    loaded = load_set(with_scale)
+    record = record_of((GOLDEN / "reconstruction_sweep.json").read_bytes(), ReconstructionRecord)
+    assert light_per_e(loaded) == 1
+    assert in_units(loaded, record) == record
+
+
+class Findings(dict[str, list[str]]):
+    """Where each unit is stated."""
+
+    def look(self, where: str, text: str) -> None:
+        text = WALL_TIMES.sub("", text)
+        for unit, pattern in UNITS_IN_TEXT.items():
+            for hit in pattern.finditer(text):
+                self.setdefault(unit, []).append(f"{where}: …{text[max(hit.start() - 40, 0) : hit.end() + 20]}…")
+
+
+def search(folder: Path, said: str) -> Findings:
+    """Return where a unit is stated: in names and texts of files, tags of TIFFs, headers, and what was said."""
+    found = Findings()
+    found.look("terminal", said)
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        found.look("name", path.relative_to(folder).as_posix())
+        if path.suffix == ".html":
+            found.look(path.name, _words(path.read_text()))
+        elif path.suffix in (".json", ".toml"):
+            found.look(path.name, path.read_text())
+        elif path.suffix == ".ply":
+            found.look(path.name, path.read_bytes().partition(b"end_header")[0].decode())
+        elif path.suffix == ".tiff":
+            with tifffile.TiffFile(path) as file:
+                for tag in file.pages.first.tags.values():
+                    found.look(f"{path.name}, {tag.name}", f"{tag.value} ")
+                    if tag.code == RESOLUTION_UNIT and tag.value == CENTIMETRE:
+                        found.look(path.name, "a pitch in mm")
+    return found
+
+
+def _words(page: str) -> str:
+    """Return a page without its style, the bytes of its pictures and its marks, but with the words of its drawings."""
+    page = re.sub(r"data:[^\"'\s]*", "", page)
+    page = re.sub(r"(?s)<style>.*?</style>|<svg|<path[^>]*>|<use[^>]*>", "", page)
+    return html.unescape(page)
+
+
+def everything(done: Command, folder: Path, out: Path, planes: tuple[object, ...], sweep: tuple[object, ...]) -> str:
+    """Make all that can be made of a set, into folders of `out`, and return what was said."""
+    quick = ("--penalty-weight", 1, "--passes", 2)
+    calls: list[tuple[object, ...]] = [
+        ("reconstruct", folder, "--out", out / "planes", *planes, *quick, "--uncertainty"),
+        ("reconstruct", folder, "--out", out / "sweep", *sweep, "--method", "backprojection", "--depth-map"),
+        ("reconstruct", folder, "--out", out / "auto", "--depth-mm", "auto", "--method", "backprojection"),
+        ("reconstruct", folder, "--out", out / "surface", "--surface", *quick),
+        ("report", out),
+        ("verify", out, "--inputs", folder),
+        ("export", "zarr", out / "sweep", out / "sweep.ome.zarr", "--overwrite"),
+        ("export", "colmap", folder, out / "colmap", "--overwrite"),
+    ]
+    said = ""
+    for call in calls:
+        for words in (call, ("--json", *call)):
+            ended = done(*words)
+            said += ended.stdout + ended.stderr
+    return said
+
+
+def test_nothing_states_a_unit_that_nobody_gave(imported: tuple[Path, str], tmp_path: Path, done: Command) -> None:
+    folder, said = imported
+    said += everything(done, folder, tmp_path / "out", ("--disparity-px", -8), ("--sweep-px", "-14:-4:6"))
+    assert search(tmp_path / "out", said) == {}
+    assert "disparit" in said
+
+
+def test_nothing_of_relative_poses_states_a_unit_that_nobody_gave(
+    with_scale: Path, tmp_path: Path, done: Command
+) -> None:
+    folder = Path(shutil.copytree(with_scale, tmp_path / "set"))
+    for path in [*folder.glob("*.json"), *folder.glob("noise_free*"), *folder.glob("object_region*")]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    without_scale(folder, "relative", "dn")
+    said = everything(done, folder, tmp_path / "out", ("--depth", 700), ("--sweep", "500:1000:6"))
+    assert search(tmp_path / "out", said) == {}
+    assert "has no scale, so that lengths are relative" in said
+
+
+def test_the_search_finds_the_units_of_a_set_that_has_them(with_scale: Path, tmp_path: Path, done: Command) -> None:
+    said = everything(done, with_scale, tmp_path / "out", ("--depth-mm", 700), ("--sweep-mm", "500:1000:6"))
+    found = search(tmp_path / "out", said)
+    for where in ("terminal", "reconstruction.json", "report.html", "stack.tiff", "plane_00700.0.tiff", "zarr.json"):
+        assert any(place.startswith(where) for place in found["mm"]), where
+    for where in ("surface.ply", "name", "surface.json", "depth_map.json", "overview.json"):
+        assert any(place.startswith(where) for hits in found.values() for place in hits), where
+    for where in ("reconstruction.json", "report.html", "overview.json", "zarr.json"):
+        assert any(place.startswith(where) for place in found["electrons"]), where
+    for where in ("report.html", "overview.json"):
+        assert any(place.startswith(where) for place in found["s"]), where
+
+
+@pytest.mark.parametrize("unit", ["mm", "relative", "disparity_px"])
+def test_rounded_depths_have_a_name_of_their_own(unit: DepthUnit, with_scale: Path, tmp_path: Path) -> None:
+    loaded = load_set(without_scale(Path(shutil.copytree(with_scale, tmp_path / "set")), unit, "electrons"))
+    focal_px, pitch_mm = loaded.settings.camera.fx_px, 50
+    # Half a digit; a disparity of fx p / z changes by that if z does by z² / (fx p)
+    half = {"mm": 0.05, "relative": 5e-4, "disparity_px": 5e-4 * 710**2 / (focal_px * pitch_mm)}[unit]
+    for depth in np.linspace(690, 710, 41).tolist():
+        rounded = rounded_depth(loaded, depth)
+        assert abs(rounded - depth) <= 1.01 * half
+        assert rounded_depth(loaded, rounded) == pytest.approx(rounded, rel=1e-12)
+        name = plane_stem(loaded, rounded)
+        assert name == plane_stem(loaded, rounded * (1 + 1e-9))
+
+
+@pytest.mark.parametrize(
+    ("units", "unit", "label"),
+    [(StatedUnits(), "mm", "depth"), (StatedUnits("disparity_px"), "pixel", "disparity")],
+)
+def test_layers_of_napari_are_in_the_units_of_their_set(
+    units: StatedUnits, unit: str, label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[dict[str, Any]] = []
+
+    class Viewer:
+        def __init__(self, **_: object) -> None:
+            pass
+
+        def add_image(self, data: Any, **named: Any) -> None:
+            made.append(named)
+
+    monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=Viewer, run=lambda: None))
+    record = record_of((GOLDEN / "reconstruction_sweep.json").read_bytes(), ReconstructionRecord)
+    planes = [msgspec.structs.replace(plane, pitch_mm=1.0) for plane in record.planes]
+    record = msgspec.structs.replace(record, units=units, planes=planes)
+    (tmp_path / "reconstruction.json").write_bytes(json_of(record))
+    for plane in planes:
+        tifffile.imwrite(tmp_path / plane.file, np.zeros(plane.shape, np.float32))
+    show_planes(tmp_path)
+    assert made[0]["units"] == (unit,) * 3
+    assert made[0]["axis_labels"] == (label, "y", "x")
