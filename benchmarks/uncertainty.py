@@ -21,7 +21,8 @@ import skimage.data
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
-from faintfield.pipelines.reconstruction.planes import Settings, solve_then_sigma
+from faintfield.pipelines.reconstruction.penalised import solve_then_sigma
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.metrics import signal_scale_for_snr
 from faintfield.recon.operator.grid import PlaneGrid

@@ -10,7 +10,8 @@ def compile_kernels() -> None:
 
     from faintfield.recon.operator.grid import PlaneGrid
     from faintfield.recon.operator.plane_operator import PlaneOperator
-    from faintfield.recon.solver.collaborative import Noise, collaborative_wiener
+    from faintfield.recon.prior.collaborative import collaborative_wiener
+    from faintfield.recon.prior.evidence import Noise
     from faintfield.recon.solver.penalties import Penalty
     from faintfield.recon.solver.proximal import DualField
 

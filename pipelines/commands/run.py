@@ -13,13 +13,13 @@ from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
-from faintfield.pipelines.reconstruction.planes import Settings
 from faintfield.pipelines.reconstruction.request import (
     DEFAULT_METHOD,
     Request,
     distinct_depths,
     folder_of_method,
 )
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.changes import present_settings

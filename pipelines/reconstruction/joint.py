@@ -11,7 +11,9 @@ from faintfield.pipelines.formats.large_arrays import available_bytes
 from faintfield.pipelines.formats.plane_poses import Place, depth_of
 from faintfield.pipelines.formats.results.records import Method, SolveRecord
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
-from faintfield.pipelines.reconstruction.planes import Objective, Settings, Solution, mean_e, solve_pmlem
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
+from faintfield.pipelines.reconstruction.prior import with_prior
+from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.grid import PlaneGrid
@@ -47,10 +49,12 @@ def solve_together(
     operator = factory.of_scene(grids)
     objective = Objective.of(SceneProblem(operator, images), settings)
     joint = solve_pmlem(objective, settings)
-    found: dict[Method, list[Solution]] = {"joint": joint}
+    found: dict[Method, list[Solution]] = {}
+    if "joint" in methods:
+        found["joint"] = with_prior(objective, joint, settings)
     if "occlusion" in methods:
         found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings)
-    return {method: dict(zip(grids, found[method], strict=True)) for method in methods}
+    return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
 
 
 def _check_memory(images: ElementalImages, masks: int) -> None:
@@ -82,14 +86,15 @@ def _with_occlusion(
     try:
         occluded = factory.of_scene(grids, hidden)
     except GeometryMismatch:
-        return _without_occlusion(joint, "a plane would be hidden from all views")
-    better = solve_pmlem(replace(objective, posed=replace(objective.posed, operator=occluded)), settings)
+        return _without_occlusion(with_prior(objective, joint, settings), "a plane would be hidden from all views")
+    behind = replace(objective, posed=replace(objective.posed, operator=occluded))
+    better = solve_pmlem(behind, settings)
     objectives = better[0].record.objective, first.objective
     assert objectives[0] is not None
     assert objectives[1] is not None
     if objectives[0] >= objectives[1]:
-        return _without_occlusion(joint, "it explains the images no better")
-    return [_of_opaque_part(one, first) for one in better]
+        return _without_occlusion(with_prior(objective, joint, settings), "it explains the images no better")
+    return [_of_opaque_part(one, first) for one in with_prior(behind, better, settings)]
 
 
 def _of_opaque_part(one: Solution, first: SolveRecord) -> Solution:

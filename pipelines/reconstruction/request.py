@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
+from msgspec import UNSET
+
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, read_plane_poses
 from faintfield.pipelines.formats.results.plane_files import plane_name
@@ -20,7 +22,7 @@ from faintfield.pipelines.formats.sets.stated import plane_stem
 from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, sweep_of_range
 from faintfield.pipelines.reconstruction.given_sweeps import swept, swept_depths
 from faintfield.pipelines.reconstruction.operators import check_in_front
-from faintfield.pipelines.reconstruction.planes import Settings
+from faintfield.pipelines.reconstruction.solutions import Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 
@@ -98,6 +100,8 @@ class Request:
             penalty=self.settings.penalty,
             likelihood=self.settings.likelihood,
             uncertainty=self.settings.uncertainty,
+            prior=UNSET if self.settings.prior == "tv" else self.settings.prior,
+            proposal=self.settings.proposal or UNSET,
             passes=self.settings.passes,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
@@ -194,6 +198,7 @@ def select_planes(
         pitch_mm=pitch_mm,
     )
     _check_methods(selection, methods, settings)
+    _check_prior(methods, settings)
     return selection
 
 
@@ -201,6 +206,21 @@ def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> li
     """Return the methods given by name or by an option of their own, the default if there are none."""
     by_option: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
     return [*given, *(name for name, wanted in by_option.items() if wanted)] or [DEFAULT_METHOD]
+
+
+def _check_prior(methods: list[Method], settings: Settings) -> None:
+    """Refuse a prior beside options that it does not know (WrongUsage)."""
+    if settings.prior == "tv":
+        if settings.proposal:
+            raise WrongUsage("--proposal saves what a prior proposes, and tv proposes nothing; give --prior patches")
+        return
+    option = f"--prior {settings.prior}"
+    if not {"pmlem", *JOINT_METHODS} & set(methods):
+        raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
+    if settings.penalty != "tv":
+        raise WrongUsage(f"{option} starts from total variation, not from --penalty {settings.penalty}; leave one out")
+    if settings.uncertainty:
+        raise WrongUsage(f"--uncertainty is known for total variation only, not for {option}; leave one out")
 
 
 def _check_methods(selection: Selection, methods: list[Method], settings: Settings) -> None:

@@ -33,7 +33,8 @@ from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_error
 from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
-from faintfield.pipelines.reconstruction.planes import Settings, mean_e, solve_then_sigma
+from faintfield.pipelines.reconstruction.penalised import solve_then_sigma
+from faintfield.pipelines.reconstruction.solutions import Settings, mean_e
 from faintfield.pipelines.reconstruction.surface_depths import (
     check_views,
     depths_of_set,
@@ -45,7 +46,7 @@ from faintfield.pipelines.reconstruction.surface_depths import (
 from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.operator.surface_operator import SurfaceOperator
-from faintfield.recon.solver.collaborative import refined
+from faintfield.recon.prior.patches import refined
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.held_out import Prediction

@@ -8,7 +8,7 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.planes import Settings
+from faintfield.pipelines.reconstruction.solutions import Settings
 
 # Folder of the surface among the results of a session.
 SURFACE_FOLDER = "surface"

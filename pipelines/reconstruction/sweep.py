@@ -27,7 +27,8 @@ from faintfield.pipelines.formats.sets.stated import in_units, light_per_e
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
 from faintfield.pipelines.reconstruction.joint import solve_together
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
-from faintfield.pipelines.reconstruction.planes import Settings, Solution, solve
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.solutions import Settings, Solution
 from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
@@ -121,7 +122,7 @@ class Channel:
         arrays = {"plane": solution.plane, **solution.sidecars}
         light = light_per_e(self._loaded)
         if light != 1:
-            arrays |= {name: light * arrays[name] for name in ("plane", "sigma") if name in arrays}
+            arrays |= {name: light * arrays[name] for name in ("plane", "sigma", "proposal") if name in arrays}
         focus = in_units(self._loaded, focus) if focus else None
         files.save_part(task.layout.name, arrays, in_units(self._loaded, record), focus)
 

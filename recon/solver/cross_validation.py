@@ -103,14 +103,19 @@ def cross_validated_weight(problem: SceneProblem, guess: float, penalty: Penalty
 
 
 def _needed_folds(problem: SceneProblem, penalty: Penalty) -> list["_Fold"]:
-    """Return as many folds as it takes to predict `MIN_SCORED_PIXELS`."""
+    """Return the folds that are scored."""
     views = problem.operator.seeing_views
     count = len(views)
     if count < MIN_VIEWS:
         raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {count}")
+    return [_Fold(problem, penalty, views[validation_views(count, n)]) for n in range(folds_to_predict(problem))]
+
+
+def folds_to_predict(problem: SceneProblem) -> int:
+    """Return how many folds it takes to predict `MIN_SCORED_PIXELS`, or the number of all."""
+    count = len(problem.operator.seeing_views)
     pixels_per_fold = problem.images.electrons[0].size * count / _folds(count)
-    needed = min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
-    return [_Fold(problem, penalty, views[validation_views(count, fold)]) for fold in range(needed)]
+    return min(int(np.ceil(MIN_SCORED_PIXELS / pixels_per_fold)), _folds(count))
 
 
 class _Fold:

@@ -1,7 +1,10 @@
-"""The proximal operator of the penalty, `min ½ Σ w (x − v)² + β Σ φ(|∇x|)` over x ≥ 0, by its dual, to a proven gap."""
+"""The proximal operator of the penalty, solved by its dual to a proven gap.
+
+That is `min ½ Σ w (x − v)² + β Σ φ(|∇(x − x̂)|)` over x ≥ 0, with a proposal x̂ that is zero unless given.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numba
@@ -53,11 +56,14 @@ class DualField:
     ----------
     vectors : list of float array (2, row, column)
         p of each plane, down and right.
+    proposal : float array (samples), optional
+        x̂, whose difference to the planes is penalised; zero by default.
     workers : int
         Number of threads.
     """
 
     vectors: list[Image]
+    proposal: Image | None = None
     workers: int = field(default_factory=lambda: int(numba.config.NUMBA_NUM_THREADS))
 
     @classmethod
@@ -67,7 +73,7 @@ class DualField:
 
     def copy(self) -> "DualField":
         """Return a copy that can be changed without changing this field."""
-        return DualField([vectors.copy() for vectors in self.vectors], self.workers)
+        return replace(self, vectors=[vectors.copy() for vectors in self.vectors])
 
     def primal(self, point: Image, reach: Image) -> Image:
         """Return `v − β/w ∇ᵀp` (samples), not clipped at zero, for a point v and a reach β/w."""
@@ -77,10 +83,11 @@ class DualField:
         return plane
 
     def penalty_and_slack(self, plane: Image, penalty: Penalty) -> tuple[float, float]:
-        """Return `Σ φ(|∇x|)`, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x."""
+        """Return `Σ φ(|∇x|)`, and `Σ φ(|∇x|) + φ*(p) − p·∇x ≥ 0`, which is zero where p belongs to x; x is x − x̂."""
+        change = plane if self.proposal is None else plane - self.proposal
         sums = [
             _penalty_and_slack(vectors, part, penalty, self.workers)
-            for vectors, (part,) in zip(self.vectors, self._planes(plane), strict=True)
+            for vectors, (part,) in zip(self.vectors, self._planes(change), strict=True)
         ]
         return sum(part[0] for part in sums), sum(part[1] for part in sums)
 
@@ -112,8 +119,12 @@ class DualField:
         several = len(self.vectors) > 1
         plane = np.maximum(self.primal(point, reach), 0) if several else np.empty(point.shape, point.dtype)
         gap, steps = 0.0, 0
+        # The kernel takes an array without samples for a proposal of zeros
+        proposals = [np.empty((0, 0), point.dtype)] * len(self.vectors)
+        if self.proposal is not None:
+            proposals = [part for (part,) in self._planes(self.proposal)]
         for index, (v, r, x) in enumerate(self._planes(point, reach, plane)):
-            ascent = _DualAscent(self.vectors[index], v, r, penalty, self.workers)
+            ascent = _DualAscent(self.vectors[index], v, r, proposals[index], penalty, self.workers)
             while True:
                 ascent.advance()
                 gap_of_plane = weight * ascent.set_solution(x)
@@ -139,20 +150,22 @@ class _DualAscent:
     The acceleration is dropped when it leads uphill (O'Donoghue and Candès 2015).
     """
 
-    def __init__(self, vectors: Image, point: Image, reach: Image, penalty: Penalty, workers: int) -> None:
+    def __init__(
+        self, vectors: Image, point: Image, reach: Image, proposal: Image, penalty: Penalty, workers: int
+    ) -> None:
         self.vectors, self.steps = vectors, 0
         self._ahead, self._momentum = vectors.copy(), 1.0
         self._spare = np.empty_like(vectors), np.empty_like(vectors)
         self._point, self._reach, self._step_sizes = point, reach, step_sizes(reach)
-        self._penalty, self._workers = penalty, workers
+        self._proposal, self._penalty, self._workers = proposal, penalty, workers
 
     def advance(self) -> None:
         """Make the steps up to the next check of the gap."""
         for _ in range(_EXCHANGES_PER_CHECK):
             momenta, self._momentum = _momenta(self._momentum)
             fields = (self.vectors, self._ahead, *self._spare)
-            known = (self._point, self._reach, self._step_sizes, self._penalty.smoothing_e, self._penalty.bounded)
-            arguments = (*fields, *known, momenta)
+            planes = (self._point, self._reach, self._step_sizes, self._proposal)
+            arguments = (*fields, *planes, self._penalty.smoothing_e, self._penalty.bounded, momenta)
             uphill = sum(_on_strips(proximal_kernels.step_strip, len(self._point), self._workers, *arguments))
             self._spare, (self.vectors, self._ahead) = (self.vectors, self._ahead), self._spare
             self.steps += momenta.size
@@ -163,7 +176,8 @@ class _DualAscent:
         """Write x (row, column) that belongs to the field so far, and return its slack."""
         _set_primal(self.vectors, self._point, self._reach, plane, self._workers)
         np.maximum(plane, 0, out=plane)
-        return _penalty_and_slack(self.vectors, plane, self._penalty, self._workers)[1]
+        change = plane - self._proposal if self._proposal.size else plane
+        return _penalty_and_slack(self.vectors, change, self._penalty, self._workers)[1]
 
 
 def step_sizes(reach: Image) -> Image:

@@ -1,9 +1,9 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 """Steps on the dual field of a penalised plane, compiled: several at a time on a strip of rows.
 
-The penalty of a plane x is `β Σ φ(|∇x|)`, with `(∇x)[i,j] = (x[i+1,j] − x[i,j], x[i,j+1] − x[i,j])` and no difference
-taken across an edge. Its dual field p has a vector of length at most one for each sample (of any length where φ is
-quadratic everywhere), and determines the plane: `x = ( v − β/w ∇ᵀp )₊`.
+The penalty of a plane x is `β Σ φ(|∇(x − x̂)|)`, with `(∇x)[i,j] = (x[i+1,j] − x[i,j], x[i,j+1] − x[i,j])` and no
+difference taken across an edge. x̂ is a proposal, by default zero. The dual field p has a vector of length at most one
+for each sample (of any length where φ is quadratic everywhere), and determines the plane: `x = ( v − β/w ∇ᵀp )₊`.
 
 A step changes a row of p using the rows next to it, so n steps on a strip need n more rows on each side, whose values
 become stale one after the other. Each strip works on a copy, so strips can be processed in any order, and the result
@@ -16,14 +16,17 @@ from faintfield.recon.numba_tools import compiled
 
 
 @compiled
-def _plane_row(row, down, right, centre, reach, values):
-    """Set `values` to a row of `( v − β/w ∇ᵀp )₊`, with its last value twice.
+def _plane_row(row, down, right, centre, reach, origin, values):
+    """Set `values` to a row of `( v − β/w ∇ᵀp )₊ − x̂`, with its last value twice.
 
     The fields begin with a row and a column of zeros.
     """
     for j in range(centre.shape[1]):
         divergence = down[row + 1, j + 1] - down[row, j + 1] + right[row + 1, j + 1] - right[row + 1, j]
         values[j] = max(centre[row, j] + reach[row, j] * divergence, values.dtype.type(0))
+    if origin.size > 0:
+        for j in range(centre.shape[1]):
+            values[j] -= origin[row, j]
     values[values.size - 1] = values[values.size - 2]
 
 
@@ -52,7 +55,9 @@ def _step_row(x, below, step, smoothing, bounded, momentum, fields):
 
 
 @compiled
-def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, steps, smoothing, bounded, momenta):
+def step_strip(
+    first, stop, dual, ahead, next_dual, next_ahead, centre, reach, steps, origin, smoothing, bounded, momenta
+):
     """Make `momenta.size` accelerated projected gradient steps on rows `first` to `stop` of the dual field.
 
     Parameters
@@ -61,6 +66,8 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
         The field p and the field extrapolated beyond it; the strip's rows of both after the steps.
     centre, reach, steps : array (row, column)
         v, β/w, and the size of the step at each sample.
+    origin : array (row, column)
+        x̂; of size zero where it is zero everywhere.
     smoothing, bounded : number, bool
         δ of the penalty, in the unit of the plane; whether |p| ≤ 1.
     momenta : array (step,)
@@ -74,7 +81,7 @@ def step_strip(first, stop, dual, ahead, next_dual, next_ahead, centre, reach, s
     top, bottom = max(first - momenta.size, 0), min(stop + momenta.size, centre.shape[0])
     local = _with_halo(top, bottom, dual, ahead)
     against = 0.0
-    planes = centre[top:bottom], reach[top:bottom], steps[top:bottom]
+    planes = centre[top:bottom], reach[top:bottom], steps[top:bottom], origin[top:bottom]
     for momentum in momenta:
         options = (centre.dtype.type(smoothing), bounded, centre.dtype.type(momentum))
         against = _step_rows(first - top, stop - top, local, planes, options)
@@ -97,15 +104,15 @@ def _with_halo(top, bottom, dual, ahead):
 @compiled
 def _step_rows(first, stop, local, planes, options):
     """Make one step on all rows of a copy; return how far rows `first` to `stop` oppose the momentum."""
-    centre, reach, steps = planes
+    centre, reach, steps, origin = planes
     height, columns = centre.shape
     here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
     smoothing, bounded, momentum = options
-    _plane_row(0, local[2], local[3], centre, reach, here)
+    _plane_row(0, local[2], local[3], centre, reach, origin, here)
     against = 0.0
     for row in range(height):
         if row + 1 < height:
-            _plane_row(row + 1, local[2], local[3], centre, reach, below)
+            _plane_row(row + 1, local[2], local[3], centre, reach, origin, below)
         else:
             below[:] = here
         fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])
@@ -130,7 +137,7 @@ def primal_of_dual(first, stop, dual, centre, reach, plane):
 
 @compiled
 def penalty_and_slack(first, stop, plane, dual, smoothing, bounded):
-    """Return Σ φ(|∇x|) over rows of max(plane, 0), and how far p is from being its subgradient: Σ φ − p·∇x + ½ δ |p|².
+    """Return Σ φ(|∇x|) over rows of a plane, and how far p is from being its subgradient: Σ φ − p·∇x + ½ δ |p|².
 
     Each term of the second sum is at least zero, and zero where p belongs to x.
     """
@@ -142,9 +149,9 @@ def penalty_and_slack(first, stop, plane, dual, smoothing, bounded):
         below = min(row + 1, rows - 1)
         of_row, slack_of_row = zero, zero
         for j in range(columns):
-            x = max(plane[row, j], zero)
-            down = max(plane[below, j], zero) - x
-            right = max(plane[row, min(j + 1, columns - 1)], zero) - x
+            x = plane[row, j]
+            down = plane[below, j] - x
+            right = plane[row, min(j + 1, columns - 1)] - x
             square = down * down + right * right
             length = np.sqrt(square)
             quadratic = (length < smoothing) | (not bounded)

@@ -1,7 +1,7 @@
 """What the views say of each depth of each sample: log-likelihood ratios against a surface assumed so far."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numba
@@ -205,7 +205,7 @@ class DepthEvidence:
         metric = np.maximum(count, np.float32(1)) / self.variance
         weight = strength * float(np.sqrt(np.median(metric)))
         dual = DualField.zero([light.shape], np.dtype(np.float32))
-        dual = dual if workers is None else DualField(dual.vectors, workers)
+        dual = dual if workers is None else replace(dual, workers=workers)
         return dual.prox(light, metric, weight, Penalty(), lambda _: 0.0, _STEPS).plane
 
 

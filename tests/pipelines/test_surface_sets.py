@@ -20,7 +20,9 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.planes import Settings, solve, solve_then_sigma
+from faintfield.pipelines.reconstruction.penalised import solve_then_sigma
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.surfaces import Searches
 

@@ -10,13 +10,9 @@ from scipy.fft import dctn, idctn
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
-from faintfield.recon.solver.collaborative import (
-    Noise,
-    Patches,
-    collaborative_wiener,
-    noise_of_back_projection,
-    refined,
-)
+from faintfield.recon.prior.collaborative import Patches, collaborative_wiener
+from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
+from faintfield.recon.prior.patches import refined
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem

@@ -96,7 +96,7 @@ def test_strips_and_threads_change_nothing(dtype: type[np.float32] | type[np.flo
     w: Image = generator.uniform(0.5, 2, (300, 31)).astype(dtype)
     planes = []
     for workers in (1, 3, 4):
-        dual = DualField([np.zeros((2, 300, 31), dtype)], workers)
+        dual = DualField([np.zeros((2, 300, 31), dtype)], workers=workers)
         planes.append(dual.prox(v, w, 1.0, TV, lambda _: 0.0, 60).plane)
     for plane in planes[1:]:
         np.testing.assert_allclose(plane, planes[0], rtol=50 * np.finfo(dtype).eps)

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.planes import Objective, Settings, solve, solve_pmlem
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import SceneProblem

@@ -41,7 +41,7 @@ _SUFFIX_OF_PARTS, _STORED = ".float32", np.dtype("<f4")
 _A_COLOUR, _ANEW = "the record of a colour of a plane", f"remove the folder {PARTS} and reconstruct again"
 
 # What may be known of each sample besides its light, each in a file of its own.
-_SIDECARS = ("sigma", "opacity")
+_SIDECARS = ("sigma", "opacity", "proposal", "moved")
 
 type Origin = Provenance[ReconstructionOptions]
 

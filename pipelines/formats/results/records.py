@@ -96,6 +96,20 @@ class PenaltyRecord(Struct, frozen=True):
     smoothing_e: float
 
 
+class PriorRecord(Struct, frozen=True, kw_only=True):
+    """What a prior proposed for a plane, and what the data made of it.
+
+    `mixture` has the weights of the candidates by region, with or without light and detail. `moved_sigma` is the root
+    mean square of plane less proposal, in standard deviations of the back-projection's noise. `left_out` says
+    why the plane is that of total variation instead.
+    """
+
+    name: str
+    mixture: dict[str, dict[str, float]] | UnsetType = UNSET
+    moved_sigma: float | UnsetType = UNSET
+    left_out: str | UnsetType = UNSET
+
+
 class SolveRecord(Struct, frozen=True, kw_only=True):
     """How one colour of a plane was solved: the middle part of `PlaneRecord`."""
 
@@ -112,6 +126,7 @@ class SolveRecord(Struct, frozen=True, kw_only=True):
     likelihood: str | UnsetType = UNSET
     occlusion: bool | UnsetType = UNSET
     occlusion_left_out: str | UnsetType = UNSET
+    prior: PriorRecord | UnsetType = UNSET
 
 
 class PlaneRecord(Struct, frozen=True, kw_only=True):
@@ -142,14 +157,18 @@ class PlaneRecord(Struct, frozen=True, kw_only=True):
     likelihood: str | UnsetType = UNSET
     occlusion: bool | UnsetType = UNSET
     occlusion_left_out: str | UnsetType = UNSET
+    prior: PriorRecord | UnsetType = UNSET
     flux_e: float
     sigma_file: FileName | UnsetType = UNSET
     opacity_file: FileName | UnsetType = UNSET
+    proposal_file: FileName | UnsetType = UNSET
+    moved_file: FileName | UnsetType = UNSET
 
     @property
     def files(self) -> list[str]:
         """Names of the files of this plane, beside the record."""
-        return [name for name in (self.file, self.sigma_file, self.opacity_file) if name is not UNSET]
+        sidecars = (self.sigma_file, self.opacity_file, self.proposal_file, self.moved_file)
+        return [self.file, *(name for name in sidecars if name is not UNSET)]
 
 
 def check_depths(planes: Sequence[PlaneRecord], units: StatedUnits | UnsetType) -> None:
@@ -223,6 +242,8 @@ class ReconstructionOptions(Struct, frozen=True):
     penalty: str | UnsetType = UNSET
     likelihood: str | UnsetType = UNSET
     uncertainty: bool | UnsetType = UNSET
+    prior: str | UnsetType = UNSET
+    proposal: bool | UnsetType = UNSET
     passes: int | UnsetType | None = UNSET
     pitch_mm: float | UnsetType | None = UNSET
     focus: bool | UnsetType = UNSET

@@ -48,19 +48,21 @@ def filter_rows(picture, pilot, variance, rows, columns, search, transform, abov
         y, u and the variance of y. No patch with a NaN in the pilot belongs to a group.
     rows, columns : int array
         First row and column of the reference patches.
-    search : (int, int)
-        How far from its reference a member may lie, along rows and columns, and the largest number of members.
+    search : (int, int, float)
+        How far from its reference a member may lie, along rows and columns, the largest number of members, and the
+        least magnitude of the coefficients that the second filter keeps, in standard deviations of their noise.
     transform : Transform
         The transform of patches, and their size.
-    above, below : float32 array (row, column)
-        Sums to which the filtered patches times their weights, and the weights, are added.
+    above, below : float32 array (filter, row, column)
+        Sums to which the filtered patches times their weights, and the weights, are added. The first filter is
+        Wiener's; the second, if there is one, keeps large coefficients.
     """
-    radius, members = search
+    radius, members, threshold = search
     size = transform.window.shape[0]
     distances = np.empty((columns.size, members), np.float32)
     places = np.empty((columns.size, members, 2), np.int32)
     found = np.empty(columns.size, np.intp)
-    patches = np.empty((3, size * size * members), np.float32)
+    patches = np.empty((4, size * size * members), np.float32)
     for row in rows:
         _find_alike(pilot, row, columns, size, radius, distances, places, found)
         for k in range(columns.size):
@@ -68,7 +70,7 @@ def filter_rows(picture, pilot, variance, rows, columns, search, transform, abov
             while 2 * count <= found[k]:
                 count *= 2
             if found[k] > 0:
-                _filter_group(picture, pilot, variance, places[k, :count], transform, patches, above, below)
+                _filter_group(picture, pilot, variance, places[k, :count], threshold, transform, patches, above, below)
 
 
 @compiled
@@ -133,8 +135,8 @@ def _insert(distance, row, column, distances, places, found, k):
 
 
 @compiled
-def _filter_group(picture, pilot, variance, places, transform, patches, above, below):
-    """Filter the patches of a group with the gain `U²/(U² + v c)` of each coefficient, and add them to the sums."""
+def _filter_group(picture, pilot, variance, places, threshold, transform, patches, above, below):
+    """Filter the patches of a group by each filter, and add them to its sums."""
     size, count = transform.window.shape[0], places.shape[0]
     y, u, scratch = patches[0], patches[1], patches[2]
     half = size // 2
@@ -147,9 +149,22 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
     for group in (y, u):
         _cosine_transform(group, scratch, transform.cosines, count)
         _haar(group, size * size, count)
+    if above.shape[0] > 1:
+        kept, length = patches[3], size * size * count
+        kept[:length] = y[:length]
+        left = _keep_large(kept, level, threshold, transform, count)
+        _add_inverse(kept, scratch, places, transform, level, left, above[1], below[1])
+    left = _shrink(y, u, level, transform, count)
+    _add_inverse(y, scratch, places, transform, level, left, above[0], below[0])
+
+
+@compiled
+def _shrink(y, u, level, transform, count):
+    """Multiply the coefficients of a group by `U²/(U² + v c)`; return the sum of the variances that are left."""
+    size = index(transform.window.shape[0])
     left = np.float32(0)
-    for k in range(index(size * size)):
-        noise = level * transform.variances[k // index(size), k % index(size)]
+    for k in range(size * size):
+        noise = level * transform.variances[k // size, k % size]
         first = k * index(count)
         kept = np.float32(0)
         for m in range(index(count)):
@@ -158,10 +173,34 @@ def _filter_group(picture, pilot, variance, places, transform, patches, above, b
             y[first + m] *= gain
             kept += gain * gain
         left += kept * noise
-    _inverse_haar(y, size * size, count)
-    _cosine_transform(y, scratch, transform.transposed, count)
+    return left
+
+
+@compiled
+def _keep_large(y, level, threshold, transform, count):
+    """Set the coefficients of a group to zero that may be noise, but never its mean; return the variances left."""
+    size = index(transform.window.shape[0])
+    left = np.float32(0)
+    for k in range(size * size):
+        noise = level * transform.variances[k // size, k % size]
+        first = k * index(count)
+        least = threshold * threshold * noise
+        for m in range(index(count)):
+            if y[first + m] * y[first + m] > least or k + m == index(0):
+                left += noise
+            else:
+                y[first + m] = np.float32(0)
+    return left
+
+
+@compiled
+def _add_inverse(group, scratch, places, transform, level, left, above, below):
+    """Transform a group back, and add its patches with the weight that their variance gives them."""
+    size, count = transform.window.shape[0], places.shape[0]
+    _inverse_haar(group, size * size, count)
+    _cosine_transform(group, scratch, transform.transposed, count)
     weight = np.float32(1) / (left / np.float32(count * size * size) + np.float32(_LEAST_LEFT) * level)
-    _add(y, places, size, transform.window, weight, above, below)
+    _add(group, places, size, transform.window, weight, above, below)
 
 
 @compiled

@@ -1,0 +1,63 @@
+"""Planes by a prior: proposals beyond total variation, and what the data make of them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from msgspec import structs
+
+from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
+from faintfield.pipelines.reconstruction.penalised import Objective, certified
+from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior.patches import patch_candidates
+from faintfield.recon.prior.proposal import PlaneProposal, propose
+from faintfield.recon.solver.cross_validation import MIN_VIEWS
+
+
+def with_prior(objective: Objective, solutions: Sequence[Solution], settings: Settings) -> list[Solution]:
+    """Return planes under the prior of the settings, given those of total variation.
+
+    The proposal x̂ is a mixture of candidates chosen by held-out views. What is returned is the certified optimum of
+    `min L(f) + β TV(f − x̂)` over f ≥ 0, with the β of total variation: where the data contradict the proposal, they
+    win. Its record says how far they moved it.
+    """
+    operator = objective.posed.operator
+    if settings.prior == "tv":
+        return list(solutions)
+    if len(operator.seeing_views) < MIN_VIEWS:
+        return [_without(one, "too few views to hold some out") for one in solutions]
+    first = solutions[0].record
+    weight = first.penalty_weight or 0.0
+    samples = operator.samples_of([one.plane for one in solutions])
+    proposals = propose(objective.posed, samples, weight, patch_candidates)
+    proposed = operator.samples_of([one.picture for one in proposals])
+    dual = replace(objective.posed.dual(), proposal=proposed)
+    record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, settings)
+    record = structs.replace(
+        record,
+        penalty_weight_chosen=first.penalty_weight_chosen,
+        penalty_weight_curve=first.penalty_weight_curve,
+        passes_before=(first.passes_before or 0) + first.passes,
+    )
+    planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
+    return [_solution(plane, record, one.sidecars, proposal, settings) for plane, one, proposal in planes]
+
+
+def _solution(
+    plane: Image, record: SolveRecord, sidecars: dict[str, Image], proposal: PlaneProposal, settings: Settings
+) -> Solution:
+    """Return one plane with how far the data moved it from its proposal."""
+    moved = np.zeros_like(plane)
+    np.divide(plane - proposal.picture, proposal.sigma, out=moved, where=proposal.sigma > 0)
+    seen = np.isfinite(proposal.sigma)
+    rms = float(np.sqrt(np.mean(np.square(moved[seen], dtype=np.float64))))
+    prior = PriorRecord(name=settings.prior, mixture=proposal.mixture, moved_sigma=rms)
+    if settings.proposal:
+        sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
+    return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)
+
+
+def _without(one: Solution, reason: str) -> Solution:
+    """Return the plane of total variation, and say why it is that."""
+    return replace(one, record=structs.replace(one.record, prior=PriorRecord(name="tv", left_out=reason)))

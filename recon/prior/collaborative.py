@@ -1,0 +1,149 @@
+"""Collaborative filters: a picture without its noise, by groups of patches that are alike."""
+
+from itertools import product
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior.collaborative_kernels import Transform, filter_rows
+from faintfield.recon.prior.evidence import Noise
+from faintfield.recon.threads import run_in_threads
+
+# Shape parameter of the Kaiser window that weights the samples of a patch.
+_KAISER_BETA = 2.0
+
+
+class Patches(NamedTuple):
+    """How groups of alike patches are formed.
+
+    Attributes
+    ----------
+    size : int
+        Samples of a patch along each side, a multiple of four.
+    step : int
+        Samples from one reference patch to the next.
+    radius : int
+        How far from its reference a patch may lie, along rows and columns.
+    members : int
+        Largest number of patches in a group.
+    """
+
+    size: int = 12
+    step: int = 5
+    radius: int = 18
+    members: int = 64
+
+
+# A coefficient below so many standard deviations of its noise is taken for noise.
+_THRESHOLD = 2.7
+
+
+def collaborative_wiener(
+    picture: Image, pilot: Image, noise: Noise, patches: Patches | None = None, *, workers: int | None = None
+) -> NDArray[np.float32]:
+    """Return a picture (row, column) without its noise, filtered in groups of patches that are alike in the pilot.
+
+    The collaborative filter of Dabov, Foi, Katkovnik and Egiazarian (2007), second step: each group of alike patches is
+    transformed by cosines along rows and columns and by Haar's wavelets along the group, and each coefficient of the
+    picture is multiplied by `U²/(U² + v)`, with U that of the pilot and v the variance of the noise. Each
+    sample is the mean of what the patches around it say, with weights that fall with the noise left in them.
+
+    Parameters
+    ----------
+    picture, pilot : float array (row, column)
+        y, and a picture of the same scene without noise, as blurred as y.
+    noise : Noise
+        Covariance of the noise of y. Patches with a sample of infinite variance join no group: samples that are in no
+        other patch keep the pilot's value.
+    patches : Patches, optional
+        How groups are formed.
+    workers : int, optional
+        Number of threads; the result does not depend on it.
+
+    Raises
+    ------
+    ValueError
+        Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
+    """
+    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), workers, also_thresholded=False)
+    return wiener
+
+
+def wiener_and_thresholded(
+    picture: Image, pilot: Image, noise: Noise, patches: Patches, *, workers: int | None = None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
+
+    The second (the filter's first step) keeps the coefficients of the picture itself that exceed 2.7 standard
+    deviations of their noise. So it also shows what the pilot lost.
+    """
+    wiener, thresholded = _filtered(picture, pilot, noise, patches, workers, also_thresholded=True)
+    return wiener, thresholded
+
+
+def _filtered(
+    picture: Image, pilot: Image, noise: Noise, patches: Patches, workers: int | None, *, also_thresholded: bool
+) -> list[NDArray[np.float32]]:
+    """Return the picture (row, column) as each filter leaves it."""
+    picture, pilot, variance = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot, noise.variance))
+    _check(picture, pilot, variance, patches)
+    # A distance to NaN is below none
+    seen = np.where(np.isfinite(variance), pilot, np.float32(np.nan))
+    above, below = np.zeros((2, 2 if also_thresholded else 1, *pilot.shape), np.float32)
+    transform = _transform(noise.kernel, patches.size)
+    rows, columns = (_corners(length, patches) for length in pilot.shape)
+
+    def work(strips: list[NDArray[np.intp]]) -> None:
+        for strip in strips:
+            search = (patches.radius, patches.members, np.float32(_THRESHOLD))
+            filter_rows(picture, seen, variance, strip, columns, search, transform, above, below)
+
+    # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
+    strip_of_row = rows // (2 * patches.radius + patches.size)
+    strips_of_all = [rows[strip_of_row == k] for k in range(strip_of_row[-1] + 1)]
+    for turn in range(min(2, len(strips_of_all))):
+        strips = strips_of_all[turn::2]
+        count = min(workers or int(numba.config.NUMBA_NUM_THREADS), len(strips))
+        run_in_threads(work, [strips[worker::count] for worker in range(count)])
+    for total, weight in zip(above, below, strict=True):
+        np.copyto(total, pilot, where=weight == 0)
+        np.divide(total, weight, out=total, where=weight > 0)
+    return list(above)
+
+
+def _check(picture: Image, pilot: Image, variance: Image, patches: Patches) -> None:
+    """Refuse shapes that differ or are too small for a patch, and sizes that are not multiples of four (ValueError)."""
+    if not picture.shape == pilot.shape == variance.shape:
+        raise ValueError(
+            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {variance.shape}; give "
+            "all the same"
+        )
+    if patches.size < 4 or patches.size % 4 or patches.size > min(picture.shape):
+        raise ValueError(
+            f"patches of {patches.size} samples in a picture {picture.shape}; give a multiple of four that fits into it"
+        )
+
+
+def _corners(length: int, patches: Patches) -> NDArray[np.intp]:
+    """Return the first samples of the reference patches along one axis, the last of which ends at the edge."""
+    last = length - patches.size
+    return np.unique(np.append(np.arange(0, last, patches.step), last))
+
+
+def _transform(kernel: NDArray[np.float64], size: int) -> Transform:
+    """Return the transform of patches, with the variance of their coefficients for noise of variance one."""
+    k, i = np.arange(size)[:, np.newaxis], np.arange(size)
+    cosines = np.sqrt(2 / size) * np.cos(np.pi * k * (i + 0.5) / size)
+    cosines[0] /= np.sqrt(2)
+    variances = np.zeros((size, size))
+    for down, right in product((-1, 0, 1), repeat=2):
+        along_rows, along_columns = (
+            np.einsum("ki,ij,kj->k", cosines, np.eye(size, k=lag), cosines) for lag in (down, right)
+        )
+        variances += kernel[1 + down, 1 + right] * np.outer(along_rows, along_columns)
+    window = np.kaiser(size, _KAISER_BETA)
+    arrays = cosines, cosines.T, variances, np.outer(window, window)
+    return Transform(*(np.ascontiguousarray(array, np.float32) for array in arrays))

@@ -1,0 +1,179 @@
+"""What the data say of each plane: a picture with its noise, and the same picture of a plane without noise."""
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.scene_operator import SceneOperator, ViewSelection
+from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.initialization import well_seen_samples
+
+# Spacings of the blurs of the noise of a draw, which stands in for many draws, and of the number of views.
+_WIDE_BLUR, _NARROW_BLUR = (1, 2, 4, 8, 12), (1, 1)
+
+# Where the variance is smaller, there is none.
+_TINY = 1e-30
+
+
+class Noise(NamedTuple):
+    """Covariance of the noise of a picture, `Cov(p, p + d) = variance[p] · kernel[1 + d]`, zero for distant samples.
+
+    Attributes
+    ----------
+    variance : float32 array (row, column)
+        In squared electrons; infinite for samples that no view sees.
+    kernel : float array (3, 3)
+        Correlation of a sample with its neighbours (row, column), one at the centre.
+    """
+
+    variance: NDArray[np.float32]
+    kernel: NDArray[np.float64]
+
+
+class Evidence(NamedTuple):
+    """What some views say of one plane.
+
+    Attributes
+    ----------
+    picture : float array (row, column)
+        y, in electrons: the back-projection of what the views show beside the light of other planes.
+    pilot : float array (row, column)
+        u, the plane as blurred as y, `H_zᵀ H_z f_z / H_zᵀ H_z 1`.
+    noise : Noise
+        Covariance of y.
+    coverage : float array (row, column)
+        `H_zᵀ H_z 1`; zero where no view sees the plane, and y and u are zero there.
+    """
+
+    picture: Image
+    pilot: Image
+    noise: Noise
+    coverage: Image
+
+
+def evidence_of_planes(
+    operator: SceneOperator, images: ElementalImages, samples: Image, views: ViewSelection = None
+) -> list[Evidence]:
+    """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
+
+    Parameters
+    ----------
+    operator, images
+        H and the data.
+    samples : float array (samples)
+        f ≥ 0, in electrons.
+    views : sequence of int, optional
+        The views that count; all by default.
+    """
+    seen = operator.adjoint_of_forward(samples, views)
+    residual = operator.adjoint(images.electrons, views) - seen
+    if np.any(images.background_e):
+        residual -= operator.adjoint_of_map(images.background_e, views)
+    variance = seen + operator.adjoint_of_map(images.background_e + images.read_variance_e2, views)
+    drawn = _drawn_noise(operator, images, samples, views, (0, 0))
+    found = []
+    parts = (operator.planes_of(array) for array in (residual, variance, drawn))
+    for own, coverage, *of_plane in zip(*_of_each(operator, samples, seen, views), *parts, strict=True):
+        of_residual, of_variance, of_draw = of_plane
+        pilot, change = (_divided(array, coverage) for array in (own, of_residual))
+        noise = _noise(coverage, of_variance, [of_draw])
+        found.append(Evidence(pilot + change, pilot, noise, coverage))
+    return found
+
+
+def _of_each(
+    operator: SceneOperator, samples: Image, seen: Image, views: ViewSelection
+) -> tuple[list[Image], list[Image]]:
+    """Return `H_zᵀ H_z f_z` and `H_zᵀ H_z 1` of each plane z alone, (row, column); `seen` is Hᵀ H f."""
+    if len(operator.grids) == 1:
+        return operator.planes_of(seen), operator.planes_of(operator.coverage(views))
+    own: list[Image] = []
+    coverages: list[Image] = []
+    for index in range(len(operator.grids)):
+        for found, light in ((own, samples), (coverages, np.ones_like(samples))):
+            alone = np.zeros_like(samples)
+            operator.planes_of(alone)[index][:] = operator.planes_of(light)[index]
+            found.append(operator.planes_of(operator.adjoint_of_forward(alone, views))[index].copy())
+    return own, coverages
+
+
+def _divided(sums: Image, coverage: Image) -> Image:
+    """Return sums by coverage, zero where no view sees."""
+    return np.divide(sums, coverage, out=np.zeros_like(sums), where=coverage > 0)
+
+
+def noise_of_back_projection(
+    operator: SceneOperator,
+    images: ElementalImages,
+    plane: Image,
+    *,
+    seed: int = 0,
+    draws: int = 1,
+) -> Noise:
+    """Return the covariance of the back-projection's noise, for data of variance `H f + b + σ²`.
+
+    A pixel of variance v adds h² v to the variance of a sum Hᵀ g, and the operator can only add h v. The ratio of the
+    two sums changes slowly over the plane, so it is measured, like the kernel, on back-projected draws of the noise,
+    one view at a time.
+
+    Parameters
+    ----------
+    operator, images, plane
+        H of one plane or surface, the data, and f.
+    seed : int
+        Seed of the random generators, one per draw and view.
+    draws : int
+        Number of draws.
+    """
+    variance = operator.adjoint_of_map(images.background_e + images.read_variance_e2)
+    variance += operator.adjoint_of_forward(np.maximum(plane, 0))
+    drawn = (_drawn_noise(operator, images, plane, None, (seed, draw)) for draw in range(draws))
+    return _noise(operator.coverage(), variance, list(drawn))
+
+
+def _noise(coverage: Image, variance: Image, draws: list[Image]) -> Noise:
+    """Return the covariance of `Hᵀ n / coverage` from `Hᵀ` of the variances, and draws of Hᵀ n."""
+    seen = well_seen_samples(coverage)
+    squares, products = np.zeros_like(coverage), np.zeros((3, 3))
+    for light in draws:
+        squares += np.square(light)
+        products += _products_of_neighbours(np.where(seen, light, 0) / np.sqrt(np.maximum(variance, _TINY)))
+    factor = blurred(squares, _WIDE_BLUR) / (len(draws) * np.maximum(blurred(variance, _WIDE_BLUR), _TINY))
+    factor *= blurred(variance, _NARROW_BLUR)
+    of_mean = np.full(coverage.shape, np.inf, np.float32)
+    np.divide(factor, np.square(blurred(coverage, _NARROW_BLUR)), out=of_mean, where=seen)
+    return Noise(of_mean, products / max(products[1, 1], _TINY))
+
+
+def _drawn_noise(
+    operator: SceneOperator, images: ElementalImages, samples: Image, views: ViewSelection, seed: tuple[int, int]
+) -> Image:
+    """Return Hᵀ n (samples) of one draw of the noise n of the data, view by view."""
+    light, total = np.maximum(samples, 0), np.zeros_like(samples)
+    for view in (operator.all_views if views is None else np.asarray(views)).tolist():
+        known = operator.map_of_views(images.background_e + images.read_variance_e2, np.array([view]))
+        deviation = np.sqrt(operator.forward(light, [view]) + known)[0]
+        total += operator.adjoint_of_view(_with_random_signs(deviation, [*seed, view]), view)
+    return total
+
+
+def _with_random_signs(image: Image, seed: Sequence[int]) -> Image:
+    """Return an image (row, column) whose values change sign at random: noise of this deviation, fast to draw."""
+    generator = np.random.default_rng(seed)
+    bits = np.frombuffer(generator.bytes(-(-image.size // 8)), np.uint8)
+    negative = np.unpackbits(bits, count=image.size).reshape(image.shape)
+    return np.where(negative, -image, image)
+
+
+def _products_of_neighbours(picture: Image) -> NDArray[np.float64]:
+    """Return the sums of products of samples and their neighbours (3, 3), over all samples with eight neighbours."""
+    rows, columns = picture.shape
+    inner = picture[1:-1, 1:-1]
+    sums = np.empty((3, 3))
+    for i, j in product(range(3), range(3)):
+        sums[i, j] = np.einsum("ij,ij", inner, picture[i : rows - 2 + i, j : columns - 2 + j], dtype=np.float64)
+    return (sums + sums[::-1, ::-1]) / 2

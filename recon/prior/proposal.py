@@ -1,0 +1,164 @@
+"""A proposal for the planes of a scene: candidate pictures, mixed such that they best predict held-out views."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.operator.occlusion import opacity
+from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
+from faintfield.recon.prior.mixture import Scores, best_mixture, scores
+from faintfield.recon.smoothing import blurred
+from faintfield.recon.solver.cross_validation import MIN_VIEWS, folds_to_predict, validation_views
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.initialization import mean_light_e
+from faintfield.recon.solver.penalties import differences
+from faintfield.recon.solver.pmlem import pmlem
+
+# Fewest folds: the choice by one is noisy.
+_MIN_FOLDS = 2
+
+# Accuracy of the planes of a fold and limit on their passes: the candidates made of them differ by more.
+_TOLERANCE, _MAX_PASSES = 0.02, 4
+
+# Spacings of the blur of the border between what is lit and what is dark.
+_BORDER_BLUR = (1, 1, 2)
+
+# A sample is in detail where the pilot changes by this share of the noise's deviation from sample to sample. Chosen on
+# photographs, as are the spacings of the blurs of the change and of what is in detail.
+_DETAIL_SHARE, _CHANGE_BLUR, _DETAIL_BLUR = 0.15, (1, 1), (1, 1, 2)
+
+# Candidates of one plane by name, all as blurred as the evidence.
+type Candidates = Callable[[Evidence], dict[str, Image]]
+
+# Shares (row, column) of each sample that belong to a region, by the region's name; they sum to one.
+type Regions = dict[str, Image]
+
+
+@dataclass(frozen=True)
+class PlaneProposal:
+    """The proposal for one plane.
+
+    Attributes
+    ----------
+    picture : float array (row, column)
+        x̂ ≥ 0, in electrons.
+    sigma : float array (row, column)
+        Standard deviation of the back-projection, in electrons; infinite where no view sees.
+    mixture : dict of str to dict of str to float
+        Weight of each candidate, by region: "light" or "dark", "detail" or "smooth".
+    """
+
+    picture: Image
+    sigma: Image
+    mixture: dict[str, dict[str, float]]
+
+
+def propose(
+    problem: SceneProblem, samples: Image, penalty_weight: float, candidates: Candidates
+) -> list[PlaneProposal]:
+    """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
+
+    The mixture that best predicts the back-projections of views that were held out, in the mean over folds. It differs
+    from region to region: with and without light, with and without detail.
+
+    Parameters
+    ----------
+    problem : SceneProblem
+        The operator and the images.
+    samples : float array (samples)
+        f, the planes that total variation gives.
+    penalty_weight : float
+        β of these.
+    candidates : callable
+        Returns the candidates for one plane by name, given its evidence. The first is chosen where all predict alike.
+
+    Raises
+    ------
+    ValueError
+        Fewer than `MIN_VIEWS` views see anything.
+    """
+    operator = problem.operator
+    views = operator.seeing_views
+    if len(views) < MIN_VIEWS:
+        raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {len(views)}")
+    evidences = evidence_of_planes(operator, problem.images, samples)
+    regions = [_regions(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
+    totals: list[list[Scores]] = [[] for _ in evidences]
+    for fold in range(max(_MIN_FOLDS, folds_to_predict(problem))):
+        held_out = views[validation_views(len(views), fold)]
+        planes = _planes_of_fold(problem, samples, penalty_weight, np.setdiff1d(views, held_out))
+        found = _fold_scores(problem, planes, held_out, candidates, regions)
+        totals = [_summed(*of_plane) for of_plane in zip(totals, found, strict=True)]
+    mixtures = [[best_mixture(of_region) for of_region in of_plane] for of_plane in totals]
+    made = (candidates(evidence) for evidence in evidences)
+    return [_mixed(*of_plane) for of_plane in zip(evidences, made, regions, mixtures, strict=True)]
+
+
+def _summed(total: list[Scores], more: list[Scores]) -> list[Scores]:
+    """Return the scores of all regions with those of one more fold."""
+    return [a + b for a, b in zip(total, more, strict=True)] if total else more
+
+
+def _regions(plane: Image, evidence: Evidence) -> Regions:
+    """Return the regions of a plane with light or without, with detail or without."""
+    lit = blurred((opacity(plane) > 0.5).astype(np.float32), _BORDER_BLUR)
+    seen = np.isfinite(evidence.noise.variance)
+    change = np.hypot(*differences(evidence.pilot))
+    noise = np.sqrt(np.where(seen, evidence.noise.variance, 1))
+    np.divide(change, noise, out=change, where=noise > 0)
+    detail = blurred((blurred(change, _CHANGE_BLUR) > _DETAIL_SHARE).astype(np.float32), _DETAIL_BLUR)
+    return {
+        "light, detail": lit * detail,
+        "light, smooth": lit * (1 - detail),
+        "dark, detail": (1 - lit) * detail,
+        "dark, smooth": (1 - lit) * (1 - detail),
+    }
+
+
+def _fold_scores(
+    problem: SceneProblem, planes: Image, held_out: NDArray[np.intp], candidates: Candidates, regions: list[Regions]
+) -> list[list[Scores]]:
+    """Return the scores of each plane's candidates from the training views, by region."""
+    operator, images = problem.operator, problem.images
+    training = np.setdiff1d(operator.seeing_views, held_out)
+    made = [list(candidates(one).values()) for one in evidence_of_planes(operator, images, planes, training)]
+    truths = evidence_of_planes(operator, images, planes, held_out)
+    return [
+        [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
+        for pictures, truth, shares in zip(made, truths, regions, strict=True)
+    ]
+
+
+def _planes_of_fold(problem: SceneProblem, samples: Image, penalty_weight: float, training: NDArray[np.intp]) -> Image:
+    """Return the planes (samples) that total variation gives of the training views."""
+    start = problem.start(training)
+    share = training.size / len(problem.operator.seeing_views)
+    iterates = pmlem(
+        problem.fit(mean_light_e(problem.operator, start), training),
+        np.maximum(samples, 1e-3 * start),
+        penalty_weight=penalty_weight * share**0.5,
+        tolerance=_TOLERANCE,
+        dual=problem.dual(),
+    )
+    for count, iterate in enumerate(iterates, 1):
+        if iterate.certificate.distance <= _TOLERANCE or max(count, iterate.passes) >= _MAX_PASSES:
+            break
+    return iterate.plane
+
+
+def _mixed(
+    evidence: Evidence, made: dict[str, Image], regions: Regions, mixture: list[NDArray[np.float64]]
+) -> PlaneProposal:
+    """Return the proposal for one plane from the evidence of all views."""
+    picture = np.zeros_like(evidence.picture)
+    for weights, share in zip(mixture, regions.values(), strict=True):
+        for weight, candidate in zip(weights, made.values(), strict=True):
+            if weight > 0:
+                picture += np.float32(weight) * share * candidate
+    named = {
+        region: dict(zip(made, weights.tolist(), strict=True)) for region, weights in zip(regions, mixture, strict=True)
+    }
+    return PlaneProposal(np.maximum(picture, 0), np.sqrt(evidence.noise.variance), named)
