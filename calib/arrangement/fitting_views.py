@@ -121,7 +121,9 @@ def _pair(pictures: Mapping[Node, Picture], node: Node, other: Node, axis: int, 
         if axis == 1:
             across, along = (left, _ACROSS_PX, _ACROSS_PX), (top, -least, largest)
         rows, columns = (across, along) if axis == 0 else (along, across)
-        area = tuple(slice(max(start - back, 0), start + _BLOCK_PX + ahead) for start, back, ahead in (rows, columns))
+        area = tuple(
+            slice(max(start - back, 0), max(start + _BLOCK_PX + ahead, 0)) for start, back, ahead in (rows, columns)
+        )
         searched = seen_by[area]
         if block.std() < 1e-3 or min(searched.shape) < _BLOCK_PX or min(searched.shape[1 - axis : 2 - axis]) < 1:
             continue
