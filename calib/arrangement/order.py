@@ -25,8 +25,8 @@ _REPEATS, _SURE = 0.6, 3.0
 # noise decides, in random order half of them.
 _FITS = 0.9
 
-# Exchanges that differ below which nothing is said: three views have none.
-_FEW = 3
+# Exchanges that differ which that correlation needs, and from which on its absence says that all pictures fit alike.
+_LEAST, _MANY = 3, 10
 
 # Seed of the exchanges, so that a set always gets the same answer.
 _SEED = 0
@@ -75,11 +75,9 @@ def check_order(pictures: Mapping[Node, Picture], axes: Axes, largest_px: float)
     found = {0: _Exchanges(), 1: _Exchanges()}
     for node in spread(list(pictures), _VIEWS):
         _exchange(found, _View(pictures, node, axes, shifts_px), generator)
-    if max(it.free for it in found.values()) < _FEW:
-        return Order("few", 1.0)
     told = [(float(np.mean(it.worse)), repeats) for it in found.values() if (repeats := it.repeats()) > 0]
     if not told:
-        return Order("open", 1.0)
+        return Order("open" if max(it.free for it in found.values()) >= _MANY else "few", 1.0)
     fits = all(share > _FITS * repeats for share, repeats in told)
     return Order("fits" if fits else "denied", min(share for share, _ in told))
 
@@ -98,7 +96,7 @@ class _Exchanges:
 
     def repeats(self) -> float:
         """Return the correlation of the scores of both halves of the blocks, 0 if it may be chance."""
-        if self.free < _FEW:
+        if self.free < _LEAST:
             return 0.0
         one, other = np.concatenate(self.scores).T
         power = float(np.sqrt((one**2).sum() * (other**2).sum()))

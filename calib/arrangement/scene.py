@@ -172,7 +172,7 @@ def measure(fine: FineMatch, orientation: Orientation, rough_ratio: float) -> Me
     order = orientation.of(fine.views.nodes)
     pictures = dict(zip(order, fine.views.fine.values(), strict=True))
     tables, chance = (_oriented_tables(it, orientation) for it in (fine.tables, fine.chance))
-    ratio = _ratio(tables, chance, rough_ratio, NO_SIGN_PX / fine.views.fine_scale)
+    ratio = pitch_ratio(tables, chance, rough_ratio, NO_SIGN_PX / fine.views.fine_scale)
     table, by_chance = (combined(it, transposed=False, opposed=False, ratio=ratio[0]) for it in (tables, chance))
     if (1, 0) not in tables.along:  # a single column: disparities are those along y
         table, by_chance = tables.along[0, 1], chance.along[0, 1]
@@ -194,7 +194,7 @@ def _oriented_tables(tables: Tables, orientation: Orientation) -> Tables:
     return Tables(tables.shifts_px, along, tables.blocks)
 
 
-def _ratio(tables: Tables, chance: Tables, rough: float, no_sign_px: float) -> tuple[float, float]:
+def pitch_ratio(tables: Tables, chance: Tables, rough: float, no_sign_px: float) -> tuple[float, float]:
     """Return disparities along x over those along y, and its standard error; (1, 0) if the pictures do not tell.
 
     Disparities within `no_sign_px` are not told from zero.
