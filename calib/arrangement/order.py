@@ -23,7 +23,7 @@ _REPEATS, _SURE = 0.6, 3.0
 
 # Share of the exchanges that must make the match worse, over that correlation: in light fields nearly all do unless
 # noise decides, in random order half of them.
-_FITS = 0.9
+_FITS = 0.85
 
 # Exchanges that differ which that correlation needs, and from which on its absence says that all pictures fit alike.
 _LEAST, _MANY = 3, 10

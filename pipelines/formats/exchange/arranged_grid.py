@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.sets.elemental_file import Arrangement
 
 # Contrast over white, and mean light over noise, above which pictures in which nothing is seen are not dark, but show
 # no scene in common.
-_BRIGHT, _OVER_NOISE = 0.02, 1.5
+_BRIGHT, _OVER_NOISE = 0.02, 1.2
 
 # Share of views that may be odd; of missing ones, `find_grid` decides.
 _MAX_ODD_SHARE = 0.25
