@@ -25,8 +25,8 @@ _REPEATS, _SURE = 0.6, 3.0
 # noise decides, in random order half of them.
 _FITS = 0.85
 
-# Exchanges that differ which that correlation needs, and from which on its absence says that all pictures fit alike.
-_LEAST, _MANY = 3, 10
+# Exchanges that differ which that correlation needs: four views in a square have too few.
+_LEAST = 10
 
 # Seed of the exchanges, so that a set always gets the same answer.
 _SEED = 0
@@ -77,7 +77,7 @@ def check_order(pictures: Mapping[Node, Picture], axes: Axes, largest_px: float)
         _exchange(found, _View(pictures, node, axes, shifts_px), generator)
     told = [(float(np.mean(it.worse)), repeats) for it in found.values() if (repeats := it.repeats()) > 0]
     if not told:
-        return Order("open" if max(it.free for it in found.values()) >= _MANY else "few", 1.0)
+        return Order("open" if max(it.free for it in found.values()) >= _LEAST else "few", 1.0)
     fits = all(share > _FITS * repeats for share, repeats in told)
     return Order("fits" if fits else "denied", min(share for share, _ in told))
 
