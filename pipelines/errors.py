@@ -12,6 +12,7 @@ InputError
 │   ├── NotOneScene
 │   ├── CopiedPicture
 │   ├── AmbiguousOrder
+│   ├── ShuffledPictures
 │   └── CameraTurned
 ├── ResultDamaged
 ├── OutputExists
@@ -79,6 +80,10 @@ class CopiedPicture(ArrangementError):
 
 class AmbiguousOrder(ArrangementError):
     """Two orders of the views are equally likely, and nothing states which."""
+
+
+class ShuffledPictures(ArrangementError):
+    """Neighbours by the names fit one another no better than other pictures of the set."""
 
 
 class CameraTurned(ArrangementError):

@@ -86,14 +86,17 @@ def combined(tables: Tables, transposed: bool, opposed: bool, ratio: float) -> T
     """
     parts = []
     for number in tables.numbers:
-        axis = (1 if number == 0 else 0) if not transposed else (0 if number == 0 else 1)
-        table = tables.along[number, axis]
-        scale = 1.0 if axis == 0 else 1.0 / ratio
-        if number == 0 and opposed:
-            scale = -scale
-        parts.append(_resampled(table, tables.shifts_px, scale))
+        axis, scale = direction(transposed, opposed, ratio, number)
+        parts.append(_resampled(tables.along[number, axis], tables.shifts_px, scale))
     with np.errstate(invalid="ignore"):
         return np.asarray(np.mean(parts, axis=0), np.float32)
+
+
+def direction(transposed: bool, opposed: bool, ratio: float, number: int) -> tuple[int, float]:
+    """Return the axis along which points move with a number, and by how much for a disparity of 1 along x."""
+    axis = number if transposed else 1 - number
+    scale = 1.0 if axis == 0 else 1.0 / ratio
+    return axis, -scale if number == 0 and opposed else scale
 
 
 def _compare(tables: Tables, chance: Tables, pooled: bool) -> Axes:

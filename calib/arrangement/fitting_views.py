@@ -49,7 +49,7 @@ class Fits:
 
 
 @dataclass(frozen=True)
-class _Pair:
+class Pair:
     """Two neighbours: the median correlation of their blocks, and how displacements across the step run."""
 
     first: Node
@@ -84,7 +84,7 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
             if steps is not None:
                 scale = steps * (1.0 if axis == 0 else 1.0 / ratio)
                 other = neighbour(node, number, steps)
-                pairs.append(_pair(pictures, node, other, axis, (scale * range_px[0], scale * range_px[1])))
+                pairs.append(compare_pair(pictures, node, other, axis, (scale * range_px[0], scale * range_px[1])))
     if not pairs:
         return Fits([], {}, {}, {})
     nodes = list(pictures)
@@ -108,7 +108,9 @@ def _steps_to_next(pictures: Mapping[Node, Picture], node: Node, number: int) ->
     return next((it for it in range(1, _MOST_STEPS + 1) if neighbour(node, number, it) in pictures), None)
 
 
-def _pair(pictures: Mapping[Node, Picture], node: Node, other: Node, axis: int, range_px: tuple[float, float]) -> _Pair:
+def compare_pair(
+    pictures: Mapping[Node, Picture], node: Node, other: Node, axis: int, range_px: tuple[float, float]
+) -> Pair:
     """Match the blocks of one view in another."""
     view, seen_by = pictures[node], pictures[other]
     least, largest = int(np.floor(range_px[0])) - 2, int(np.ceil(range_px[1])) + 2
@@ -121,7 +123,9 @@ def _pair(pictures: Mapping[Node, Picture], node: Node, other: Node, axis: int, 
         if axis == 1:
             across, along = (left, _ACROSS_PX, _ACROSS_PX), (top, -least, largest)
         rows, columns = (across, along) if axis == 0 else (along, across)
-        area = tuple(slice(max(start - back, 0), start + _BLOCK_PX + ahead) for start, back, ahead in (rows, columns))
+        area = tuple(
+            slice(max(start - back, 0), max(start + _BLOCK_PX + ahead, 0)) for start, back, ahead in (rows, columns)
+        )
         searched = seen_by[area]
         if block.std() < 1e-3 or min(searched.shape) < _BLOCK_PX or min(searched.shape[1 - axis : 2 - axis]) < 1:
             continue
@@ -134,11 +138,11 @@ def _pair(pictures: Mapping[Node, Picture], node: Node, other: Node, axis: int, 
         x, y = left + _BLOCK_PX / 2 - view.shape[1] / 2, top + _BLOCK_PX / 2 - view.shape[0] / 2
         found.append((float(response[peak]), offset, x, y))
     if len(found) < 3:
-        return _Pair(node, other, axis, np.nan, np.nan, 0.0, 0.0, 0.0)
+        return Pair(node, other, axis, np.nan, np.nan, 0.0, 0.0, 0.0)
     score, offset_px, x_px, y_px = np.array(found).T
     constant, along_x, along_y = _plane(x_px, y_px, offset_px, np.maximum(score, 0.0))
     turn, scale = (along_x, along_y) if axis == 0 else (-along_y, along_x)
-    return _Pair(node, other, axis, float(np.median(score)), float(np.median(chance)), constant, turn, scale)
+    return Pair(node, other, axis, float(np.median(score)), float(np.median(chance)), constant, turn, scale)
 
 
 def _corners(shape: tuple[int, ...]) -> list[tuple[int, int]]:
@@ -185,7 +189,7 @@ def _robust(
     return solution
 
 
-def _odd(nodes: Sequence[Node], pairs: Sequence[_Pair]) -> tuple[list[_Pair], list[Node]]:
+def _odd(nodes: Sequence[Node], pairs: Sequence[Pair]) -> tuple[list[Pair], list[Node]]:
     """Return the pairs that fit, and the views that are not linked with most others by such pairs."""
     known = [pair for pair in pairs if np.isfinite(pair.score)]
     if not known:
@@ -205,7 +209,7 @@ def _odd(nodes: Sequence[Node], pairs: Sequence[_Pair]) -> tuple[list[_Pair], li
     return [pair for pair in good if pair.first not in odd and pair.second not in odd], odd
 
 
-def _per_view(nodes: Sequence[Node], pairs: Sequence[_Pair], values: Sequence[float]) -> NDArray[np.float64]:
+def _per_view(nodes: Sequence[Node], pairs: Sequence[Pair], values: Sequence[float]) -> NDArray[np.float64]:
     """Return a value (view,) for each view from the differences of pairs; the median is zero."""
     if not pairs:
         return np.zeros(len(nodes))

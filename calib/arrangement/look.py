@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from faintfield.calib.arrangement.axes import SURE, Axes, find_axes
 from faintfield.calib.arrangement.fitting_views import Fits, compare_neighbours
 from faintfield.calib.arrangement.occlusion import NearAndFar
+from faintfield.calib.arrangement.order import Order, check_order
 from faintfield.calib.arrangement.orientation import Orientation, counted
-from faintfield.calib.arrangement.pictures import MIN_SIDE_PX, Node, Picture, copies, prepare
+from faintfield.calib.arrangement.pictures import MIN_SIDE_PX, Node, Picture, Views, copies, prepare
 from faintfield.calib.arrangement.scene import NO_SIGN_PX, FineMatch, find_roughly, measure
 
 # Standard errors from which the occlusion test decides.
@@ -22,6 +23,8 @@ _DOUBT = 2.5
 
 type Told = Literal["pictures", "signs", "names"]
 
+type Unseen = Literal["small", "single", "even", "apart", "dark"]
+
 
 @dataclass(frozen=True)
 class Look:
@@ -31,6 +34,9 @@ class Look:
     ----------
     seen : bool
         The views show one scene beyond doubt. Without it nothing else is known.
+    unseen : {"small", "single", "even", "apart", "dark"}, optional
+        Why not: the pictures are too small to be compared; there is one only; all pixels of each are alike; no picture
+        has a neighbour; or nothing in common rises above noise.
     match_z : float
         Standard errors by which they do.
     orientation : Orientation
@@ -64,9 +70,18 @@ class Look:
         Displacement x, y beyond what disparities explain, in px of the files.
     contrast : float
         Standard deviation within a picture, in units of the files.
+    noise : float
+        Standard deviation from pixel to pixel, beside edges; in units of the files.
+    mean : float
+        Median of the pictures' means, in units of the files.
+    still : bool
+        No point moves from view to view by more than is told from zero.
+    order : Order
+        Whether neighbours by the names fit better than other pictures do.
     """
 
     seen: bool
+    unseen: Unseen | None
     match_z: float
     orientation: Orientation
     axes_z: float
@@ -87,7 +102,11 @@ class Look:
     scale: NDArray[np.float64]
     shift_px: NDArray[np.float64]
     contrast: float
+    noise: float
+    mean: float
+    still: bool
     level: float
+    order: Order
 
 
 def look(nodes: Sequence[Node], read: Callable[[int], Picture], given: Orientation | None = None) -> Look:
@@ -107,13 +126,16 @@ def look(nodes: Sequence[Node], read: Callable[[int], Picture], given: Orientati
     places = {node: index for index, node in enumerate(numbers)}
     same = [(places[first], places[second]) for first, second in copies(views)]
     light = np.array([views.mean[node] for node in numbers])
-    light = light / (float(np.median(light)) or 1.0)
-    blank = _nothing_seen(len(numbers), given or Orientation(), same, light, views.contrast)
-    if min(views.fine[numbers[0]].shape) < MIN_SIDE_PX or len(numbers) < 2:
-        return blank
+    blank = _nothing_seen(views, given or Orientation(), same, light)
+    if len(numbers) < 2:
+        return replace(blank, unseen="single")
+    if all(not np.ptp(it) for it in views.light.values()):
+        return replace(blank, unseen="even")
+    if min(views.fine[numbers[0]].shape) < MIN_SIDE_PX:
+        return replace(blank, unseen="small")
     coarse, largest_px = find_roughly(views)
     if coarse is None:
-        return blank
+        return replace(blank, unseen="apart")
     if coarse.match_z < SURE:
         return replace(blank, match_z=coarse.match_z, level=coarse.level)
     fine = FineMatch(views, largest_px)
@@ -122,15 +144,18 @@ def look(nodes: Sequence[Node], read: Callable[[int], Picture], given: Orientati
         coarse.match_z, max(coarse.transposed_z, coarse.opposed_z)
     ):
         axes = coarse
-    return _oriented(replace(blank, seen=True, match_z=max(axes.match_z, coarse.match_z)), fine, axes, given, numbers)
+    known = replace(blank, seen=True, unseen=None, match_z=max(axes.match_z, coarse.match_z))
+    return _oriented(known, fine, axes, given, numbers)
 
 
 def _nothing_seen(
-    count: int, orientation: Orientation, same: list[tuple[int, int]], light: NDArray[np.float64], contrast: float
+    views: Views, orientation: Orientation, same: list[tuple[int, int]], means: NDArray[np.float64]
 ) -> Look:
     """Return what is known of pictures that show nothing in common."""
+    count, mean = len(means), float(np.median(means))
     return Look(
         seen=False,
+        unseen="dark",
         match_z=0.0,
         orientation=orientation,
         axes_z=0.0,
@@ -146,12 +171,16 @@ def _nothing_seen(
         ratio_sigma=0.0,
         copies=same,
         odd=[],
-        light=light,
+        light=means / (mean or 1.0),
         turn_rad=np.zeros(count),
         scale=np.ones(count),
         shift_px=np.zeros((count, 2)),
-        contrast=contrast,
+        contrast=views.contrast,
+        noise=views.noise,
+        mean=mean,
+        still=False,
         level=0.0,
+        order=Order("open", 1.0),
     )
 
 
@@ -169,7 +198,7 @@ def _oriented(known: Look, fine: FineMatch, axes: Axes, given: Orientation | Non
     side = seen.side()
     contradicted = False
     if given is None:
-        orientation, direction, undecided = _direction(found, opposed, side, seen.raw_px)
+        orientation, direction, undecided = _direction(found, opposed, side, seen.bare_px())
         if orientation != found:
             seen = measure(fine, orientation, axes.ratio)
             side = replace(side, z=-side.z)
@@ -179,6 +208,12 @@ def _oriented(known: Look, fine: FineMatch, axes: Axes, given: Orientation | Non
         contradicted |= axes.transposed_z > SURE and axes.transposed != given.transpose
         contradicted |= axes.opposed_z > SURE and axes.opposed != (given.flip_rows != given.flip_columns)
     fits = compare_neighbours(seen.pictures, seen.raw_px, seen.ratio[0])
+    coarse_px = fine.views.fine_scale / fine.views.coarse_scale
+    fitting = {
+        number: fine.views.coarse[number]
+        for number, node in zip(numbers, seen.order, strict=True)
+        if node not in fits.odd
+    }
     return _with_fits(
         replace(
             known,
@@ -189,10 +224,12 @@ def _oriented(known: Look, fine: FineMatch, axes: Axes, given: Orientation | Non
             side_z=side.z,
             edges=side.edges,
             level=axes.level,
-            aligned=_aligned(seen.raw_px[1] * fine.views.fine_scale),
+            aligned=_aligned(seen.bare_px()[1]),
             disparity_px=seen.range_px(),
+            still=max(map(abs, seen.bare_px())) <= NO_SIGN_PX,
             ratio=seen.ratio[0],
             ratio_sigma=seen.ratio[1],
+            order=check_order(fitting, axes, fine.largest_px * coarse_px),
         ),
         fits,
         seen.order,
@@ -206,17 +243,20 @@ def _aligned(largest_px: float) -> bool | None:
 
 
 def _direction(
-    found: Orientation, opposed: bool, side: NearAndFar, raw_px: tuple[float, float]
+    found: Orientation, opposed: bool, side: NearAndFar, range_px: tuple[float, float]
 ) -> tuple[Orientation, Told, bool]:
-    """Return the orientation, what tells it from its opposite, and whether two are equally likely."""
+    """Return the orientation, what tells it from its opposite, and whether two are equally likely.
+
+    The range of disparities is in px of the files, without a margin.
+    """
     if abs(side.z) >= SURE_SIDE:
         return (found if side.z > 0 else found.turned()), "pictures", False
-    if raw_px[1] < -NO_SIGN_PX and side.z > -_DOUBT:
+    if range_px[1] < -NO_SIGN_PX and side.z > -_DOUBT:
         return found, "signs", False
-    if raw_px[0] > NO_SIGN_PX and opposed and side.z < _DOUBT:
+    if range_px[0] > NO_SIGN_PX and opposed and side.z < _DOUBT:
         return found.turned(), "signs", False
     # All points move with the camera: the order is reversed, or aligned on the nearest point; the names state neither
-    one_sign = raw_px[0] > NO_SIGN_PX or raw_px[1] < -NO_SIGN_PX
+    one_sign = range_px[0] > NO_SIGN_PX or range_px[1] < -NO_SIGN_PX
     return found, "names", opposed or one_sign
 
 

@@ -67,14 +67,14 @@ def correlate(
     """
     others = {node: np.ascontiguousarray(it[::-1, ::-1]) for node, it in pictures.items()} if turned else pictures
     shape = next(iter(pictures.values())).shape
-    blocks = (max(shape[0] // block_px, 1), max(shape[1] // block_px, 1))
+    blocks = _blocks(shape, block_px)
     along: dict[tuple[int, int], list[Table]] = {}
     for number in (0, 1):
         for axis in (0, 1):
             rows = []
             for node in nodes:
                 sides = [
-                    _table(pictures[node], others[other], sign * distance * shifts_px, axis, blocks, block_px)
+                    block_table(pictures[node], others[other], sign * distance * shifts_px, axis, block_px)
                     for sign in (1, -1)
                     if (other := neighbour(node, number, sign * distance)) in pictures
                 ]
@@ -114,10 +114,14 @@ def block_means(picture: Picture, blocks: tuple[int, int], block_px: int) -> NDA
     ).ravel()
 
 
-def _table(
-    view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int, blocks: tuple[int, int], block_px: int
-) -> Table:
+def _blocks(shape: tuple[int, ...], block_px: int) -> tuple[int, int]:
+    """Return how many blocks a picture has, down and across."""
+    return max(shape[0] // block_px, 1), max(shape[1] // block_px, 1)
+
+
+def block_table(view: Picture, other: Picture, shifts_px: NDArray[np.floating], axis: int, block_px: int) -> Table:
     """Return the correlation (block, shift) of a view with another, displaced along an axis."""
+    blocks = _blocks(view.shape, block_px)
     power = block_means(view * view, blocks, block_px)
     columns = []
     for shift_px in shifts_px:

@@ -23,6 +23,9 @@ _SMOOTHING_PX, _SHADES_PX = 0.8, 8.0
 # σ in px of the smoothing before contrast is measured: it takes off noise, and leaves what scenes have.
 _NOISE_PX = 2.0
 
+# Standard deviation of normal noise over the median of its absolute values.
+_SIGMA_OF_MEDIAN = 1.4826
+
 
 @dataclass(frozen=True)
 class Views:
@@ -40,6 +43,8 @@ class Views:
         Mean of each picture in units of its file.
     contrast : float
         Median over the views of the standard deviation within a picture, smoothed, in units of the files.
+    noise : float
+        Median over the views of the standard deviation of what the smoothing took off, beside edges.
     """
 
     fine: dict[Node, Picture]
@@ -49,6 +54,7 @@ class Views:
     coarse_scale: float
     mean: dict[Node, float]
     contrast: float
+    noise: float
 
     @property
     def nodes(self) -> list[Node]:
@@ -66,12 +72,14 @@ def prepare(nodes: Sequence[Node], read: Callable[[int], Picture]) -> Views:
     read : callable
         Returns the grey picture (row, column) of a view by its place in `nodes`; all have one size.
     """
-    fine, coarse, light, means, contrasts = {}, {}, {}, {}, []
+    fine, coarse, light, means, contrasts, noises = {}, {}, {}, {}, [], []
     scales = (1.0, 1.0)
     for index, node in enumerate(nodes):
         picture = np.asarray(read(index), np.float32)
         means[node] = float(picture.mean())
-        contrasts.append(float(cv2.GaussianBlur(picture, (0, 0), _NOISE_PX).std()))
+        smooth = cv2.GaussianBlur(picture, (0, 0), _NOISE_PX)
+        contrasts.append(float(smooth.std()))
+        noises.append(_SIGMA_OF_MEDIAN * float(np.median(np.abs(picture - smooth))))
         small = _shrunk(picture, _FINE_PX)
         tiny = _shrunk(small, _COARSE_PX)
         scales = picture.shape[1] / small.shape[1], picture.shape[1] / tiny.shape[1]
@@ -79,7 +87,7 @@ def prepare(nodes: Sequence[Node], read: Callable[[int], Picture]) -> Views:
         light[node] = small / np.float32(means[node] or 1.0)
     texture = float(np.median([(it - cv2.GaussianBlur(it, (0, 0), _SHADES_PX)).std() for it in light.values()])) or 1.0
     light = {node: it / np.float32(texture) for node, it in light.items()}
-    return Views(fine, coarse, light, *scales, means, float(np.median(contrasts)))
+    return Views(fine, coarse, light, *scales, means, float(np.median(contrasts)), float(np.median(noises)))
 
 
 def copies(views: Views) -> list[tuple[Node, Node]]:

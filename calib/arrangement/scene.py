@@ -155,10 +155,14 @@ class Measured:
         nodes = fine.between(self.order, _EDGE_VIEWS)
         return find_far_side(light, nodes, shifts_px, distance=fine.distance, ratio=self.ratio[0])
 
+    def bare_px(self) -> tuple[float, float]:
+        """Return the range of disparities in px of the files."""
+        scale = self.fine.views.fine_scale
+        return self.raw_px[0] * scale, self.raw_px[1] * scale
+
     def range_px(self) -> tuple[float, float]:
         """Return the range of disparities in px of the files, with a margin."""
-        scale = self.fine.views.fine_scale
-        least, largest = self.raw_px[0] * scale, self.raw_px[1] * scale
+        least, largest = self.bare_px()
         margin = _MARGIN_SHARE * (largest - least) + _MARGIN_PX
         return least - margin, largest + margin
 
@@ -168,7 +172,7 @@ def measure(fine: FineMatch, orientation: Orientation, rough_ratio: float) -> Me
     order = orientation.of(fine.views.nodes)
     pictures = dict(zip(order, fine.views.fine.values(), strict=True))
     tables, chance = (_oriented_tables(it, orientation) for it in (fine.tables, fine.chance))
-    ratio = _ratio(tables, chance, rough_ratio)
+    ratio = pitch_ratio(tables, chance, rough_ratio, NO_SIGN_PX / fine.views.fine_scale)
     table, by_chance = (combined(it, transposed=False, opposed=False, ratio=ratio[0]) for it in (tables, chance))
     if (1, 0) not in tables.along:  # a single column: disparities are those along y
         table, by_chance = tables.along[0, 1], chance.along[0, 1]
@@ -190,13 +194,16 @@ def _oriented_tables(tables: Tables, orientation: Orientation) -> Tables:
     return Tables(tables.shifts_px, along, tables.blocks)
 
 
-def _ratio(tables: Tables, chance: Tables, rough: float) -> tuple[float, float]:
-    """Return disparities along x over those along y, and its standard error; (1, 0) if the pictures do not tell."""
+def pitch_ratio(tables: Tables, chance: Tables, rough: float, no_sign_px: float) -> tuple[float, float]:
+    """Return disparities along x over those along y, and its standard error; (1, 0) if the pictures do not tell.
+
+    Disparities within `no_sign_px` are not told from zero.
+    """
     if len(tables.numbers) < 2:
         return 1.0, 0.0
     x_px, y_px = (block_disparities(tables.along[key], chance.along[key], tables.shifts_px) for key in ((1, 0), (0, 1)))
     with np.errstate(invalid="ignore"):
-        sure = np.abs(x_px - rough * y_px) < _AGREE * (np.abs(x_px) + NO_SIGN_PX)
+        sure = np.abs(x_px - rough * y_px) < _AGREE * (np.abs(x_px) + no_sign_px)
         sure &= np.abs(y_px) > 0.5 * np.nanmax(np.abs(y_px), initial=0.0)
     ratios = x_px[sure] / y_px[sure]
     if len(ratios) < MIN_BLOCKS:

@@ -201,7 +201,7 @@ REFUSED: dict[str, tuple[str, Variant]] = {
         Variant(square=True, change=lambda views: dict.fromkeys(views, views[3, 3])),
     ),
     "one picture twice": ("CopiedPicture", Variant(change=lambda views: {**views, (1, 1): views[3, 3]})),
-    "shuffled": ("AmbiguousOrder", Variant(change=_shuffled, aligned_px=MIDDLE_PX)),
+    "shuffled": ("ShuffledPictures", Variant(change=_shuffled, aligned_px=MIDDLE_PX)),
     "running numbers, no square": ("BadValue", Variant(Names(running(COLUMNS)))),
     "running numbers with a gap": ("BadValue", Variant(Names(running(7)), square=True, change=_without((3, 3)))),
     "sizes of other pictures": (

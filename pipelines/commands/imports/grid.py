@@ -10,7 +10,8 @@ from faintfield.calib.arrangement.orientation import Orientation
 from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positive
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.exchange.arranged_grid import arranged, grey_picture, show_arrangement
+from faintfield.pipelines.formats.exchange.arranged_grid import arranged, grey_picture
+from faintfield.pipelines.formats.exchange.arrangement_words import show_arrangement
 from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
 from faintfield.pipelines.formats.exchange.imported_noise import StatedNoise
 from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
@@ -181,7 +182,7 @@ def _gauge(
     if (pitch_mm is None) != (fx_px is None) or (pitch_mm is not None and aligned):
         inform(
             "depths are stated as disparities in px: mm need --pitch-mm and --fx-px"
-            + (", and --disparity-px as the pictures are aligned on a plane in the scene" if aligned else "")
+            + (", and --disparity-px as the pictures are aligned on a plane" if aligned else "")
         )
     if pitch_mm is not None and fx_px is not None and (disparity_px or not arrangement.aligned):
         return _Gauge(pitch_mm, focal_px, disparity_px, measured=True)

@@ -9,7 +9,11 @@ from numpy.typing import NDArray
 
 from faintfield.calib.arrangement.look import Look, look
 from faintfield.calib.arrangement.orientation import Orientation
+from faintfield.pipelines.errors import AmbiguousOrder
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
+
+# Share of other pictures that neighbours fit better than, from which no line of views is tried in place of a square.
+_SURELY = 0.95
 
 # Correlation by which the blocks must agree better in another order of a list.
 _CLEARLY_MORE = 0.05
@@ -26,6 +30,8 @@ def look_at_grid(grid: ImageGrid, given: Orientation | None, read: Grey) -> tupl
     found = _look(grid, given, read)
     if given is not None or grid.measured is not None or min(grid.size) == 1:
         return grid, found
+    if grid.guessed and not (found.seen and found.order.verdict == "fits" and found.order.share > _SURELY):
+        grid, found = _square_or_line(grid, found, given, read)
     rows, columns = grid.size
     if grid.ordered and rows != columns:
         other = replace(grid, paths={(k % rows, k // rows): path for k, path in enumerate(grid.paths.values())})
@@ -33,12 +39,42 @@ def look_at_grid(grid: ImageGrid, given: Orientation | None, read: Grey) -> tupl
         # The order as documented unless the other agrees clearly more
         if seen.seen and seen.level > found.level + _CLEARLY_MORE:
             grid, found = other, seen
-    if found.seen and _shifts_px(found) > _DOUBTFUL_PX:
+    if min(grid.size) > 1 and found.seen and _shifts_px(found) > _DOUBTFUL_PX:
         for other in _back_and_forth(grid):
             seen = _look(other, given, read)
             fits = seen.seen and len(seen.odd) <= len(found.odd) and seen.level >= found.level
             if fits and _shifts_px(seen) < _CLEARLY_LESS * _shifts_px(found):
                 grid, found = other, seen
+    return grid, found
+
+
+def _square_or_line(grid: ImageGrid, found: Look, given: Orientation | None, read: Grey) -> tuple[ImageGrid, Look]:
+    """Return the grid as the square that was guessed, or as one line of views, in whichever the neighbours fit.
+
+    Raises
+    ------
+    AmbiguousOrder
+        They fit in both.
+    """
+    rows, columns = grid.size
+    count = rows * columns
+    line = replace(
+        grid,
+        paths={(0, place): path for place, path in enumerate(grid.paths.values())},
+        said=[*grid.said, f"the pictures show one line of {count} views, not {rows} x {columns}"],
+    )
+    seen = _look(line, given, read)
+    if not seen.seen or seen.order.verdict != "fits":
+        return grid, found
+    if not found.seen or found.order.verdict == "denied":
+        return line, seen
+    if found.order.verdict == "fits" and found.order.share < seen.order.share:
+        raise AmbiguousOrder(
+            f"{next(iter(grid.paths.values())).parent}: the views may be a grid of {rows} x {columns}, whose "
+            f"neighbours fit better than {found.order.share:.0%} of other pictures, or one line of {count}, whose "
+            f"neighbours fit better than {seen.order.share:.0%}; give --rows {rows} --columns {columns}, "
+            f"--rows 1 --columns {count}, or --rows {count} --columns 1"
+        )
     return grid, found
 
 

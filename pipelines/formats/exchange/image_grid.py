@@ -37,12 +37,15 @@ class ImageGrid:
         What a person should know of how the pictures were found: files left out, sizes guessed.
     ordered : bool
         Names tell no more than an order, which may run by row or by column, and back and forth.
+    guessed : bool
+        That the grid is a square follows from the number of pictures only.
     """
 
     paths: dict[Node, Path]
     measured: dict[Node, Steps] | None = None
     said: list[str] = field(default_factory=list)
     ordered: bool = False
+    guessed: bool = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -173,7 +176,9 @@ def find_grid(
     measured = _measured(folder, named, dict(zip(nodes, places, strict=True)))
     if measured:
         said = [*said, f"names state positions ({names[0]}): the cameras are placed by them"]
-    return replace(grid, measured=measured, said=[*said, how] if how else said, ordered=_by_index(places))
+    by_index = _by_index(places)
+    said = [*said, how] if how else said
+    return replace(grid, measured=measured, said=said, ordered=by_index, guessed=by_index and running is None)
 
 
 def _by_index(places: list[Place]) -> bool:

@@ -95,14 +95,20 @@ def found_views(
 def _of_one_file(src: Path, folder: Path, rows: int | None, columns: int | None) -> FoundViews:
     """Return the views in one file, unpacked into a folder."""
     suffix = src.suffix.lower()
-    if suffix not in IMAGE_SUFFIXES or suffix in RAW_SUFFIXES:
+    if suffix not in IMAGE_SUFFIXES:
+        raise BadValue(
+            f"{src}: files of {suffix or 'no kind'} are not read (read are {', '.join(sorted(IMAGE_SUFFIXES))}); "
+            "convert it to PNG or TIFF, a picture for each view"
+        )
+    if suffix in RAW_SUFFIXES:
         raise BadValue(
             f"{src}: is no file that views are unpacked from; name a folder of pictures, a TIFF with a picture for "
             "each view, or a picture that holds them in rows and columns"
         )
     count, said = pages_in(src), []
     side = math.isqrt(count)
-    if count > 1 and rows is None and columns is None and side**2 == count:
+    guessed = count > 1 and rows is None and columns is None and side**2 == count
+    if guessed:
         rows, columns = side, side
         said.append(f"{src.name} holds {count} pictures; they are taken as {side} x {side}, row by row")
     if rows is None and columns is None:
@@ -124,7 +130,8 @@ def _of_one_file(src: Path, folder: Path, rows: int | None, columns: int | None)
 
     paths, factor = _unpacked(pages if count > 1 else tiles, rows * columns, folder)
     said += [_scaled(factor)] if factor is not None else []
-    return FoundViews(ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True))), [src], factor, said)
+    grid = ImageGrid(dict(zip(grid_nodes(rows, columns), paths, strict=True)), guessed=guessed)
+    return FoundViews(grid, [src], factor, said)
 
 
 def _tiles(src: Path, rows: int, columns: int) -> list[NDArray[Any]]:
