@@ -129,7 +129,7 @@ def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> Depth
     return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
 
 
-def _ends_at_infinity(depths_mm: NDArray[np.float64]) -> bool:
+def _ends_at_infinity(depths_mm: NDArray[np.floating]) -> bool:
     """Return whether the last depth is less than half a step of 1/depth before infinity: nothing lies beyond."""
     before, last = 1 / depths_mm[-2:]
     return bool(last < 0.5 * (before - last))
