@@ -131,22 +131,23 @@ def test_of_sets_that_mean_nothing_no_more_are_accepted_than_is_stated(kind: str
     loaded = load_set(scene)
     range_mm = searched_range_mm(loaded)
     views = binned_views(loaded, range_mm[0], tmp_path, min_bins_px=8)
+    height, width = views.colours[0][1].electrons.shape[1:]
     (layout, images), random, accepted = views.colours[0], np.random.default_rng(3), 0
     for _ in range(100):
         electrons = images.electrons[random.permutation(NODES**2)]
         if kind == "noise":
-            electrons = random.poisson(200, images.electrons.shape)
+            electrons = random.poisson(200, images.electrons.shape).astype(np.float32)
         if kind == "other scenes":
-            electrons = 200 * 64 * np.stack([_small_scene(random, images.electrons.shape[1:]) for _ in electrons])
+            electrons = 200 * 64 * np.stack([_small_scene(random, (width, height)) for _ in electrons])
         meaningless = replace(images, electrons=electrons.astype(np.float32))
         with contextlib.suppress(NothingInFocus):
             accepted += check_places(BinnedViews(loaded, [(layout, meaningless)], views.bins_px), range_mm) is not None
     assert accepted <= 2  # 0.2 are expected; more than two in one of 900 such tests
 
 
-def _small_scene(random: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.floating]:
+def _small_scene(random: np.random.Generator, size_px: tuple[int, int]) -> NDArray[np.floating]:
     """Return a picture of an own wall and cards."""
-    return light_field(CARDS, (1, 1), shape[::-1], seed=int(random.integers(2**40)))[0, 0]
+    return light_field(CARDS, (1, 1), size_px, seed=int(random.integers(2**40)))[0, 0]
 
 
 def test_shuffles_are_different_and_all_there_are_of_few_views() -> None:
