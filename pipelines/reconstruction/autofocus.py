@@ -136,7 +136,7 @@ def _narrowed(
 
     Returns all ranges, the last comparison, and the significance of the first.
     """
-    views = _binned(loaded, range_mm, out)
+    views = views_of_search(loaded, range_mm, out)
     significance = check_places(views, range_mm)
     ranges = [range_mm]
     while True:
@@ -153,7 +153,7 @@ def _narrowed(
         if _moved_px(loaded, narrower) < _LEAST_MOVED_PX:
             return ranges, compared, found, significance
         ranges.append(narrower)
-        views = _binned(loaded, ranges[-1], out)
+        views = views_of_search(loaded, ranges[-1], out)
 
 
 def _searched_depths(range_mm: tuple[float, float]) -> list[float]:
@@ -162,8 +162,8 @@ def _searched_depths(range_mm: tuple[float, float]) -> list[float]:
     return depths
 
 
-def _binned(loaded: ElementalSet, range_mm: tuple[float, float], out: Path) -> BinnedViews:
-    """Return the views in bins of pixels that suit the steps of a search."""
+def views_of_search(loaded: ElementalSet, range_mm: tuple[float, float], out: Path) -> BinnedViews:
+    """Return the views in bins of pixels that suit the steps of a search; `out` is for a temporary file."""
     step_px = _moved_px(loaded, range_mm) / (_DEPTHS - 1)
     least_px = int(np.ceil(step_px / _MAX_BINS_PER_STEP))
     with working("reading views"):
@@ -181,7 +181,7 @@ def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:
 
     This is the range of disparities that an import found, with a margin, if the set states it. Otherwise it follows
     from the poses. At the near end the views share a quarter of the reference view, on average. At the far end they
-    no longer do (cameras that look inwards), or else it is one step of the search before infinity.
+    no longer do (cameras that look inwards), or else it is infinity.
     """
     baseline_mm = float(np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max())
     if baseline_mm <= 0:
@@ -200,7 +200,8 @@ def searched_range_mm(loaded: ElementalSet) -> tuple[float, float]:
     overlapping = shared >= _MIN_OVERLAP
     first = best - int(np.argmin(np.append(overlapping[best::-1], False))) + 1
     last = best + int(np.argmin(np.append(overlapping[best:], False))) - 1
-    return float(depths[first]), float(min(depths[last], _DEPTHS * depths[first]))
+    endless = last == len(depths) - 1
+    return float(depths[first]), float(_INFINITY * depths[first] if endless else depths[last])
 
 
 def _range_of_disparities(loaded: ElementalSet, least_px: float, largest_px: float) -> tuple[float, float]:

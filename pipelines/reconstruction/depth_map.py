@@ -66,6 +66,24 @@ def check_sweep(loaded: ElementalSet, depths_mm: Sequence[float]) -> None:
     check_overlap(loaded, (min(depths_mm), max(depths_mm)))
 
 
+def check_light(loaded: ElementalSet, depths_mm: Sequence[float], out: Path) -> None:
+    """Refuse views that agree no better than shuffled ones in a sweep (NothingInFocus).
+
+    `out` is for a temporary file if memory is short.
+    """
+    from faintfield.pipelines.reconstruction.surface_depths import check_agreement
+
+    check_agreement(loaded, (min(depths_mm), max(depths_mm)), out)
+
+
+def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Origin]) -> DepthMapRecord | None:
+    """Return the record of the maps if each method's folder has those of its provenance."""
+    kept = [
+        read_current(folder / DEPTH_MAP_FILE, DepthMapFileRecord, origins[method]) for method, folder in folders.items()
+    ]
+    return kept[0].depth_map if kept and kept[0] is not None and all(kept) else None
+
+
 def write_depth_map(
     loaded: ElementalSet,
     planes: Mapping[tuple[Method, float], Path],
@@ -93,11 +111,9 @@ def write_depth_map(
         The range of the sweep is too wide, or views, poses and range do not fit together.
     """
     folders = {method: path.parent for (method, _), path in planes.items()}
-    kept = [
-        read_current(folder / DEPTH_MAP_FILE, DepthMapFileRecord, origins[method]) for method, folder in folders.items()
-    ]
-    if kept and kept[0] is not None and all(kept):
-        return kept[0].depth_map
+    kept = kept_depth_map(folders, origins)
+    if kept is not None:
+        return kept
     depths = sorted({depth for _, depth in planes})
     found = _map_of(loaded, depths, disparities_px)
     for method, folder in folders.items():

@@ -36,7 +36,7 @@ from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess
 from faintfield.pipelines.reconstruction.channels import channel_layouts
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
-from faintfield.pipelines.reconstruction.depth_map import check_sweep, write_depth_map
+from faintfield.pipelines.reconstruction.depth_map import check_light, check_sweep, kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
 from faintfield.pipelines.reconstruction.overview import look_at, write_overview
 from faintfield.pipelines.reconstruction.request import Request, distinct_depths, folder_of_method
@@ -84,6 +84,8 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     sweep = _sweep(loaded, folders, request)
     glance = look_at(loaded)  # here, as what is wrong with a set is to be found before its planes are made
     read_truth(loaded.folder)
+    if request.with_depth_map and kept_depth_map(folders, sweep.origins) is None:
+        check_light(loaded, depths, out)
     _make_planes(sweep, folders, out, runner)
     write_overview(glance, out)
     depth_map = None

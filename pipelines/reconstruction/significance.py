@@ -1,6 +1,8 @@
-"""Whether what `auto` finds could be chance: views are shuffled between their places and compared again."""
+"""Whether depths that are found could be chance: views are shuffled between their places and compared again."""
 
 from dataclasses import dataclass
+from itertools import permutations
+from math import factorial
 
 import cv2
 import numpy as np
@@ -14,20 +16,28 @@ from faintfield.recon.depth.significance import Significance, disagreement, sign
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.likelihood.images import binned
 
-# Shuffles, and the largest p-value of what is kept: chance is taken for depth in one set of a hundred.
-_SHUFFLES, MAX_P_VALUE = 99, 0.01
+# Most shuffles of a test.
+_SHUFFLES = 499
 
-# Fewest views that are tested: fewer have not many more orders than there are shuffles.
+# Largest p-value that is kept, by the fewest views: chance is taken for depth in one set of 500. Few views have few
+# orders; of three or four, only those are refused that agree as well or better in every other order, as copies do.
+_LARGEST_P = {7: 0.002, 5: 0.01, 3: 0.99}
+
+# Fewest views whose p-value means something, and is returned.
 _FEWEST_VIEWS = 5
 
 # Depths of each comparison, and the most samples and views, evenly chosen: for speed and memory.
 _DEPTHS, _MAX_SAMPLES, _MAX_VIEWS = 20, 1000, 49
 
+# Least share of the pixels of a view that have a number, or it is left out.
+_MIN_KNOWN = 0.5
+
 # Fewest bins along a side of a view.
 _MIN_BINS = 8
 
-# Another arrangement of the views is right if it agrees better than shuffled views by this many times as much.
-_CLEARLY = 1.2
+# Another arrangement of the views is right if it agrees better than shuffled views by this many times as much, and with
+# at most this p-value, or that which is kept.
+_CLEARLY, _MAX_P_REARRANGED = 1.2, 0.01
 
 # Seed of the shuffles: the same set gives the same result.
 _SEED = 20
@@ -64,49 +74,58 @@ def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significa
     NothingInFocus
         Shuffled views agree as well, or views in reversed or exchanged rows and columns agree better.
     """
-    if len(views.loaded.settings.view) < _FEWEST_VIEWS:
+    chosen = _compared(views)
+    count = len(chosen)
+    if count < _FEWEST_VIEWS:
         inform(
-            f"{len(views.loaded.settings.view)} views are too few to test by shuffles whether they agree by chance; "
-            f"{_FEWEST_VIEWS} are needed"
+            f"{count} views are too few to test by shuffles whether they agree by chance; {_FEWEST_VIEWS} are needed"
         )
+    if count < min(_LARGEST_P):
         return None
     depths_mm = (1 / np.linspace(1 / range_mm[0], 1 / range_mm[1], _DEPTHS)).tolist()
     with working("preparing the comparison of shuffled views"):
-        shown = _from_all_places(views, depths_mm)
-    count = len(shown.nodes)
+        shown = _from_all_places(views, chosen, depths_mm)
     stated = shown.tried(np.arange(count))
-    shuffles = _shuffles(count)
-    shuffled = [shown.tried(places) for places in progress(shuffles, "comparing shuffled views")]
+    shuffled = [shown.tried(places) for places in progress(_shuffles(count), "comparing shuffled views")]
     found = significance(stated, shuffled)
-    _refuse_rearranged(views.loaded, shown, stated, shuffled)
-    if found.p_value > MAX_P_VALUE:
+    largest = next(p_value for fewest, p_value in _LARGEST_P.items() if count >= fewest)
+    _refuse_rearranged(views.loaded, shown, stated, shuffled, min(largest, _MAX_P_REARRANGED))
+    if found.p_value > largest:
         raise NothingInFocus(
             f"{views.loaded.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
-            f"{found.shuffles} shuffles, at most {MAX_P_VALUE:g} is needed): nothing moves between them as their "
-            "places say; correct order and places of the pictures, use more light, or give the depths by --depth"
+            f"{found.shuffles} shuffles, at most {largest:g} is needed): nothing moves between them as their places "
+            "say; correct order and places of the pictures, use more light, or make planes at depths given by --depth"
         )
-    return found
+    return found if count >= _FEWEST_VIEWS else None
 
 
 def _shuffles(count: int) -> list[NDArray[np.intp]]:
-    """Return shuffles of places, none of which keeps all or turns them round, which only exchanges near and far."""
-    random, places = np.random.default_rng(_SEED), np.arange(count)
-    found: list[NDArray[np.intp]] = []
+    """Return different shuffles of places, all of them if there are few.
+
+    None keeps all or turns them round, which only exchanges near and far. A shuffle that came twice would count as two,
+    and p of a few views would be too small.
+    """
+    left_out = {tuple(range(count)), tuple(range(count))[::-1]}
+    if factorial(count) - len(left_out) <= _SHUFFLES:
+        return [np.array(places) for places in permutations(range(count)) if places not in left_out]
+    random, found = np.random.default_rng(_SEED), dict[tuple[int, ...], None]()
     while len(found) < _SHUFFLES:
-        shuffled = random.permutation(count)
-        if not (np.array_equal(shuffled, places) or np.array_equal(shuffled, places[::-1])):
-            found.append(shuffled)
-    return found
+        shuffled = tuple(random.permutation(count).tolist())
+        if shuffled not in left_out:
+            found[shuffled] = None
+    return [np.array(places) for places in found]
 
 
-def _refuse_rearranged(loaded: ElementalSet, shown: _Views, stated: float, shuffled: list[float]) -> None:
+def _refuse_rearranged(
+    loaded: ElementalSet, shown: _Views, stated: float, shuffled: list[float], largest_p: float
+) -> None:
     """Refuse views that agree clearly better with their rows or columns reversed, or exchanged (NothingInFocus)."""
     chance = float(np.mean(shuffled))
     tried = [(shown.tried(places), remedy) for remedy, places in _arrangements(shown.nodes)]
     if not tried:
         return
     best, remedy = min(tried)
-    if significance(best, shuffled).p_value <= MAX_P_VALUE and chance - best > _CLEARLY * (chance - stated):
+    if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - stated):
         raise NothingInFocus(
             f"{loaded.folder}: the views agree better with {remedy}: by {chance - best:.3g} in squared deviations, "
             f"and by {chance - stated:.3g} as stated; import the pictures again so"
@@ -136,10 +155,19 @@ def _arrangements(nodes: list[tuple[int, int] | None]) -> list[tuple[str, NDArra
     return [(remedy, np.array([at[node] for node in moved])) for remedy, moved in tried if set(moved) == set(at)]
 
 
-def _from_all_places(views: BinnedViews, depths_mm: list[float]) -> _Views:
+def _compared(views: BinnedViews) -> list[int]:
+    """Return the views that are compared: evenly chosen, without those that are largely saturated or masked."""
+    layout, images = views.colours[0]
+    chosen = _evenly(views.loaded)
+    if images.valid is None:
+        return chosen
+    known = images.valid.reshape(-1, len(layout.lattices), images.valid[0].size).mean(axis=(1, 2))
+    return [view for view in chosen if known[view] >= _MIN_KNOWN]
+
+
+def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[float]) -> _Views:
     """Return what some views show of the planes, in one colour, if taken from each of their places."""
     loaded, (layout, images) = views.loaded, views.colours[0]
-    chosen = _evenly(loaded)
     shape, bins = images.electrons.shape[1:], 1
     while (shape[0] // bins) * (shape[1] // bins) > _MAX_SAMPLES and min(shape) // (2 * bins) >= _MIN_BINS:
         bins *= 2
@@ -177,7 +205,9 @@ def _places_px(
         ]
         for view in chosen
     ]
-    return ((np.array(seen) + 0.5) / bins_px - 0.5).astype(np.float32)
+    places = (np.array(seen) + 0.5) / bins_px - 0.5
+    # Outside is outside, also behind a camera
+    return np.clip(np.nan_to_num(places, nan=-1.0), -1.0, shape[::-1]).astype(np.float32)
 
 
 def _evenly(loaded: ElementalSet) -> list[int]:

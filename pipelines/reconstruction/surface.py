@@ -101,7 +101,8 @@ def reconstruct_surface(
     GeometryMismatch
         The views share too little at the depths of a given range, or the range is too wide.
     NothingInFocus
-        All views were taken from one place; or no range of depths is given, and none is found.
+        All views were taken from one place; they agree no better than shuffled ones; or no range of depths is given,
+        and none is found.
     """
     started = time.monotonic()
     _check(loaded, out)
@@ -118,7 +119,7 @@ def reconstruct_surface(
     find_range = request.depth_range_mm is None and imported_range_px(loaded) is None
     remove_leftovers(out)
     bins = default_bins(loaded)
-    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=find_range)
+    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=find_range, out=out)
     far, near = float(depths[0]), float(depths[-1])
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
     with naming_range(loaded, far, near):

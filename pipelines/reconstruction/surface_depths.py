@@ -6,6 +6,7 @@ The maps of `--surface` and of `--depth-map` both come from here.
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.autofocus import overlap, searched_range_mm
+from faintfield.pipelines.reconstruction.autofocus import overlap, searched_range_mm, views_of_search
 from faintfield.pipelines.reconstruction.comparison import BETWEEN_PIXELS
 from faintfield.pipelines.reconstruction.luminance import luminance
+from faintfield.pipelines.reconstruction.significance import check_places
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.errors import GeometryMismatch, NothingInFocus
 from faintfield.recon.surface.estimate import SurfaceEstimate, estimate_surface
@@ -87,6 +89,14 @@ def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, flo
     return request.depth_range_mm
 
 
+def check_agreement(loaded: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:
+    """Refuse views that agree no better than shuffled ones in a range of depths (NothingInFocus).
+
+    `out` is for a temporary file if memory is short.
+    """
+    check_places(views_of_search(loaded, range_mm, out), range_mm)
+
+
 def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
     """Refuse a range of depths, nearest and farthest, at which the views share too little (GeometryMismatch)."""
     near_mm, far_mm = range_mm
@@ -102,7 +112,12 @@ def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
 
 
 def depths_of_set(
-    loaded: ElementalSet, bins: int, range_mm: tuple[float, float], *, find_range: bool
+    loaded: ElementalSet,
+    bins: int,
+    range_mm: tuple[float, float],
+    *,
+    find_range: bool,
+    out: Path | None = None,
 ) -> tuple[NDArray[np.float64], SurfaceEstimate]:
     """Return the 1/depths that are compared, ascending, and the depth of each sample of the bins by them.
 
@@ -118,13 +133,15 @@ def depths_of_set(
         Nearest and farthest depth.
     find_range : bool
         Search this range for that of the scene first.
+    out : Path, optional
+        Test in this folder whether the views agree better than shuffled ones; by default `check_agreement` did so.
 
     Raises
     ------
     GeometryMismatch
         The range is too wide, or views, poses and range do not fit together.
     NothingInFocus
-        Nothing is found in the range.
+        Nothing is found in the range, or the views agree no better than shuffled ones.
     """
     nodes, views = nodes_of(loaded), between_pixels(luminance(loaded, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
@@ -134,6 +151,9 @@ def depths_of_set(
                 far, near = found_range(views, nodes, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
+    if out is not None:
+        check_agreement(loaded, range_mm, out)
+    with naming_range(loaded, far, near):
         inform(f"surface {_between(loaded, far, near)}: comparing {len(depths)} depths")
         with working("finding the depths of the surface"):
             return depths, estimate_surface(views, depths, nodes)

@@ -124,9 +124,15 @@ def depth_map(planes: list[Agreement], depths_mm: NDArray[np.floating]) -> Depth
     step = np.abs(np.gradient(depths_mm))[best]
     near = np.abs(depths_mm[:, np.newaxis, np.newaxis] - chosen) <= np.maximum(1.01 * step, 0.02 * chosen)
     confidence = np.where(near, posterior, 0).sum(axis=0)
-    within = (best > 0) & (best < len(planes) - 1)  # the most likely depth may lie beyond the sweep
+    within = (best > 0) & ((best < len(planes) - 1) | _ends_at_infinity(depths_mm))  # else it may lie beyond the sweep
     confidence[~(within & comparable & _lit(planes, best))] = 0
     return DepthEstimate(_refined(evidence, best).astype(np.float32), confidence.astype(np.float32))
+
+
+def _ends_at_infinity(depths_mm: NDArray[np.floating]) -> bool:
+    """Return whether the last depth is less than half a step of 1/depth before infinity: nothing lies beyond."""
+    before, last = 1 / depths_mm[-2:]
+    return bool(last < 0.5 * (before - last))
 
 
 def _evidence(planes: list[Agreement]) -> tuple[Image, NDArray[np.bool_]]:

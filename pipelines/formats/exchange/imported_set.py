@@ -113,7 +113,8 @@ def import_posed(
         units=None if mm_per_unit else Units(depth="relative"),
         overwrite=overwrite,
     )
-    inform(f"{out}: {len(images)} views")
+    width, height = images[index].lens.size_px
+    inform(f"{out}: {len(images)} views of {width} x {height} px")
     return ImportedSet(str(out), len(images), images[index].path.name)
 
 
