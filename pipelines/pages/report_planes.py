@@ -105,12 +105,14 @@ class Plane:
 
 
 def method_title(records: Sequence[PlaneRecord]) -> str:
-    """Return the name of the method of records; it says if occlusion was left out."""
+    """Return the name of the method of records, with its prior; it says if occlusion was left out."""
+    names = {record.prior.name for record in records if record.prior} - {"tv"}
+    prior = f", prior of {' and '.join(sorted(names))}" if names else ""
     left_out = dict.fromkeys(record.channel for record in records if record.occlusion is False)
     if not left_out:
-        return METHOD_NAMES[records[0].method]
+        return METHOD_NAMES[records[0].method] + prior
     in_colours = "" if all(record.channel in left_out for record in records) else f" in {', '.join(left_out)}"
-    return f"{METHOD_NAMES['joint']} (occlusion left out{in_colours})"
+    return f"{METHOD_NAMES['joint']}{prior} (occlusion left out{in_colours})"
 
 
 def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> list[Plane]:
