@@ -16,8 +16,9 @@ from faintfield.pipelines.paper.figure_methods import METHODS, OURS
 from faintfield.pipelines.paper.figure_records import CurvePoint
 
 # The colours of Okabe and Ito, which colour-blind readers can tell apart; marks and dashes tell curves without colour.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-_MARKS, _DASHES = "os^Dv<>", ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#7f7f7f")
+_MARKS = "os^Dv<>P"
+_DASHES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)), (0, (8, 1, 1, 1)))
 _STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
@@ -120,7 +121,8 @@ def _title(method: str) -> str:
 
 def _curve(axes: Axes, points: Sequence[CurvePoint], index: int, label: str) -> None:
     """Draw the means with twice their standard errors."""
-    look: dict[str, Any] = {"color": _COLOURS[index % 7], "marker": _MARKS[index % 7], "linestyle": _DASHES[index % 7]}
+    index %= len(_COLOURS)
+    look: dict[str, Any] = {"color": _COLOURS[index], "marker": _MARKS[index], "linestyle": _DASHES[index]}
     bars = [2 * (point.standard_error or 0.0) for point in points]
     snr, mse = [point.snr for point in points], [point.mse for point in points]
     axes.errorbar(snr, mse, bars, label=label, markersize=4, linewidth=1.3, capsize=2, **look)

@@ -9,7 +9,7 @@ import numpy as np
 
 from faintfield.pipelines.formats.results.records import Method
 from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.initialization import back_projection
@@ -40,9 +40,16 @@ class FigureMethod:
     draws: int | None = None
 
 
-def _solved(method: Method, operator: PlaneOperator, images: ElementalImages, weight: float | None = None) -> Image:
+def _solved(
+    method: Method,
+    operator: PlaneOperator,
+    images: ElementalImages,
+    weight: float | None = None,
+    *,
+    prior: PriorName = "tv",
+) -> Image:
     """Return the plane that `reconstruct --method` would write."""
-    return solve(operator, images, method, Settings(penalty_weight=weight)).plane
+    return solve(operator, images, method, Settings(penalty_weight=weight, prior=prior)).plane
 
 
 def _clipped(operator: PlaneOperator, images: ElementalImages) -> Image:
@@ -88,5 +95,6 @@ METHODS = (
     FigureMethod("pmlem-clipped", "PMLEM, one-step-late, negative data clipped", _clipped, draws=2),
     FigureMethod("pmlem-osl", "PMLEM, one-step-late, weight from the noise", partial(_solved, "pmlem-osl"), draws=2),
     FigureMethod(OURS, "PMLEM, convergent, weight from held-out views", partial(_solved, OURS)),
+    FigureMethod("pmlem-patches", "PMLEM, prior of patches", partial(_solved, OURS, prior="patches")),
     FigureMethod(BEST, "PMLEM, convergent, best weight", partial(_solved, OURS), _PMLEM_WEIGHTS),
 )
