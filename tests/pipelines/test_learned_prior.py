@@ -1,0 +1,240 @@
+"""The network for planes: its numbers, its tiles, what it does with noise alone, and when it should not be asked."""
+
+from hashlib import sha256
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from faintfield.pipelines.reconstruction import learned_prior
+from faintfield.pipelines.reconstruction.learned_prior import learned_estimate, network_input, outside_range
+from faintfield.pipelines.reconstruction.planes import Settings, solve
+from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.prior.collaborative import Patches, collaborative_wiener
+from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
+from faintfield.recon.solver.initialization import back_projection
+
+_FILE = resources.files("faintfield.pipelines.reconstruction") / "networks" / "plane_prior.onnx"
+
+# By training/reference.py, sums in numpy for the input of `waves`.
+_VALUES = {(0, 0): -0.050578, (3, 5): 0.375013, (11, 15): 0.026569, (23, 8): 0.191935}
+_ROOT_MEAN_SQUARE = 0.236324
+
+
+class Known(NamedTuple):
+    """What is known of a dark plane, and its true light as blurred as the back-projection."""
+
+    picture: Image
+    pilot: Image
+    patches: Image
+    noise: Noise
+    truth: Image
+
+    def estimate(self) -> NDArray[np.float32]:
+        return learned_estimate(self.picture, self.pilot, self.patches, self.noise.variance)
+
+
+def known_of(light_e: Image, seed: int, views: int = 25, read_noise_e: float = 3.0) -> Known:
+    """Expose views of a plane, displaced by fractions of a pixel, and reconstruct it as the product does."""
+    random = np.random.default_rng(seed)
+    homographies = np.stack([np.eye(3)] * views)
+    homographies[:, :2, 2] = random.uniform(-1.5, 0.5, (views, 2))
+    axes = np.meshgrid(*(np.arange(length + 1.0) for length in light_e.shape[::-1]))
+    operator = PlaneOperator(
+        homographies,
+        np.stack(axes, axis=-1),
+        PlaneGrid((light_e.shape[0], light_e.shape[1]), 1.0, (0.0, 0.0)),
+        workers=1,
+    )
+    light = operator.forward(light_e.astype(np.float32))
+    electrons = random.poisson(light) + random.normal(0, read_noise_e, light.shape)
+    images = ElementalImages(electrons.astype(np.float32), 0.0, read_noise_e**2)
+    weight = 0.9 * np.sqrt(views) / read_noise_e
+    plane = solve(operator, images, "pmlem", Settings(penalty_weight=float(weight))).plane
+    noise = noise_of_back_projection(operator, images, plane)
+    pilot, picture = operator.adjoint_of_forward(plane) / operator.coverage(), back_projection(operator, images)
+    patches = collaborative_wiener(picture, pilot, noise, Patches(8, 4, 16, 64), workers=1)
+    return Known(picture, pilot, patches, noise, back_projection(operator, ElementalImages(light)))
+
+
+def waves(rows: int = 24, columns: int = 16) -> NDArray[np.float32]:
+    phase = np.arange(rows)[:, np.newaxis] * 0.7 + np.arange(columns) * 0.4
+    return np.stack([np.sin(phase * (k + 1)) + 0.1 * k for k in range(4)]).astype(np.float32)
+
+
+def made_up(shape: tuple[int, int], seed: int = 2) -> tuple[Image, Image, Image, Image]:
+    """Return smooth pictures with noise and a variance: arguments of `learned_estimate`."""
+    random = np.random.default_rng(seed)
+    patches = 2 + np.cos(np.arange(shape[0])[:, np.newaxis] / 9) * np.sin(np.arange(shape[1]) / 7)
+    variance = np.full(shape, 0.25) * (1 + 0.3 * patches)
+    y = patches + random.normal(size=shape) * np.sqrt(variance)
+    return y, patches + 0.1 * random.normal(size=shape), patches, variance
+
+
+# --- the network and OpenCV ------------------------------------------------------------------------------------------
+
+
+def test_opencv_computes_what_sums_over_the_nine_places_of_each_convolution_give() -> None:
+    network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
+    network.setInput(waves()[np.newaxis])
+    output = network.forward()[0, 0]
+    assert np.sqrt(np.mean(np.square(output))) == pytest.approx(_ROOT_MEAN_SQUARE, abs=1e-4)
+    for at, value in _VALUES.items():
+        assert output[at] == pytest.approx(value, abs=1e-4)
+
+
+def test_the_file_is_the_one_that_its_card_describes() -> None:
+    card = (Path(__file__).parents[2] / "training" / "README.md").read_text()
+    assert sha256(_FILE.read_bytes()).hexdigest() in card
+    assert len(_FILE.read_bytes()) < 1.5e6
+
+
+# --- planes of any size ----------------------------------------------------------------------------------------------
+
+
+def test_one_plane_gets_the_mean_of_what_the_network_says_of_it_from_four_sides() -> None:
+    y, u, p, v = made_up((16, 24))
+    inputs, deviation = network_input(y, u, p, v)
+    network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
+    change = np.zeros(p.shape)
+    for turn in range(4):
+        network.setInput(np.ascontiguousarray(np.rot90(inputs, turn, (1, 2)))[np.newaxis])
+        change += np.rot90(network.forward()[0, 0], -turn) / 4
+    np.testing.assert_allclose(learned_estimate(y, u, p, v), p + deviation * change, atol=1e-5)
+    assert change.std() > 0.01
+
+
+def test_the_estimate_turns_with_the_plane() -> None:
+    known = made_up((48, 40))
+    y, u, p, v = (np.rot90(array) for array in known)
+    np.testing.assert_allclose(learned_estimate(y, u, p, v), np.rot90(learned_estimate(*known)), atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (41, 67), (9, 130)])
+def test_planes_of_any_size_are_continued_to_multiples_of_eight_by_their_mirror_images(shape: tuple[int, int]) -> None:
+    y, u, p, _ = made_up(shape)
+    more = [(0, -length % 8) for length in shape]
+    more_y, more_u, more_p = (np.pad(array, more, mode="symmetric") for array in (y, u, p))
+    found = learned_estimate(y, u, p, np.full(shape, 0.3))
+    wanted = learned_estimate(more_y, more_u, more_p, np.full(more_p.shape, 0.3))
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, wanted[: shape[0], : shape[1]], atol=1e-5)
+
+
+def test_tiles_join_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = made_up((136, 120))
+    whole = learned_estimate(*known)
+    monkeypatch.setattr(learned_prior, "_TILE", 64)
+    assert np.abs(learned_estimate(*known) - whole).max() < 1e-3 * np.sqrt(known[-1].min())
+    monkeypatch.setattr(learned_prior, "_MARGIN", 0)
+    assert np.abs(learned_estimate(*known) - whole).max() > 1e-2 * np.sqrt(known[-1].min())
+
+
+# --- units -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_unit_of_light_does_not_matter() -> None:
+    y, u, p, v = made_up((48, 56))
+    scaled = learned_estimate(1000 * y, 1000 * u, 1000 * p, 1e6 * v)
+    np.testing.assert_allclose(scaled, 1000 * learned_estimate(y, u, p, v), rtol=1e-3)
+
+
+def test_the_network_sees_light_in_units_of_the_noise() -> None:
+    y, u, p, v = made_up((16, 16))
+    inputs, deviation = network_input(y, u, p, v)
+    np.testing.assert_allclose(deviation, np.sqrt(v), rtol=1e-6)
+    np.testing.assert_allclose(p + inputs[0] * np.sqrt(v), y, atol=1e-6)
+    np.testing.assert_allclose(p + inputs[1] * np.sqrt(v), u, atol=1e-6)
+    np.testing.assert_allclose(8 * inputs[2] * np.sqrt(v), p, atol=1e-6)
+    np.testing.assert_allclose(np.exp(inputs[3]) * np.median(np.sqrt(v)), np.sqrt(v), rtol=1e-5)
+
+
+# --- what no view sees -----------------------------------------------------------------------------------------------
+
+
+def test_samples_that_no_view_sees_keep_the_patches_and_disturb_no_others() -> None:
+    y, u, p, v = made_up((64, 80))
+    v[:, 60:] = np.inf
+    found = learned_estimate(y, u, p, v)
+    np.testing.assert_array_equal(found[:, 60:], p[:, 60:].astype(np.float32))
+    y[:, 60:] = u[:, 60:] = np.nan
+    np.testing.assert_array_equal(learned_estimate(y, u, p, v), found)
+
+
+def test_a_plane_that_no_view_sees_stays_as_it_is() -> None:
+    y, u, p, _ = made_up((16, 16))
+    np.testing.assert_array_equal(learned_estimate(y, u, p, np.full(p.shape, np.inf)), p.astype(np.float32))
+
+
+# --- what it does to pictures ----------------------------------------------------------------------------------------
+
+
+def errors(known: Known, picture: Image) -> Image:
+    """Return the errors of a picture in units of the noise, away from the edges."""
+    return ((picture - known.truth) / np.sqrt(known.noise.variance))[4:-4, 4:-4]
+
+
+@pytest.mark.parametrize("level_e", [0.01, 1.0, 8.0])
+def test_plain_fields_come_out_plain(level_e: float) -> None:
+    known = known_of(np.full((72, 80), level_e), seed=3)
+    left = errors(known, known.estimate())
+    assert np.abs(left).max() < 0.5
+    assert left.std() < 0.1
+    assert left.std() < errors(known, known.patches).std()
+
+
+def test_gradients_come_out_without_a_pattern_that_was_not_there() -> None:
+    known = known_of(np.linspace(0.5, 6, 72)[:, np.newaxis] * np.ones(80), seed=4)
+    left, by_penalty, by_patches = (errors(known, x) for x in (known.estimate(), known.pilot, known.patches))
+    assert np.abs(left).max() < np.abs(by_penalty).max()  # total variation makes steps of the gradient
+    assert left.std() < min(by_penalty.std(), by_patches.std())
+
+
+def lettered(shape: tuple[int, int] = (96, 128)) -> Image:
+    canvas = np.zeros(shape, np.uint8)
+    cv2.rectangle(canvas, (12, 14), (110, 84), 120, -1)
+    cv2.putText(canvas, "R7k", (20, 66), cv2.FONT_HERSHEY_DUPLEX, 1.6, 255, 3, cv2.LINE_AA)
+    return np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.7) / 255 * 4.0)
+
+
+def test_a_picture_comes_nearer_to_the_truth() -> None:
+    known = known_of(lettered(), seed=5)
+    before, after = (float(np.mean(np.square(x - known.truth))) for x in (known.patches, known.estimate()))
+    assert after < 0.85 * before
+
+
+# --- when it should not be asked -------------------------------------------------------------------------------------
+
+
+def known_noise(shape: tuple[int, int] = (64, 64)) -> Noise:
+    return Noise(np.full(shape, 0.25, np.float32), np.outer([0.25, 1, 0.25], [0.25, 1, 0.25]))
+
+
+def test_what_it_was_trained_for_is_within_its_range() -> None:
+    assert outside_range(np.ones((64, 64)), known_noise()) is None
+
+
+@pytest.mark.parametrize(
+    ("light_e", "noise", "said"),
+    [
+        (500.0, known_noise(), "times its noise"),
+        (1.0, known_noise((16, 64)), "samples"),
+        (1.0, known_noise()._replace(kernel=np.full((3, 3), 0.6)), "neighbours"),
+        (1.0, known_noise()._replace(variance=np.full((64, 64), np.inf, np.float32)), "seen"),
+        (
+            1.0,
+            known_noise()._replace(variance=np.geomspace(1e-3, 1e3, 4096, dtype=np.float32).reshape(64, 64)),
+            "its median",
+        ),
+    ],
+)
+def test_what_it_was_not_trained_for_is_named(light_e: float, noise: Noise, said: str) -> None:
+    reason = outside_range(np.full(noise.variance.shape, light_e), noise)
+    assert reason is not None
+    assert said in reason
