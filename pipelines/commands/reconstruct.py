@@ -122,8 +122,8 @@ def reconstruct(
         it covers.
     prior
         What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
-        repeat; where this predicts held-out views better, less noise and more detail remain. The data keep the last
-        word: see docs/physics.md.
+        repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
+        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md.
     proposal
         Save, beside each plane, what the prior proposed, and in standard deviations how far the data moved the plane.
     passes

@@ -107,7 +107,7 @@ class Plane:
 def method_title(records: Sequence[PlaneRecord]) -> str:
     """Return the name of the method of records, with its prior; it says if occlusion was left out."""
     names = {record.prior.name for record in records if record.prior} - {"tv"}
-    prior = f", prior of {' and '.join(sorted(names))}" if names else ""
+    prior = f", prior: {' and '.join(sorted(names))}" if names else ""
     left_out = dict.fromkeys(record.channel for record in records if record.occlusion is False)
     if not left_out:
         return METHOD_NAMES[records[0].method] + prior

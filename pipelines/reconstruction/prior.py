@@ -2,16 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
-from msgspec import structs
+from msgspec import UNSET, structs
 
 from faintfield.pipelines.formats.results.records import PriorRecord, SolveRecord
 from faintfield.pipelines.reconstruction.penalised import Objective, certified
-from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
+from faintfield.pipelines.reconstruction.solutions import PriorName, Settings, Solution, mean_e
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
 from faintfield.recon.prior.patches import patch_candidates
-from faintfield.recon.prior.proposal import PlaneProposal, propose
+from faintfield.recon.prior.proposal import Candidates, PlaneProposal, propose
 from faintfield.recon.solver.cross_validation import MIN_VIEWS
 
 
@@ -30,7 +32,10 @@ def with_prior(objective: Objective, solutions: Sequence[Solution], settings: Se
     first = solutions[0].record
     weight = first.penalty_weight or 0.0
     samples = operator.samples_of([one.plane for one in solutions])
-    proposals = propose(objective.posed, samples, weight, patch_candidates)
+    evidences = evidence_of_planes(operator, objective.posed.images, samples)
+    no_network = _why_no_network(evidences) if settings.prior != "patches" else None
+    candidates = _candidates(settings.prior if no_network is None else "patches")
+    proposals = propose(objective.posed, samples, evidences, weight, candidates)
     proposed = operator.samples_of([one.picture for one in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
     record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, settings)
@@ -41,18 +46,54 @@ def with_prior(objective: Objective, solutions: Sequence[Solution], settings: Se
         passes_before=(first.passes_before or 0) + first.passes,
     )
     planes = zip(operator.planes_of(found), solutions, proposals, strict=True)
-    return [_solution(plane, record, one.sidecars, proposal, settings) for plane, one, proposal in planes]
+    return [_solution(plane, record, one.sidecars, proposal, settings, no_network) for plane, one, proposal in planes]
+
+
+def _why_no_network(evidences: Sequence[Evidence]) -> str | None:
+    """Return why a plane is unlike those that the network knows, None if all are like them."""
+    from faintfield.pipelines.reconstruction.learned_prior import outside_range  # OpenCV is slow to load
+
+    reasons = (outside_range(evidence.pilot, evidence.noise) for evidence in evidences)
+    return next((reason for reason in reasons if reason is not None), None)
+
+
+def _candidates(prior: PriorName) -> Candidates:
+    """Return the function that makes the candidates of a prior."""
+    if prior == "patches":
+        return patch_candidates
+    return partial(_with_network, alone=prior == "learned")
+
+
+def _with_network(evidence: Evidence, *, alone: bool) -> dict[str, Image]:
+    """Return the candidates from patches and what the network makes of them; alone: only that and total variation's."""
+    from faintfield.pipelines.reconstruction.learned_prior import learned_estimate  # OpenCV is slow to load
+
+    found = patch_candidates(evidence)
+    patches = (found["wiener"] + found["twice"]) / 2
+    variance = evidence.noise.variance
+    found["learned"] = learned_estimate(evidence.picture, evidence.pilot, patches, variance)
+    return {name: found[name] for name in ("tv", "learned")} if alone else found
 
 
 def _solution(
-    plane: Image, record: SolveRecord, sidecars: dict[str, Image], proposal: PlaneProposal, settings: Settings
+    plane: Image,
+    record: SolveRecord,
+    sidecars: dict[str, Image],
+    proposal: PlaneProposal,
+    settings: Settings,
+    no_network: str | None,
 ) -> Solution:
     """Return one plane with how far the data moved it from its proposal."""
     moved = np.zeros_like(plane)
     np.divide(plane - proposal.picture, proposal.sigma, out=moved, where=proposal.sigma > 0)
     seen = np.isfinite(proposal.sigma)
     rms = float(np.sqrt(np.mean(np.square(moved[seen], dtype=np.float64))))
-    prior = PriorRecord(name=settings.prior, mixture=proposal.mixture, moved_sigma=rms)
+    prior = PriorRecord(
+        name=settings.prior,
+        mixture=proposal.mixture,
+        moved_sigma=rms,
+        no_network=UNSET if no_network is None else no_network,
+    )
     if settings.proposal:
         sidecars = sidecars | {"proposal": proposal.picture, "moved": moved}
     return Solution(plane, structs.replace(record, mean_e=mean_e(plane), prior=prior), sidecars)

@@ -9,7 +9,7 @@ from faintfield.pipelines.formats.results.records import SolveRecord
 from faintfield.recon.likelihood.images import Image, LikelihoodName
 from faintfield.recon.solver.penalties import PenaltyName
 
-type PriorName = Literal["tv", "patches"]
+type PriorName = Literal["tv", "patches", "learned", "auto"]
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,8 @@ class Settings:
     uncertainty : bool
         Estimate the standard deviation of the samples of PMLEM's planes.
     prior : str
-        What is expected of a picture besides small differences: "tv", nothing; "patches", that its patches repeat.
+        What is expected of a picture besides small differences: "tv", nothing; "patches", that its patches repeat;
+        "learned", what a network was trained with; "auto", whichever predicts best.
     proposal : bool
         Keep the proposal of the prior beside the plane, and how far the data moved the plane from it.
     """

@@ -1,6 +1,6 @@
 """A proposal for the planes of a scene: candidate pictures, mixed such that they best predict held-out views."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,11 @@ class PlaneProposal:
 
 
 def propose(
-    problem: SceneProblem, samples: Image, penalty_weight: float, candidates: Candidates
+    problem: SceneProblem,
+    samples: Image,
+    evidences: Sequence[Evidence],
+    penalty_weight: float,
+    candidates: Candidates,
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
 
@@ -70,10 +74,13 @@ def propose(
         The operator and the images.
     samples : float array (samples)
         f, the planes that total variation gives.
+    evidences : sequence of Evidence
+        What all views say of each plane.
     penalty_weight : float
         β of these.
     candidates : callable
-        Returns the candidates for one plane by name, given its evidence. The first is chosen where all predict alike.
+        Returns the candidates for one plane by name, given its evidence: always the same names. The first is chosen
+        where all predict alike.
 
     Raises
     ------
@@ -84,7 +91,6 @@ def propose(
     views = operator.seeing_views
     if len(views) < MIN_VIEWS:
         raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {len(views)}")
-    evidences = evidence_of_planes(operator, problem.images, samples)
     regions = [_regions(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
     for fold in range(max(_MIN_FOLDS, folds_to_predict(problem))):

@@ -332,3 +332,11 @@ class TestPoseTables:
             model = PoseTable(path).posed(lens, path.parent)
             assert 1 <= len(model.images) <= len(text)
             assert all(np.isfinite(image.rt_cam_world).all() for image in model.images)
+
+
+@pytest.mark.parametrize("element", [1e308, -np.inf, np.nan, 2.1])
+def test_elements_that_no_rotation_has_are_refused_before_they_overflow(element: float) -> None:
+    turn = np.eye(3)
+    turn[1, 2] = element
+    with pytest.raises(ValueError, match="not finite, or has columns"):
+        rt_cam_world(turn, np.zeros(3))

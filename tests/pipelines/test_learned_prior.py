@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.reconstruction import learned_prior
 from faintfield.pipelines.reconstruction.learned_prior import learned_estimate, network_input, outside_range
-from faintfield.pipelines.reconstruction.planes import Settings, solve
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator

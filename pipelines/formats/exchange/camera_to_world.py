@@ -24,7 +24,8 @@ def rt_cam_world(turn: ArrayLike, centre: ArrayLike) -> NDArray[np.float64]:
         `turn` is no rotation: it is not finite, stretches, or mirrors.
     """
     matrix = np.asarray(turn, np.float64)
-    if not np.isfinite(matrix).all() or not np.allclose(matrix.T @ matrix, np.eye(3), atol=_TOLERANCE):
+    # Elements beyond 2 are refused before their squares, which may overflow
+    if not (np.abs(matrix) <= 2).all() or not np.allclose(matrix.T @ matrix, np.eye(3), atol=_TOLERANCE):
         raise ValueError("its rotation is not finite, or has columns that are not of length 1 and at right angles")
     if np.linalg.det(matrix) < 0:
         raise ValueError("its rotation mirrors the world")
