@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import encoded, write_frame
-from faintfield.pipelines.reconstruction import planes, surface, surface_depths, surface_files
+from faintfield.pipelines.reconstruction import penalised, surface, surface_depths, surface_files
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from tests.pipelines.surfaces import Searches, found_at_once
 
@@ -79,7 +79,7 @@ def seen(monkeypatch: pytest.MonkeyPatch) -> Searches:
     monkeypatch.setattr(surface_depths, "estimate_surface", search)
     monkeypatch.setattr(surface_files, "map_picture", lambda *_: preview)
     monkeypatch.setattr(surface, "refined", lambda operator, images, plane: plane)
-    monkeypatch.setattr(planes, "standard_deviation", lambda local, *_: np.ones_like(local.plane))
+    monkeypatch.setattr(penalised, "standard_deviation", lambda local, *_: np.ones_like(local.plane))
     monkeypatch.setattr(surface_files, "render_parallax", lambda *_: [np.zeros((4, 4), np.uint8)] * 2)
     return given
 

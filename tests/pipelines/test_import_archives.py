@@ -340,7 +340,7 @@ class TestOneFile:
     def test_a_file_of_another_kind_is_refused(self, tmp_path: Path, faintfield: Command) -> None:
         (tmp_path / "a.zip").write_bytes(b"PK")
         refused(
-            faintfield("import", "grid", tmp_path / "a.zip", tmp_path / "set"), "BadValue", "name a folder of pictures"
+            faintfield("import", "grid", tmp_path / "a.zip", tmp_path / "set"), "BadValue", "files of .zip are not read"
         )
 
 
