@@ -65,12 +65,14 @@ def best_mixture(found: Scores) -> NDArray[np.float64]:
 
 def _mixture_of(found: Scores, chosen: list[int]) -> NDArray[np.float64] | None:
     """Return the weights of least error with sum one of some candidates; None if one of them is negative."""
-    size = len(chosen)
-    system: NDArray[np.float64] = np.ones((size + 1, size + 1))
-    system[:size, :size], system[size, size] = found.gram[np.ix_(chosen, chosen)], 0.0
-    solution = np.linalg.lstsq(system, np.append(found.towards[chosen], 1.0), rcond=None)[0][:size]
-    if (solution < 0).any():
+    # The first of them takes what the others leave of one: so the sum is exact whatever the scale of the errors
+    first, *others = chosen
+    differences = np.eye(found.towards.size)[others] - np.eye(found.towards.size)[first]
+    curvature = differences @ found.gram @ differences.T
+    slope = differences @ (found.towards - found.gram[first])
+    shares = np.linalg.lstsq(curvature, slope, rcond=None)[0]
+    if (shares < 0).any() or shares.sum() > 1:
         return None
     weights: NDArray[np.float64] = np.zeros(found.towards.size)
-    weights[chosen] = solution
+    weights[others], weights[first] = shares, 1 - shares.sum()
     return weights
