@@ -12,7 +12,7 @@ from faintfield.calib.arrangement.orientation import Orientation
 from faintfield.pipelines.errors import AmbiguousOrder
 from faintfield.pipelines.formats.exchange.image_grid import ImageGrid
 
-# Share of other pictures that neighbours fit better than, from which no line of views is tried in place of a square.
+# Share of other pictures that neighbours fit better than, from which no other order is tried in place of a square.
 _SURELY = 0.95
 
 # Correlation by which the blocks must agree better in another order of a list.
@@ -30,7 +30,7 @@ def look_at_grid(grid: ImageGrid, given: Orientation | None, read: Grey) -> tupl
     found = _look(grid, given, read)
     if given is not None or grid.measured is not None or min(grid.size) == 1:
         return grid, found
-    if grid.guessed and not (found.seen and found.order.verdict == "fits" and found.order.share > _SURELY):
+    if grid.guessed and not _surely_fits(found):
         grid, found = _square_or_line(grid, found, given, read)
     rows, columns = grid.size
     if grid.ordered and rows != columns:
@@ -64,7 +64,7 @@ def _square_or_line(grid: ImageGrid, found: Look, given: Orientation | None, rea
         said=[*grid.said, f"the pictures show one line of {count} views, not {rows} x {columns}"],
     )
     seen = _look(line, given, read)
-    if not seen.seen or seen.order.verdict != "fits":
+    if not seen.seen or seen.order.verdict != "fits" or _runs_back_and_forth(grid, given, read):
         return grid, found
     if not found.seen or found.order.verdict == "denied":
         return line, seen
@@ -76,6 +76,16 @@ def _square_or_line(grid: ImageGrid, found: Look, given: Orientation | None, rea
             f"--rows 1 --columns {count}, or --rows {count} --columns 1"
         )
     return grid, found
+
+
+def _surely_fits(found: Look) -> bool:
+    """Return whether neighbours fit better than nearly all other pictures."""
+    return found.seen and found.order.verdict == "fits" and found.order.share > _SURELY
+
+
+def _runs_back_and_forth(grid: ImageGrid, given: Orientation | None, read: Grey) -> bool:
+    """Return whether a square fits whose rows run back and forth; the views of such a one make a line, too."""
+    return any(_surely_fits(_look(other, given, read)) for other in _back_and_forth(grid))
 
 
 def _look(grid: ImageGrid, given: Orientation | None, read: Grey) -> Look:
