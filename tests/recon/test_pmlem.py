@@ -1,6 +1,6 @@
 """PMLEM against two independent solvers on a dense matrix, and its certificate against true distances."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice, pairwise
 
@@ -69,6 +69,52 @@ def test_total_variation_agrees_with_a_primal_dual_method(likelihood: Likelihood
     assert distance(found.plane, best) <= 1e-4
     differences = (difference_matrix() @ best.ravel()).reshape(2, -1)
     assert (np.hypot(*differences) < 1e-6).mean() > 0.2  # the penalty has an effect: pieces are flat
+
+
+def about(proposal: Image | None, posed: DenseProblem, *, tolerance: float = 0.01) -> Iterator[PmlemIterate]:
+    """Iterates with total variation counted from a proposal."""
+    fit, start = started(posed)
+    dual = replace(DualField.zero([SHAPE], start.dtype), proposal=proposal)
+    return pmlem(fit, start, penalty_weight=WEIGHT, tolerance=tolerance, dual=dual)
+
+
+def a_proposal(seed: int) -> Image:
+    """A plane with a box that the data do not show, and much that they contradict."""
+    proposal = np.random.default_rng(seed).uniform(0, 8, SHAPE)
+    proposal[4:7, 1:5] += 9
+    return proposal
+
+
+def settled_about(proposal: Image, posed: DenseProblem) -> PmlemIterate:
+    for found in about(proposal, posed, tolerance=1e-6):
+        if found.certificate.distance <= 1e-6 or found.passes >= 400:
+            break
+    return found
+
+
+@pytest.mark.parametrize("likelihood", ["shifted-poisson", "least-squares"])
+def test_total_variation_about_a_proposal_agrees_with_a_primal_dual_method(likelihood: LikelihoodName) -> None:
+    posed, proposal = problem(likelihood), a_proposal(20)
+    found = settled_about(proposal, posed)
+    assert distance(found.plane, primal_dual_solution(posed, WEIGHT, 5000, proposal)) <= 2e-4
+    assert distance(found.plane, solved(posed, WEIGHT, Penalty()).plane) > 0.1
+    value = DataFit(posed.operator, posed.images, 3.0).value_and_gradient(found.plane)[0]
+    penalty = np.hypot(*(difference_matrix() @ (found.plane - proposal).ravel()).reshape(2, -1)).sum()
+    assert found.objective == pytest.approx(value + WEIGHT * penalty, rel=1e-9)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_about_a_proposal_of_zeros_every_pass_is_the_same_to_the_last_bit(
+    dtype: type[np.float32] | type[np.float64],
+) -> None:
+    posed = problem(dtype=dtype)
+    for one, other in zip(islice(about(None, posed), 8), about(np.zeros(SHAPE, dtype), posed), strict=False):
+        np.testing.assert_array_equal(one.plane, other.plane)
+        assert (one.objective, one.certificate, one.inner_steps) == (
+            other.objective,
+            other.certificate,
+            other.inner_steps,
+        )
 
 
 @pytest.mark.parametrize("likelihood", LIKELIHOODS)
