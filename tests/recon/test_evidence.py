@@ -90,7 +90,7 @@ def test_where_no_view_sees_a_plane_there_is_no_light_and_no_end_to_the_noise() 
 
 
 def test_the_noise_of_each_plane_is_that_of_the_model_in_the_light_of_all() -> None:
-    """The variance of `Hᵀn / HᵀH1` is `Σ h² v / (HᵀH1)²` with v the light of both planes, the background and the noise."""
+    """The variance of `Hᵀn / HᵀH1` is `Σ h² v / (HᵀH1)²` with v of both planes, background and sensor."""
     generator = np.random.default_rng(5)
     shape = (28, 32)
     shifts = [generator.uniform(-0.5, 0.5, (5, 2)), generator.uniform(-0.5, 0.5, (5, 2)) + 2.0]

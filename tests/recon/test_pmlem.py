@@ -103,6 +103,43 @@ def test_total_variation_about_a_proposal_agrees_with_a_primal_dual_method(likel
     assert found.objective == pytest.approx(value + WEIGHT * penalty, rel=1e-9)
 
 
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_about_a_scene_with_a_false_box_no_plane_is_further_from_the_optimum_than_its_certificate_says(
+    likelihood: LikelihoodName, seed: int
+) -> None:
+    posed, proposal = problem(likelihood, seed=seed), np.full(SHAPE, 2.0)
+    proposal[2:6, 3:9] = 6
+    proposal[4:7, 1:5] += 4
+    proposal += np.random.default_rng(seed).normal(0, 0.5, SHAPE)
+    best = settled_about(proposal, posed).plane
+    metric = started(posed)[0].metric(best)
+    for tolerance in (0.1, 0.003):
+        iterates = list(islice(about(proposal, posed, tolerance=tolerance), 8))
+        for iterate in iterates:
+            assert norm(iterate.plane - best, metric) / norm(best, metric) <= iterate.certificate.distance + 1e-6
+        assert min(iterate.certificate.distance for iterate in iterates) <= tolerance
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_about_any_proposal_the_parts_of_the_certificate_bound_the_distance_by_its_true_curvature(seed: int) -> None:
+    """With m of the straight way to the optimum, `(a + √(a² + 4 m e))/2m` bounds the distance, by convexity alone.
+
+    A rough proposal that the data contradict has an m below the ½ that the certificate assumes.
+    """
+    posed, proposal = problem("least-squares", seed=seed), a_proposal(seed)
+    best = settled_about(proposal, posed).plane
+    metric = started(posed)[0].metric(best)
+    rows = posed.matrix[posed.counted()]
+    variance_e2 = posed.images.likelihood.level_e + posed.images.background_e + posed.images.read_variance_e2
+    for iterate in islice(about(proposal, posed, tolerance=0.003), 10):
+        away = iterate.plane - best
+        far, size = norm(away, metric), norm(iterate.plane, metric)
+        m = float(np.sum((rows @ away.ravel()) ** 2 / variance_e2)) / far**2
+        a, e = iterate.certificate.stationarity * size, (iterate.certificate.slack * size) ** 2 / 2
+        assert far <= (a + np.sqrt(a**2 + 4 * m * e)) / (2 * m) + 1e-5 * size
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_about_a_proposal_of_zeros_every_pass_is_the_same_to_the_last_bit(
     dtype: type[np.float32] | type[np.float64],

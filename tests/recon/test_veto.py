@@ -1,9 +1,10 @@
 """What the data make of a false proposal: details that they contradict shrink, and those that they show come back.
 
-Scenes with a lit square, a thin line and a texture. The proposals are the truth, as blurred as a back-projection, with a
-line or a letter that is not there, or without the line that is.
+Scenes with a lit square, a thin line and a texture. The proposals are the truth, as blurred as a back-projection, with
+a line or a letter that is not there, or without one that is.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -41,9 +42,6 @@ def letter() -> Image:
     structure = np.zeros(SHAPE, np.uint8)
     cv2.putText(structure, "E", (36, 58), cv2.FONT_HERSHEY_SIMPLEX, 0.95, (1,), 2)
     return structure.astype(np.float32)
-
-
-STRUCTURES = {"line": line, "letter": letter}
 
 
 @dataclass(frozen=True)
@@ -109,3 +107,42 @@ def share_left(snr: float, structure: Image, amplitude: float, seed: int, *, mis
     proposal = blurred if missing else blurred + false
     found = vetoed(of, images, proposal)
     return along(found - truth, structure) / along(proposal - truth, structure)
+
+
+SEEDS = range(3)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+@pytest.mark.parametrize(
+    ("structure", "amplitude", "most"),
+    [(line, 3, 0.75), (line, 10, 0.3), (letter, 1, 0.85), (letter, 3, 0.5), (letter, 10, 0.2)],
+)
+@pytest.mark.parametrize("snr", [0.16, 1.0])
+def test_the_data_shrink_what_they_contradict(
+    snr: float, structure: Callable[[], Image], amplitude: float, most: float, missing: bool
+) -> None:
+    """In units of the back-projection's noise; relative to the false part of the proposal."""
+    left = [share_left(snr, structure(), amplitude, seed, missing=missing) for seed in SEEDS]
+    assert 0 < np.mean(left) < most
+
+
+@pytest.mark.parametrize("snr", [0.16, 1.0])
+def test_the_larger_a_falsehood_the_more_of_it_goes(snr: float) -> None:
+    for structure in (line(), letter()):
+        left = [np.mean([share_left(snr, structure, amplitude, seed) for seed in SEEDS]) for amplitude in (1, 3, 10)]
+        assert 1 > left[0] > 1.3 * left[1] > 1.3**2 * left[2]
+
+
+@pytest.mark.parametrize(("snr", "most"), [(0.16, 0.2), (1.0, 0.4)])
+def test_a_true_proposal_hardly_moves(snr: float, most: float) -> None:
+    """At the higher signal it moves more, since the truth is not blurred as the proposal is."""
+    of = scene(snr)
+    proposal = as_blurred(of.operator, of.truth)
+    for seed in SEEDS:
+        found = vetoed(of, noisy_images(of.operator, of.truth, BACKGROUND_E, VARIANCE_E2, 100 + seed), proposal)
+        assert np.sqrt(np.mean(np.square(found - proposal))) < most * of.sigma
+
+
+def test_the_proposal_decides_what_the_data_do_not_show() -> None:
+    """A falsehood of a tenth of the noise stays: the record says that the data did not object, not that it is true."""
+    assert share_left(0.16, line(), 0.1, 0) > 0.5
