@@ -114,9 +114,10 @@ def difference_matrix() -> Image:
     return matrix.reshape(2 * SAMPLES, SAMPLES)
 
 
-def primal_dual_solution(posed: DenseProblem, weight: float, passes: int) -> Image:
-    """The optimum with total variation, by Condat and Vũ's primal-dual iteration with fixed steps."""
+def primal_dual_solution(posed: DenseProblem, weight: float, passes: int, proposal: Image | None = None) -> Image:
+    """The optimum with total variation about a proposal, by Condat and Vũ's primal-dual iteration with fixed steps."""
     gradient_of = difference_matrix()
+    proposed = np.zeros(SAMPLES) if proposal is None else proposal.ravel()
     lightest = float(posed.images.background_e) + float(posed.images.read_variance_e2)
     curvature = np.linalg.norm(posed.matrix, 2) ** 2 * 4 / lightest
     step = 1 / curvature
@@ -125,7 +126,7 @@ def primal_dual_solution(posed: DenseProblem, weight: float, passes: int) -> Ima
     for _ in range(passes):
         ahead = f - step * (posed.value_and_gradient(f)[1] + weight * (gradient_of.T @ p))
         ahead = np.maximum(ahead, 0)
-        p = p + dual_step * weight * (gradient_of @ (2 * ahead - f))
+        p = p + dual_step * weight * (gradient_of @ (2 * ahead - f - proposed))
         length = np.hypot(*p.reshape(2, SAMPLES))
         p = (p.reshape(2, SAMPLES) / np.maximum(length, 1)).ravel()
         f = ahead

@@ -1,4 +1,4 @@
-"""The collaborative Wiener filter against a slow one in numpy, and the noise of back-projections in closed form."""
+"""The collaborative filters against slow ones in numpy."""
 
 from itertools import islice
 
@@ -8,108 +8,19 @@ from numpy.typing import NDArray
 from scipy.fft import dctn, idctn
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
-from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
-from faintfield.recon.prior.collaborative import Patches, collaborative_wiener
+from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
 from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
 from faintfield.recon.prior.patches import refined
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
+from tests.recon.displaced import SHAPE, noisy_images, views_displaced_by
 
-SHAPE = (96, 112)
 KERNEL = np.outer([0.2, 1.0, 0.2], [0.3, 1.0, 0.3])
-
-
-def views_displaced_by(
-    shifts: Image, shape: tuple[int, int] = SHAPE, *, width: int = 0, turn_rad: float = 0.0
-) -> PlaneOperator:
-    """Views of one pixel per sample, displaced by `shifts` (view, 2) down and right; `width` columns are seen."""
-    columns, rows = np.meshgrid(np.arange(-1.0, (width or shape[1]) + 1), np.arange(-1.0, shape[0] + 1))
-    turn = np.array([[np.cos(turn_rad), -np.sin(turn_rad)], [np.sin(turn_rad), np.cos(turn_rad)]])
-    homographies = np.stack([np.eye(3)] * len(shifts))
-    homographies[:, :2, :2], homographies[:, :2, 2] = turn, shifts[:, ::-1]
-    rays = np.stack([columns, rows], axis=-1)
-    return PlaneOperator(homographies, rays, PlaneGrid(shape, 1.0, (0.0, 0.0)), workers=1)
 
 
 def inner(plane: NDArray[np.floating]) -> NDArray[np.floating]:
     return plane[4:-4, 4:-4]
-
-
-def without_light(operator: PlaneOperator, background_e: float, variance_e2: float) -> ElementalImages:
-    return ElementalImages(np.zeros(operator.images_shape, np.float32), background_e, variance_e2)
-
-
-# --- the noise of a back-projection ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("in_phase", [False, True])
-def test_the_noise_of_displaced_views_has_the_covariance_of_their_bilinear_weights(in_phase: bool) -> None:
-    shifts = np.random.default_rng(5).uniform(-0.3, 0.3, (6, 2)) + np.array([0.5, 0.25])
-    shifts = np.full((6, 2), 0.5) if in_phase else shifts
-    operator = views_displaced_by(shifts)
-    plane = np.full(SHAPE, 3.0, np.float32)
-    noise = noise_of_back_projection(operator, without_light(operator, 0.5, 12.0), plane, draws=2)
-    # A sample has the weights (1 − φ, φ) ⊗ (1 − φ', φ') in each view
-    phases = shifts % 1
-    own = phases**2 + (1 - phases) ** 2
-    of_neighbours = phases * (1 - phases)
-    factor = np.sum(own[:, 0] * own[:, 1])
-    expected = 15.5 * factor / 36
-    assert np.median(inner(noise.variance)) == pytest.approx(expected, rel=0.03)
-    np.testing.assert_allclose(inner(noise.variance), expected, rtol=0.25)
-    kernel = np.ones((3, 3))
-    kernel[1, ::2] = np.sum(own[:, 0] * of_neighbours[:, 1]) / factor
-    kernel[::2, 1] = np.sum(of_neighbours[:, 0] * own[:, 1]) / factor
-    kernel[::2, ::2] = np.sum(of_neighbours[:, 0] * of_neighbours[:, 1]) / factor
-    np.testing.assert_allclose(noise.kernel, kernel, atol=0.025)
-    assert noise.kernel[1, 1] == 1
-
-
-def test_averaged_over_all_phases_the_weights_squared_are_four_ninths() -> None:
-    operator = views_displaced_by(np.random.default_rng(6).uniform(-9, 9, (12, 2)), turn_rad=0.11)
-    noise = noise_of_back_projection(operator, without_light(operator, 0.0, 9.0), np.zeros(SHAPE, np.float32))
-    coverage = operator.coverage()
-    well = coverage > 6
-    ratio = noise.variance[well] * coverage[well] / 9
-    assert well.mean() > 0.6
-    assert np.median(ratio) == pytest.approx(4 / 9, rel=0.05)
-    np.testing.assert_allclose(noise.kernel, np.outer([0.25, 1, 0.25], [0.25, 1, 0.25]), atol=0.03)
-
-
-def test_noise_follows_the_light_and_the_number_of_views_sample_by_sample() -> None:
-    generator = np.random.default_rng(7)
-    shifts = generator.uniform(0, 1, (8, 2))
-    operator = views_displaced_by(np.concatenate([shifts, shifts + np.array([0, 56])]))  # half of them see the left
-    plane = np.full(SHAPE, 1.0, np.float32)
-    plane[48:] = 30.0
-    images = without_light(operator, 0.5, 4.0)
-    found = noise_of_back_projection(operator, images, plane).variance
-    draws = []
-    for _ in range(80):
-        sd = np.sqrt(operator.forward(plane) + 4.5)
-        noise = generator.standard_normal(sd.shape, np.float32) * sd + np.float32(0.5)
-        draws.append(back_projection(operator, ElementalImages(noise, 0.5)))
-    drawn = np.var(draws, axis=0)
-    for part in (np.s_[4:40, 4:50], np.s_[56:-4, 4:50], np.s_[4:40, 62:-4], np.s_[56:-4, 62:-4]):
-        assert np.median(found[part] / drawn[part]) == pytest.approx(1, rel=0.15)
-        assert np.mean(abs(np.log(found[part] / drawn[part]))) < 0.25  # of single samples, 0.13 is that of the draws
-    left, right = found[4:40, 4:50].mean(), found[4:40, 62:-4].mean()
-    assert left / right == pytest.approx(2, rel=0.25)
-    # A column on either side of a border must not take the mean of both
-    np.testing.assert_allclose(found[4:-4, 52] / found[4:-4, 60], 2, rtol=0.3)
-    np.testing.assert_allclose(found[51, 4:50] / found[44, 4:50], 34.5 / 5.5, rtol=0.3)
-
-
-def test_noise_is_infinite_where_no_view_sees_and_repeatable() -> None:
-    operator = views_displaced_by(np.zeros((2, 2)), width=60)
-    images, plane = without_light(operator, 0.0, 4.0), np.ones(SHAPE, np.float32)
-    noise, again = (noise_of_back_projection(operator, images, plane, seed=3) for _ in range(2))
-    np.testing.assert_array_equal(np.isinf(noise.variance), operator.coverage() == 0)
-    assert 0 < np.isinf(noise.variance).sum() < noise.variance.size
-    np.testing.assert_array_equal(noise.variance, again.variance)
-    assert noise_of_back_projection(operator, images, plane, seed=4).kernel[0, 0] != noise.kernel[0, 0]
 
 
 # --- the filter ------------------------------------------------------------------------------------------------------
@@ -132,10 +43,10 @@ def coefficient_variances(kernel: Image, size: int) -> Image:
     return np.asarray(np.diag(basis @ covariance @ basis.T).reshape(size, size))
 
 
-def slow_filter(y: Image, pilot: Image, noise: Noise, patches: Patches) -> Image:
-    """One group after the other, in float64."""
+def slow_filters(y: Image, pilot: Image, noise: Noise, patches: Patches) -> tuple[Image, Image]:
+    """One group after the other, in float64: filtered by Wiener's gains, and with small coefficients set to zero."""
     size, step, radius, members = patches
-    above, below = np.zeros(y.shape), np.zeros(y.shape)
+    above, below = np.zeros((2, 2, *y.shape))
     window = np.outer(np.kaiser(size, 2.0), np.kaiser(size, 2.0))
     per_coefficient = coefficient_variances(noise.kernel, size)
     last = y.shape[0] - size, y.shape[1] - size
@@ -157,13 +68,17 @@ def slow_filter(y: Image, pilot: Image, noise: Noise, patches: Patches) -> Image
                 for plane in (y, pilot)
             ]
             level = np.mean([noise.variance[r + size // 2, c + size // 2] for _, r, c in alike])
-            gain = spectra[1] ** 2 / (spectra[1] ** 2 + level * per_coefficient)
-            weight = window / (np.mean(gain**2 * level * per_coefficient) + 1e-3 * level)
-            filtered = np.tensordot(haar.T, spectra[0] * gain, 1)
-            for (_, r, c), coefficients in zip(alike, filtered, strict=True):
-                cut(above, r, c, size)[:] += weight * idctn(coefficients, norm="ortho")
-                cut(below, r, c, size)[:] += weight
-    return np.where(below > 0, above / np.where(below > 0, below, 1), pilot)
+            wiener = spectra[1] ** 2 / (spectra[1] ** 2 + level * per_coefficient)
+            large = np.abs(spectra[0]) > 2.7 * np.sqrt(level * per_coefficient)
+            large[0, 0, 0] = True  # the mean of the group
+            for k, gain in enumerate((wiener, large)):
+                weight = window / (np.mean(gain**2 * level * per_coefficient) + 1e-3 * level)
+                filtered = np.tensordot(haar.T, spectra[0] * gain, 1)
+                for (_, r, c), coefficients in zip(alike, filtered, strict=True):
+                    cut(above[k], r, c, size)[:] += weight * idctn(coefficients, norm="ortho")
+                    cut(below[k], r, c, size)[:] += weight
+    found = np.where(below > 0, above / np.where(below > 0, below, 1), pilot)
+    return found[0], found[1]
 
 
 def cut(plane: Image, row: int, column: int, size: int) -> Image:
@@ -189,23 +104,43 @@ def pictures(shape: tuple[int, int], seed: int) -> tuple[Image, Image, Noise]:
     ],
 )
 @pytest.mark.parametrize("partly_unseen", [False, True])
-def test_the_filter_agrees_with_a_slow_one(shape: tuple[int, int], patches: Patches, partly_unseen: bool) -> None:
+def test_the_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patches, partly_unseen: bool) -> None:
     y, pilot, noise = pictures(shape, 8)
     if partly_unseen:
         noise.variance[: shape[0] // 3, -2:] = np.inf
         noise.variance[-1, 0] = np.inf
         y[noise.variance == np.inf] = np.nan
-    expected = slow_filter(y, pilot, noise, patches)
-    found = collaborative_wiener(y, pilot, noise, patches, workers=2)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(y[np.isfinite(y)]).max())
+    both = wiener_and_thresholded(y, pilot, noise, patches, workers=2)
+    for found, expected in zip(both, slow_filters(y, pilot, noise, patches), strict=True):
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(y[np.isfinite(y)]).max())
+    np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches, workers=2))
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])
-def test_the_result_does_not_depend_on_the_number_of_workers(workers: int) -> None:
+def test_the_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
     y, pilot, noise = pictures((300, 64), 9)
-    single = collaborative_wiener(y, pilot, noise, workers=1)
-    np.testing.assert_array_equal(collaborative_wiener(y, pilot, noise, workers=workers), single)
+    single = wiener_and_thresholded(y, pilot, noise, Patches(), workers=1)
+    several = wiener_and_thresholded(y, pilot, noise, Patches(), workers=workers)
+    for found, expected in zip(several, single, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_the_mean_of_a_group_is_kept_however_much_noise_there_is() -> None:
+    """One group of all patches, whose pilot does not matter: only its mean is left."""
+    y, pilot, noise = pictures((12, 12), 16)
+    loud = Noise(np.full_like(noise.variance, 1e6), noise.kernel)
+    _, thresholded = wiener_and_thresholded(y, np.zeros_like(pilot), loud, Patches(12, 6, 18, 64))
+    np.testing.assert_allclose(thresholded, y.mean(dtype=float), rtol=1e-5)
+
+
+def test_what_stands_out_of_the_noise_is_kept_though_the_pilot_has_lost_it() -> None:
+    noise = Noise(np.ones((40, 40), np.float32), KERNEL)
+    y = np.full((40, 40), 5, np.float32)
+    y[20, 18:24] += 30
+    wiener, thresholded = wiener_and_thresholded(y, np.full_like(y, 5), noise, Patches(4, 3, 4, 8))
+    assert np.abs(wiener[20, 18:24] - y[20, 18:24]).min() > 20
+    np.testing.assert_allclose(thresholded[20, 18:24], y[20, 18:24], atol=6)
 
 
 def test_without_noise_the_picture_is_returned() -> None:
@@ -251,9 +186,7 @@ def test_refining_brings_a_texture_back_that_total_variation_flattens() -> None:
     row, column = np.indices(SHAPE)
     truth = (8 + 2.5 * np.sin(2 * np.pi * row / 6) * np.sin(2 * np.pi * column / 7)).astype(np.float32)
     operator = views_displaced_by(generator.uniform(-0.5, 0.5, (9, 2)))
-    expected = operator.forward(truth)
-    read_noise = generator.normal(0, np.sqrt(6.0), expected.shape)
-    images = ElementalImages((generator.poisson(expected + 0.3) + read_noise).astype(np.float32), 0.3, 6.0)
+    images = noisy_images(operator, truth, 0.3, 6.0, 14)
     start = smooth_start(operator, images)
     fit = DataFit(operator, images, float(start.mean()))
     weight = universal_penalty_weight(operator, images, start)

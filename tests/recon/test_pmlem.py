@@ -1,6 +1,6 @@
 """PMLEM against two independent solvers on a dense matrix, and its certificate against true distances."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice, pairwise
 
@@ -69,6 +69,89 @@ def test_total_variation_agrees_with_a_primal_dual_method(likelihood: Likelihood
     assert distance(found.plane, best) <= 1e-4
     differences = (difference_matrix() @ best.ravel()).reshape(2, -1)
     assert (np.hypot(*differences) < 1e-6).mean() > 0.2  # the penalty has an effect: pieces are flat
+
+
+def about(proposal: Image | None, posed: DenseProblem, *, tolerance: float = 0.01) -> Iterator[PmlemIterate]:
+    """Iterates with total variation counted from a proposal."""
+    fit, start = started(posed)
+    dual = replace(DualField.zero([SHAPE], start.dtype), proposal=proposal)
+    return pmlem(fit, start, penalty_weight=WEIGHT, tolerance=tolerance, dual=dual)
+
+
+def a_proposal(seed: int) -> Image:
+    """A plane with a box that the data do not show, and much that they contradict."""
+    proposal = np.random.default_rng(seed).uniform(0, 8, SHAPE)
+    proposal[4:7, 1:5] += 9
+    return proposal
+
+
+def settled_about(proposal: Image, posed: DenseProblem) -> PmlemIterate:
+    for found in about(proposal, posed, tolerance=1e-6):
+        if found.certificate.distance <= 1e-6 or found.passes >= 400:
+            break
+    return found
+
+
+@pytest.mark.parametrize("likelihood", ["shifted-poisson", "least-squares"])
+def test_total_variation_about_a_proposal_agrees_with_a_primal_dual_method(likelihood: LikelihoodName) -> None:
+    posed, proposal = problem(likelihood), a_proposal(20)
+    found = settled_about(proposal, posed)
+    assert distance(found.plane, primal_dual_solution(posed, WEIGHT, 5000, proposal)) <= 2e-4
+    assert distance(found.plane, solved(posed, WEIGHT, Penalty()).plane) > 0.1
+    value = DataFit(posed.operator, posed.images, 3.0).value_and_gradient(found.plane)[0]
+    penalty = np.hypot(*(difference_matrix() @ (found.plane - proposal).ravel()).reshape(2, -1)).sum()
+    assert found.objective == pytest.approx(value + WEIGHT * penalty, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("likelihood", LIKELIHOODS)
+def test_about_a_scene_with_a_false_box_no_plane_is_further_from_the_optimum_than_its_certificate_says(
+    likelihood: LikelihoodName, seed: int
+) -> None:
+    posed, proposal = problem(likelihood, seed=seed), np.full(SHAPE, 2.0)
+    proposal[2:6, 3:9] = 6
+    proposal[4:7, 1:5] += 4
+    proposal += np.random.default_rng(seed).normal(0, 0.5, SHAPE)
+    best = settled_about(proposal, posed).plane
+    metric = started(posed)[0].metric(best)
+    for tolerance in (0.1, 0.003):
+        iterates = list(islice(about(proposal, posed, tolerance=tolerance), 8))
+        for iterate in iterates:
+            assert norm(iterate.plane - best, metric) / norm(best, metric) <= iterate.certificate.distance + 1e-6
+        assert min(iterate.certificate.distance for iterate in iterates) <= tolerance
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_about_any_proposal_the_parts_of_the_certificate_bound_the_distance_by_its_true_curvature(seed: int) -> None:
+    """With m of the straight way to the optimum, `(a + √(a² + 4 m e))/2m` bounds the distance, by convexity alone.
+
+    A rough proposal that the data contradict has an m below the ½ that the certificate assumes.
+    """
+    posed, proposal = problem("least-squares", seed=seed), a_proposal(seed)
+    best = settled_about(proposal, posed).plane
+    metric = started(posed)[0].metric(best)
+    rows = posed.matrix[posed.counted()]
+    variance_e2 = posed.images.likelihood.level_e + posed.images.background_e + posed.images.read_variance_e2
+    for iterate in islice(about(proposal, posed, tolerance=0.003), 10):
+        away = iterate.plane - best
+        far, size = norm(away, metric), norm(iterate.plane, metric)
+        m = float(np.sum((rows @ away.ravel()) ** 2 / variance_e2)) / far**2
+        a, e = iterate.certificate.stationarity * size, (iterate.certificate.slack * size) ** 2 / 2
+        assert far <= (a + np.sqrt(a**2 + 4 * m * e)) / (2 * m) + 1e-5 * size
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_about_a_proposal_of_zeros_every_pass_is_the_same_to_the_last_bit(
+    dtype: type[np.float32] | type[np.float64],
+) -> None:
+    posed = problem(dtype=dtype)
+    for one, other in zip(islice(about(None, posed), 8), about(np.zeros(SHAPE, dtype), posed), strict=False):
+        np.testing.assert_array_equal(one.plane, other.plane)
+        assert (one.objective, one.certificate, one.inner_steps) == (
+            other.objective,
+            other.certificate,
+            other.inner_steps,
+        )
 
 
 @pytest.mark.parametrize("likelihood", LIKELIHOODS)

@@ -1,0 +1,201 @@
+"""`reconstruct --prior`: the files and records it promises, what it refuses, and errors below those without it."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.pipelines.cli import run
+
+type Command = Callable[..., CompletedProcess[str]]
+
+PATCHES = ("--prior", "patches")
+NEAR = ("--depth-mm", 500)
+BOTH = (*NEAR, "--depth-mm", 700)
+QUICK = ("--passes", 2, "--penalty-weight", 2)
+
+
+def _planes(folder: Path) -> list[dict[str, Any]]:
+    planes: list[dict[str, Any]] = json.loads((folder / "reconstruction.json").read_text())["planes"]
+    return planes
+
+
+def _record(folder: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((folder / "reconstruction.json").read_text())
+    return record
+
+
+def _files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("plane_*")}
+
+
+@pytest.fixture(scope="module")
+def dark_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """5 x 5 views of 128 x 96 px at the darkness of the paper, to be read only."""
+    folder = tmp_path_factory.mktemp("dark") / "scene"
+    words = ("simulate", folder, "--size-px", 128, 96, "--rows", 5, "--columns", 5, "--snr", 0.16)
+    assert run([str(word) for word in words]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def proposed(dark_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plane of the dark set by patches, with what was proposed, to be read only."""
+    out = tmp_path_factory.mktemp("proposed") / "out"
+    words = ("reconstruct", dark_set, *NEAR, *PATCHES, "--proposal", "--out", out)
+    assert run([str(word) for word in words]) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def without(dark_set: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same plane without a prior, to be read only."""
+    out = tmp_path_factory.mktemp("without") / "out"
+    assert run([str(word) for word in ("reconstruct", dark_set, *NEAR, "--out", out)]) == 0
+    return out
+
+
+def test_a_proposal_and_how_far_the_data_moved_the_plane_stand_beside_it(proposed: Path) -> None:
+    (plane,) = _planes(proposed)
+    assert plane["proposal_file"] == "plane_00500.0_proposal.tiff"
+    assert plane["moved_file"] == "plane_00500.0_moved.tiff"
+    light, x, moved = (tifffile.imread(proposed / plane[key]) for key in ("file", "proposal_file", "moved_file"))
+    assert light.dtype == x.dtype == moved.dtype == np.float32
+    assert min(light.min(), x.min()) >= 0
+    # Moved is the difference in positive units of noise
+    assert ((light - x) * moved >= 0).all()
+    other = moved != 0  # dark samples are exactly black in both
+    sigma = (light - x)[other] / moved[other]
+    assert other.mean() > 0.5
+    assert 0.1 < np.percentile(sigma, 1) < np.percentile(sigma, 99) < 10
+    assert plane["prior"]["moved_sigma"] == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=0.02)
+    assert 0 < plane["prior"]["moved_sigma"] < 1
+
+
+def test_the_record_has_the_mixture_of_each_region_and_the_certificate_of_the_plane(
+    proposed: Path, without: Path
+) -> None:
+    (plane,), (first,) = _planes(proposed), _planes(without)
+    assert plane["prior"]["name"] == "patches"
+    mixture = plane["prior"]["mixture"]
+    assert set(mixture) == {"light, detail", "light, smooth", "dark, detail", "dark, smooth"}
+    for weights in mixture.values():
+        assert list(weights) == ["tv", "wiener", "twice", "fine"]
+        assert min(weights.values()) >= 0
+        assert sum(weights.values()) == pytest.approx(1, abs=1e-9)
+    assert plane["certificate"]["reached"]
+    assert plane["certificate"]["passes"] == plane["passes"]
+    for key in ("penalty_weight", "penalty_weight_chosen", "penalty_weight_curve", "penalty", "likelihood"):
+        assert plane[key] == first[key]
+    assert plane["passes_before"] == pytest.approx(first["passes_before"] + first["passes"])
+    assert plane["mean_e"] == pytest.approx(tifffile.imread(proposed / plane["file"]).mean(dtype=float), rel=1e-6)
+    options = _record(proposed)["options"]
+    assert (options["prior"], options["proposal"]) == ("patches", True)
+
+
+def test_verify_vouches_for_what_stands_beside_a_plane(proposed: Path, faintfield: Command) -> None:
+    assert faintfield("verify", proposed).returncode == 0
+    for kind in ("proposal", "moved"):
+        path = proposed / f"plane_00500.0_{kind}.tiff"
+        whole = path.read_bytes()
+        path.write_bytes(whole[:-4] + b"\0\0\x80\x3f")
+        ended = faintfield("verify", proposed)
+        path.write_bytes(whole)
+        assert ended.returncode == 1
+        assert path.name in ended.stderr
+    assert faintfield("verify", proposed).returncode == 0
+
+
+def test_at_the_darkness_of_the_paper_the_plane_is_nearer_the_truth_than_without_the_prior(
+    proposed: Path, without: Path
+) -> None:
+    errors = []
+    for folder in (proposed, without):
+        (row,) = json.loads((folder / "metrics.json").read_text())["planes"]
+        errors.append(row["mse_plane"])
+    assert errors[0] < errors[1]
+
+
+def test_the_prior_of_total_variation_changes_nothing(scene: Path, tmp_path: Path, done: Command) -> None:
+    done("reconstruct", scene, *NEAR, *QUICK, "--out", tmp_path / "none")
+    done("reconstruct", scene, *NEAR, *QUICK, "--prior", "tv", "--out", tmp_path / "tv")
+    assert _files(tmp_path / "tv") == _files(tmp_path / "none")
+    for folder in ("none", "tv"):
+        record = _record(tmp_path / folder)
+        assert "prior" not in record["planes"][0]
+        assert not {"prior", "proposal"} & set(record["options"])
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((*PATCHES, "--penalty", "huber-tv"), "--prior patches starts from total variation, not from --penalty huber"),
+        ((*PATCHES, "--uncertainty"), "--uncertainty is known for total variation only, not for --prior patches"),
+        ((*PATCHES, "--method", "mlem"), "--prior patches is for pmlem, joint and occlusion, not for mlem"),
+        (("--proposal",), "--proposal saves what a prior proposes, and tv proposes nothing"),
+        (("--prior", "tv", "--proposal"), "give --prior patches"),
+    ],
+)
+def test_options_that_a_prior_does_not_know_are_refused(
+    words: tuple[object, ...], said: str, scene: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    ended = faintfield("reconstruct", scene, *NEAR, *words, "--out", tmp_path / "out")
+    assert ended.returncode == 2
+    assert said in ended.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [PATCHES, (*PATCHES, "--proposal")])
+def test_a_surface_has_no_prior(words: tuple[object, ...], scene: Path, tmp_path: Path, faintfield: Command) -> None:
+    ended = faintfield("reconstruct", scene, "--surface", *words, "--out", tmp_path / "out")
+    assert ended.returncode == 2
+    assert "--prior" in ended.stderr
+
+
+def test_planes_found_together_have_a_proposal_and_a_certificate_each(
+    dark_set: Path, tmp_path: Path, done: Command
+) -> None:
+    done("reconstruct", dark_set, *BOTH, "--joint", "--occlusion", *PATCHES, "--proposal", "--out", tmp_path)
+    for method in ("joint", "occlusion"):
+        planes = _planes(tmp_path / method)
+        assert len(planes) == 2
+        assert planes[0]["prior"]["mixture"] != planes[1]["prior"]["mixture"]
+        for plane in planes:
+            assert plane["prior"]["name"] == "patches"
+            assert plane["certificate"]["reached"]
+            assert np.isfinite(plane["prior"]["moved_sigma"])
+            assert np.isfinite(tifffile.imread(tmp_path / method / plane["moved_file"])).all()
+
+
+def test_planes_of_another_prior_are_made_anew_and_those_of_the_same_are_kept(
+    scene: Path, tmp_path: Path, done: Command
+) -> None:
+    words = ("reconstruct", scene, *NEAR, *QUICK, "--out", tmp_path)
+    done(*words, *PATCHES)
+    by_patches = _files(tmp_path)
+    assert "1 of 1 planes are there" in done(*words, *PATCHES).stderr
+    assert "are there" not in done(*words, *PATCHES, "--proposal").stderr
+    assert set(_files(tmp_path)) == {*by_patches, "plane_00500.0_proposal.tiff", "plane_00500.0_moved.tiff"}
+    assert "are there" not in done(*words).stderr
+    by_variation = _files(tmp_path)
+    assert set(by_variation) == set(by_patches)
+    assert by_variation["plane_00500.0.tiff"] != by_patches["plane_00500.0.tiff"]
+    assert "are there" not in done(*words, *PATCHES).stderr
+    assert _files(tmp_path) == by_patches
+
+
+def test_too_few_views_give_the_plane_of_total_variation_and_say_so(tmp_path: Path, done: Command) -> None:
+    done("simulate", tmp_path / "set", "--size-px", 64, 48, "--rows", 1, "--columns", 3)
+    for name, words in (("tv", ()), ("patches", (*PATCHES, "--proposal"))):
+        done("reconstruct", tmp_path / "set", *NEAR, *words, "--out", tmp_path / name)
+    (plane,), (first,) = _planes(tmp_path / "patches"), _planes(tmp_path / "tv")
+    assert plane["prior"] == {"name": "tv", "left_out": "too few views to hold some out"}
+    assert not {"proposal_file", "moved_file"} & set(plane)
+    assert (tmp_path / "patches" / plane["file"]).read_bytes() == (tmp_path / "tv" / first["file"]).read_bytes()
+    again = done("reconstruct", tmp_path / "set", *NEAR, *PATCHES, "--proposal", "--out", tmp_path / "patches")
+    assert "1 of 1 planes are there" in again.stderr
