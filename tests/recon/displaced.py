@@ -1,5 +1,7 @@
 """Views displaced beside one another, whose weights on the samples are known in closed form."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
@@ -24,7 +26,7 @@ def views_displaced_by(
 
 
 def planes_displaced_by(
-    shifts: list[Image],
+    shifts: Sequence[Image],
     shape: tuple[int, int] = SHAPE,
     *,
     transmission: Image | None = None,

@@ -67,7 +67,7 @@ def test_the_mixture_is_as_good_as_that_of_a_general_solver(seed: int, count: in
     best = best_mixture(found)
     assert is_a_mixture(best)
     size, scale = found.towards.size, float(np.trace(found.gram))
-    solved = minimize(
+    solved = minimize(  # type: ignore[call-overload]
         lambda a: found.loss(a) / scale,
         np.full(size, 1 / size),
         jac=lambda a: 2 * (found.gram @ a - found.towards) / scale,
@@ -77,6 +77,14 @@ def test_the_mixture_is_as_good_as_that_of_a_general_solver(seed: int, count: in
         options={"ftol": 1e-12},
     )
     assert found.loss(best) / scale <= solved.fun + 1e-7
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e12])
+def test_weights_sum_to_one_whatever_the_scale_of_the_light(scale: float) -> None:
+    found = random_scores(4, 5, 4)
+    best = best_mixture(Scores(scale * found.gram, scale * found.towards))
+    assert best.sum() == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(best, best_mixture(found), atol=1e-6)
 
 
 def test_where_all_predict_alike_the_first_is_chosen_and_fewer_before_more() -> None:

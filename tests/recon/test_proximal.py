@@ -95,7 +95,7 @@ def test_strips_and_threads_change_nothing(dtype: type[np.float32] | type[np.flo
     generator = np.random.default_rng(5)
     v: Image = generator.normal(2, 1, (300, 31)).astype(dtype)
     w: Image = generator.uniform(0.5, 2, (300, 31)).astype(dtype)
-    proposal = generator.normal(2, 1, (300, 31)).astype(dtype) if proposed else None
+    proposal: Image | None = generator.normal(2, 1, (300, 31)).astype(dtype) if proposed else None
     planes = []
     for workers in (1, 3, 4):
         dual = DualField([np.zeros((2, 300, 31), dtype)], proposal, workers)
