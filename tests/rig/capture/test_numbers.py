@@ -225,3 +225,9 @@ def test_the_remaining_time_is_the_sum_of_motions_stops_exposures_and_checks() -
         bench.clock.sleep_s(100.0)
         pace.arrive(b, timed=timed)
     assert pace.remaining_s(again, 0) == pytest.approx(4.0 + 0.9 + 7.0 + 0.5 + 7.0)
+
+
+def test_where_one_corner_is_enough_a_node_that_sees_none_is_named() -> None:
+    frames = board_frames(sweeps=1, nodes=3)
+    (found,) = (it for it in board_warnings(frames[2], frames, {0: 4, 1: 0, 2: 4}, 1) if "nodes" in it)
+    assert found.startswith("1 of 3 nodes see 1 board corners in no sweep ([0, 1])")
