@@ -1,5 +1,6 @@
 """Messages and progress bars, always on standard error; standard output is for results only."""
 
+import itertools
 import logging
 import threading
 import time
@@ -114,7 +115,7 @@ def working(label: str) -> Iterator[None]:
         yield
 
 
-@dataclass
+@dataclass(eq=False)
 class _Report:
     """Lines about work that takes long: the first after 2 s, then one every 10 s.
 
@@ -183,14 +184,16 @@ def _said_while(report: _Report) -> Iterator[None]:
         yield
     finally:
         finished.set()
-        _reports.remove(report)
+        # The thread itself may close an abandoned generator: it ends after its line
         if thread is not threading.current_thread():
             thread.join()
+        _reports.remove(report)
 
 
 def _parts_speak(report: _Report) -> bool:
     """Return whether a part of the work has already said what it does."""
-    return any(part.spoke for part in _reports[_reports.index(report) + 1 :])
+    parts = itertools.dropwhile(lambda other: other is not report, tuple(_reports))
+    return any(part.spoke for part in parts if part is not report)
 
 
 def _in_lines[T](items: Iterable[T], label: str, total: int | None) -> Generator[T]:

@@ -1,6 +1,7 @@
 """What takes long says so off a terminal: lines by a clock of its own, and none for what is short."""
 
 import io
+import threading
 import time
 
 import pytest
@@ -91,3 +92,27 @@ def test_a_bar_that_is_drawn_goes_on_while_a_part_works(monkeypatch: pytest.Monk
     assert taken == [1, 2]
     assert "[alone]" in screen.getvalue()
     assert "[part]" not in screen.getvalue()
+
+
+def test_a_line_that_falls_due_as_the_work_ends_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    speaking, removed = threading.Event(), threading.Event()
+
+    class Reports(list[_Report]):
+        def remove(self, report: _Report, /) -> None:
+            super().remove(report)
+            removed.set()
+
+    def line(_: _Report) -> str:
+        speaking.set()
+        removed.wait(0.2)  # for ever, if the thread is waited for before its report is removed
+        return "late"
+
+    failures: list[threading.ExceptHookArgs] = []
+    monkeypatch.setattr(threading, "excepthook", failures.append)
+    monkeypatch.setattr(console, "_reports", Reports())
+    monkeypatch.setattr(console, "_FIRST_LINE_S", 0.0)
+    monkeypatch.setattr(_Report, "line", line)
+    with working("ending"):
+        speaking.wait()
+    assert failures == []
+    assert removed.is_set()
