@@ -18,6 +18,10 @@ from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 # IPOPT prints nothing only with all of these. It also tries points with a negative variance, and backs off by itself.
 _QUIET: dict[str, Any] = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "show_eval_warnings": False}
 
+# Gradient of −ln L per unit of a parameter at which the search ends. A gradient of one is one standard error where that
+# is one unit, and −ln L of 10⁵ is rounded such that its gradient may not come below 10⁻⁷.
+_TOLERANCE = 1e-6
+
 # Limits of parameters. Without dark signal nothing determines the gain, and the search would not end.
 _LIMITS = {"jitter_dn2": (0.0, np.inf), "log_gain": (np.log(1e-4), np.log(1e4))}
 
@@ -61,7 +65,8 @@ class NoiseFit:
         (Biometrics Bulletin 2, 110, 1946), from the variance of the variance.
         """
         variance = float(gradient @ self.covariance @ gradient)
-        spread = sum(min(float(gradient @ c @ gradient), variance) ** 2 / freedom for c, freedom in self.sources)
+        shares = ((float(np.clip(gradient @ c @ gradient, 0, variance)), freedom) for c, freedom in self.sources)
+        spread = sum(share**2 / freedom for share, freedom in shares)
         if not spread > 1e-6 * variance**2:
             return float(stats.norm.ppf(0.975))
         return float(stats.t.ppf(0.975, variance**2 / spread))
@@ -93,9 +98,8 @@ class GaussianProblem:
         symbols: Any = ca.vertsplit(p)
         moments = replace(moments, excess=Excess(*symbols))
         objective = negative_log_likelihood(values, moments)
-        self._solver = ca.nlpsol(
-            "fit", "ipopt", {"x": x, "p": p, "f": objective}, _QUIET | {"ipopt.acceptable_iter": 0}
-        )
+        options = _QUIET | {"ipopt.acceptable_iter": 0, "ipopt.tol": _TOLERANCE}
+        self._solver = ca.nlpsol("fit", "ipopt", {"x": x, "p": p, "f": objective}, options)
         self._hessian = ca.Function("hessian", [x, p], [ca.hessian(objective, x)[0]])
 
     def fit(self, excess: Excess, near: Mapping[str, float] | None = None) -> NoiseFit:

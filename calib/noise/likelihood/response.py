@@ -27,7 +27,7 @@ BENDS = tuple(f"nonlinearity_per_dn{power}" for power in ("", "2", "3", "4", "5"
 
 # Standard error of the bend at the end of the range before it is measured: where the light of the flats tells it, and
 # where nothing does. The second is the model error of an unbent sensor: 95 % of cameras bend by less than twice that.
-MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.01
+MEASURED_BEND_SE, UNKNOWN_BEND_SE = 0.3, 0.012
 
 # Largest range that counts, over the brightest flat, since 16 bits may hold 12; no converter has fewer than 8.
 _RANGE_OVER_BRIGHTEST, _MIN_RANGE_DN = 2.0, 255.0
@@ -38,8 +38,9 @@ _MIN_SPAN, _LEVELS_FOR_BENDS = 2.0, (2, 4, 7, 11)
 # A further coefficient is fitted if the levels scatter less with it by an F test of this probability.
 _MAX_CHANCE = 0.1
 
-# Residuals are chance alone if those of a good model are larger with this probability.
-_USUAL_CHANCE = 0.1
+# Residuals are chance alone if those of a good model are larger with this probability. With few degrees of freedom an
+# interval grows so much, by Student's t, that only unlikely ones count.
+_USUAL_CHANCE, _FEW_FREEDOM, _CHANCE_OF_FEW = 0.3, 8, 0.1
 
 # Range of the linearity error as fractions of saturation, and the fewest levels in it; EMVA 1288 release 4.0.
 LINEARITY_RANGE, _MIN_LINEARITY_LEVELS = (0.05, 0.95), 3
@@ -142,7 +143,8 @@ def scatter_of_levels(light: Light, signal_dn: Array, variance_dn2: Array, bends
 
 def grown_variance(deviance: Callable[[float], float], freedom: float, start: float = 1e-12) -> float:
     """Return the excess variance at which a falling deviance equals its degrees of freedom; 0 if chance makes it."""
-    if freedom < 1 or stats.chi2.sf(deviance(0.0), freedom) > _USUAL_CHANCE:
+    usual = _USUAL_CHANCE if freedom >= _FEW_FREEDOM else _CHANCE_OF_FEW
+    if freedom < 1 or stats.chi2.sf(deviance(0.0), freedom) > usual:
         return 0.0
     low, high = 0.0, start
     while deviance(high) > freedom:

@@ -115,7 +115,7 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
     if fitted.flats and fitted.light_unknown:
         warnings.append(
             f"the light of the flats is not known well enough to tell a bend of the response from the gain; the "
-            f"intervals allow for {2 * UNKNOWN_BEND_SE:.0%} at the end of the range: state the photons of at least 3 "
+            f"intervals allow for {2 * UNKNOWN_BEND_SE:.1%} at the end of the range: state the photons of at least 3 "
             "light levels, or record 3 exposures under one light"
         )
     return warnings

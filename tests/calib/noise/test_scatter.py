@@ -1,13 +1,16 @@
 """Intervals grow by the scatter that the series show, and quantities that the series deny have no value."""
 
 from dataclasses import replace
+from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy import stats
 
+from benchmarks.noise_coverage import CASES, record
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
-from faintfield.calib.noise.likelihood.maximum import NoiseFit
+from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
 from faintfield.calib.noise.misfit.scatter import block_scatter
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
@@ -105,6 +108,31 @@ def test_the_quantile_is_students_where_the_scatter_rules_and_normal_where_it_do
     assert fit.quantile(np.array([0.0, 1.0])) == pytest.approx(stats.norm.ppf(0.975))
     # Half of the variance rests on 3 degrees of freedom: Satterthwaite's are 2² 3 = 12
     assert fit.quantile(np.array([0.5, 1.0])) == pytest.approx(stats.t.ppf(0.975, 12))
+    # A share that rounding makes negative is none
+    shrunk = replace(fit, sources=((np.diag([-1e9, 0.0]), 3),))
+    assert shrunk.quantile(np.array([1.0, 0.0])) == pytest.approx(stats.norm.ppf(0.975))
+
+
+def test_the_search_ends_where_the_likelihood_is_rounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """−ln L of many values is so large that its rounding leaves a gradient above IPOPT's usual limit."""
+    asked: list[str] = []
+    solved: list[str] = []
+
+    def counted_fit(self: GaussianProblem, *given: Any) -> NoiseFit:
+        asked.append("fit")
+        return fit(self, *given)
+
+    def counted_call(self: ca.Function, *given: Any, **named: Any) -> Any:
+        solved.append(self.name())
+        return call(self, *given, **named)
+
+    fit, call = GaussianProblem.fit, ca.Function.__call__
+    monkeypatch.setattr(GaussianProblem, "fit", counted_fit)
+    monkeypatch.setattr(ca.Function, "__call__", counted_call)
+    camera, session = CASES["noise off by 2 %"]
+    calibrate(record(camera, session, np.random.default_rng(5)), camera.highest_dn)
+    assert asked
+    assert solved.count("fit") == len(asked)  # no search failed and was begun anew
 
 
 def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
