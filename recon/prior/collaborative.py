@@ -37,14 +37,23 @@ class Patches(NamedTuple):
     members: int = 64
 
 
+# Least variance of a coefficient, relative to that of a sample.
+_LEAST_VARIANCE = 0.01
+
 # A coefficient below so many standard deviations of its noise is taken for noise.
 _THRESHOLD = 2.7
 
 
 def collaborative_wiener(
-    picture: Image, pilot: Image, noise: Noise, patches: Patches | None = None, *, workers: int | None = None
+    picture: Image,
+    pilot: Image,
+    noise: Noise,
+    patches: Patches | None = None,
+    *,
+    guide: Image | None = None,
+    workers: int | None = None,
 ) -> NDArray[np.float32]:
-    """Return a picture (row, column) without its noise, filtered in groups of patches that are alike in the pilot.
+    """Return a picture (row, column) without its noise, filtered in groups of patches that are alike in the guide.
 
     The collaborative filter of Dabov, Foi, Katkovnik and Egiazarian (2007), second step: each group of alike patches is
     transformed by cosines along rows and columns and by Haar's wavelets along the group, and each coefficient of the
@@ -60,6 +69,8 @@ def collaborative_wiener(
         other patch keep the pilot's value.
     patches : Patches, optional
         How groups are formed.
+    guide : float array (row, column), optional
+        A picture of the same scene in which alike patches are found; the pilot by default.
     workers : int, optional
         Number of threads; the result does not depend on it.
 
@@ -68,30 +79,46 @@ def collaborative_wiener(
     ValueError
         Shapes differ, the picture is smaller than a patch, or the size of a patch is not a multiple of four.
     """
-    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), workers, also_thresholded=False)
+    (wiener,) = _filtered(picture, pilot, noise, patches or Patches(), guide, workers, also_thresholded=False)
     return wiener
 
 
 def wiener_and_thresholded(
-    picture: Image, pilot: Image, noise: Noise, patches: Patches, *, workers: int | None = None
+    picture: Image,
+    pilot: Image,
+    noise: Noise,
+    patches: Patches,
+    *,
+    guide: Image | None = None,
+    workers: int | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return what `collaborative_wiener` returns, and the picture whose groups keep what stands out of the noise.
 
     The second (the filter's first step) keeps the coefficients of the picture itself that exceed 2.7 standard
     deviations of their noise. So it also shows what the pilot lost.
     """
-    wiener, thresholded = _filtered(picture, pilot, noise, patches, workers, also_thresholded=True)
+    wiener, thresholded = _filtered(picture, pilot, noise, patches, guide, workers, also_thresholded=True)
     return wiener, thresholded
 
 
 def _filtered(
-    picture: Image, pilot: Image, noise: Noise, patches: Patches, workers: int | None, *, also_thresholded: bool
+    picture: Image,
+    pilot: Image,
+    noise: Noise,
+    patches: Patches,
+    guide: Image | None,
+    workers: int | None,
+    *,
+    also_thresholded: bool,
 ) -> list[NDArray[np.float32]]:
     """Return the picture (row, column) as each filter leaves it."""
-    picture, pilot, variance = (np.ascontiguousarray(array, np.float32) for array in (picture, pilot, noise.variance))
-    _check(picture, pilot, variance, patches)
+    guide = pilot if guide is None else guide
+    picture, pilot, guide, variance = (
+        np.ascontiguousarray(array, np.float32) for array in (picture, pilot, guide, noise.variance)
+    )
+    _check(picture, pilot, guide, variance, patches)
     # A distance to NaN is below none
-    seen = np.where(np.isfinite(variance), pilot, np.float32(np.nan))
+    guide = np.where(np.isfinite(variance), guide, np.float32(np.nan))
     above, below = np.zeros((2, 2 if also_thresholded else 1, *pilot.shape), np.float32)
     transform = _transform(noise.kernel, patches.size)
     rows, columns = (_corners(length, patches) for length in pilot.shape)
@@ -99,7 +126,7 @@ def _filtered(
     def work(strips: list[NDArray[np.intp]]) -> None:
         for strip in strips:
             search = (patches.radius, patches.members, np.float32(_THRESHOLD))
-            filter_rows(picture, seen, variance, strip, columns, search, transform, above, below)
+            filter_rows(picture, pilot, guide, variance, strip, columns, search, transform, above, below)
 
     # Groups reach into the next strips, but no farther: the strips of one turn can be filtered at the same time
     strip_of_row = rows // (2 * patches.radius + patches.size)
@@ -114,13 +141,11 @@ def _filtered(
     return list(above)
 
 
-def _check(picture: Image, pilot: Image, variance: Image, patches: Patches) -> None:
+def _check(picture: Image, pilot: Image, guide: Image, variance: Image, patches: Patches) -> None:
     """Refuse shapes that differ or are too small for a patch, and sizes that are not multiples of four (ValueError)."""
-    if not picture.shape == pilot.shape == variance.shape:
-        raise ValueError(
-            f"picture, pilot and variance have shapes {picture.shape}, {pilot.shape} and {variance.shape}; give "
-            "all the same"
-        )
+    shapes = [array.shape for array in (picture, pilot, guide, variance)]
+    if len(set(shapes)) > 1:
+        raise ValueError(f"picture, pilot, guide and variance have shapes {shapes}; give all the same")
     if patches.size < 4 or patches.size % 4 or patches.size > min(picture.shape):
         raise ValueError(
             f"patches of {patches.size} samples in a picture {picture.shape}; give a multiple of four that fits into it"
@@ -144,6 +169,8 @@ def _transform(kernel: NDArray[np.float64], size: int) -> Transform:
             np.einsum("ki,ij,kj->k", cosines, np.eye(size, k=lag), cosines) for lag in (down, right)
         )
         variances += kernel[1 + down, 1 + right] * np.outer(along_rows, along_columns)
+    # A kernel measured on one draw need not be positive definite
+    variances = np.maximum(variances, _LEAST_VARIANCE)
     window = np.kaiser(size, _KAISER_BETA)
     arrays = cosines, cosines.T, variances, np.outer(window, window)
     return Transform(*(np.ascontiguousarray(array, np.float32) for array in arrays))

@@ -39,13 +39,13 @@ class Transform(NamedTuple):
 
 
 @compiled
-def filter_rows(picture, pilot, variance, rows, columns, search, transform, above, below):
+def filter_rows(picture, pilot, guide, variance, rows, columns, search, transform, above, below):
     """Filter the groups of all reference patches whose first samples lie in `rows` x `columns`.
 
     Parameters
     ----------
-    picture, pilot, variance : float32 array (row, column)
-        y, u and the variance of y. No patch with a NaN in the pilot belongs to a group.
+    picture, pilot, guide, variance : float32 array (row, column)
+        y, u, a picture l in which patches are compared, and the variance of y. A patch with NaN in l has no group.
     rows, columns : int array
         First row and column of the reference patches.
     search : (int, int, float)
@@ -64,7 +64,7 @@ def filter_rows(picture, pilot, variance, rows, columns, search, transform, abov
     found = np.empty(columns.size, np.intp)
     patches = np.empty((4, size * size * members), np.float32)
     for row in rows:
-        _find_alike(pilot, row, columns, size, radius, distances, places, found)
+        _find_alike(guide, row, columns, size, radius, distances, places, found)
         for k in range(columns.size):
             count = 1
             while 2 * count <= found[k]:
@@ -80,9 +80,9 @@ def _outwards(step):
 
 
 @compiled
-def _find_alike(pilot, row, columns, size, radius, distances, places, found):
-    """Find the patches nearest to each reference patch of a row, by squared distance in the pilot, nearest first."""
-    height, width = pilot.shape
+def _find_alike(guide, row, columns, size, radius, distances, places, found):
+    """Find the patches nearest to each reference patch of a row, by squared distance, nearest first."""
+    height, width = guide.shape
     squares = np.empty(width, np.float32)
     found[:] = 0
     distances[:] = np.inf
@@ -93,7 +93,7 @@ def _find_alike(pilot, row, columns, size, radius, distances, places, found):
         for horizontal in range(2 * radius + 1):
             shift = _outwards(horizontal)
             start, stop = max(0, -shift), min(width, width - shift)
-            _sum_squares(pilot, row, other, shift, start, stop, size, squares)
+            _sum_squares(guide, row, other, shift, start, stop, size, squares)
             for k in range(columns.size):
                 column = columns[k]
                 if column >= start and column + size <= stop:
@@ -105,9 +105,9 @@ def _find_alike(pilot, row, columns, size, radius, distances, places, found):
 
 
 @compiled
-def _sum_squares(pilot, row, other, shift, start, stop, size, squares):
-    """Set `squares` from `start` to `stop` to the sums over `size` rows of `(u[row, x] − u[other, x + shift])²`."""
-    plane, width = pointer(pilot), pilot.shape[1]
+def _sum_squares(guide, row, other, shift, start, stop, size, squares):
+    """Set `squares` from `start` to `stop` to the sums over `size` rows of `(l[row, x] − l[other, x + shift])²`."""
+    plane, width = pointer(guide), guide.shape[1]
     total = advanced(pointer(squares), start)
     count = index(stop - start)
     for i in range(0, size, 4):

@@ -47,16 +47,24 @@ class Evidence(NamedTuple):
         Covariance of y.
     coverage : float array (row, column)
         `H_zᵀ H_z 1`; zero where no view sees the plane, and y and u are zero there.
+    others : float array (row, column), optional
+        What the plane shows in other colours, as blurred as y.
     """
 
     picture: Image
     pilot: Image
     noise: Noise
     coverage: Image
+    others: Image | None = None
 
 
 def evidence_of_planes(
-    operator: SceneOperator, images: ElementalImages, samples: Image, views: ViewSelection = None
+    operator: SceneOperator,
+    images: ElementalImages,
+    samples: Image,
+    views: ViewSelection = None,
+    *,
+    others: Image | None = None,
 ) -> list[Evidence]:
     """Return the evidence of each plane of a scene, `y_z = u_z + H_zᵀ(g − b − H f) / H_zᵀ H_z 1`.
 
@@ -68,6 +76,8 @@ def evidence_of_planes(
         f ≥ 0, in electrons.
     views : sequence of int, optional
         The views that count; all by default.
+    others : float array (samples), optional
+        The planes in other colours.
     """
     seen = operator.adjoint_of_forward(samples, views)
     residual = operator.adjoint(images.electrons, views) - seen
@@ -77,28 +87,28 @@ def evidence_of_planes(
     drawn = _drawn_noise(operator, images, samples, views, (0, 0))
     found = []
     parts = (operator.planes_of(array) for array in (residual, variance, drawn))
-    for own, coverage, *of_plane in zip(*_of_each(operator, samples, seen, views), *parts, strict=True):
-        of_residual, of_variance, of_draw = of_plane
-        pilot, change = (_divided(array, coverage) for array in (own, of_residual))
+    own = _alone(operator, samples, seen, views)
+    coverages = _alone(operator, np.ones_like(samples), operator.coverage(views), views)
+    for of_pilot, coverage, of_residual, of_variance, of_draw in zip(own, coverages, *parts, strict=True):
+        pilot, change = (_divided(array, coverage) for array in (of_pilot, of_residual))
         noise = _noise(coverage, of_variance, [of_draw])
         found.append(Evidence(pilot + change, pilot, noise, coverage))
+    if others is not None:
+        shown = map(_divided, _alone(operator, others, operator.adjoint_of_forward(others, views), views), coverages)
+        found = [one._replace(others=light) for one, light in zip(found, shown, strict=True)]
     return found
 
 
-def _of_each(
-    operator: SceneOperator, samples: Image, seen: Image, views: ViewSelection
-) -> tuple[list[Image], list[Image]]:
-    """Return `H_zᵀ H_z f_z` and `H_zᵀ H_z 1` of each plane z alone, (row, column); `seen` is Hᵀ H f."""
+def _alone(operator: SceneOperator, samples: Image, seen: Image, views: ViewSelection) -> list[Image]:
+    """Return `H_zᵀ H_z f_z` (row, column) of each plane z alone; `seen` is Hᵀ H f."""
     if len(operator.grids) == 1:
-        return operator.planes_of(seen), operator.planes_of(operator.coverage(views))
-    own: list[Image] = []
-    coverages: list[Image] = []
-    for index in range(len(operator.grids)):
-        for found, light in ((own, samples), (coverages, np.ones_like(samples))):
-            alone = np.zeros_like(samples)
-            operator.planes_of(alone)[index][:] = operator.planes_of(light)[index]
-            found.append(operator.planes_of(operator.adjoint_of_forward(alone, views))[index].copy())
-    return own, coverages
+        return operator.planes_of(seen)
+    found = []
+    for index, light in enumerate(operator.planes_of(samples)):
+        alone = np.zeros_like(samples)
+        operator.planes_of(alone)[index][:] = light
+        found.append(operator.planes_of(operator.adjoint_of_forward(alone, views))[index].copy())
+    return found
 
 
 def _divided(sums: Image, coverage: Image) -> Image:

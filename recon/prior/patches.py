@@ -18,16 +18,23 @@ def patch_candidates(evidence: Evidence) -> dict[str, Image]:
     "tv" is the pilot, the plane that the penalty gave; "wiener" the collaborative Wiener filter with this pilot;
     "twice" the filter again, its pilot the mean of the first result and of the groups that keep what stands out of the
     noise, which shows what the penalty lost; "fine" the same with small patches, whose pilot is "twice" and the small
-    groups that keep. A plane smaller than a patch has its pilot only.
+    groups that keep. A plane smaller than a patch has its pilot only. Patches are alike if they are so in the sum of
+    the pilot and of what other colours show.
     """
-    picture, pilot, noise, _ = evidence
+    picture, pilot, noise, _, others = evidence
+
+    def guide(pilot: Image) -> Image:
+        return pilot if others is None else pilot + others
+
     found = {"tv": pilot}
     if min(pilot.shape) >= _LARGE.size:
-        wiener, thresholded = wiener_and_thresholded(picture, pilot, noise, _LARGE)
+        wiener, thresholded = wiener_and_thresholded(picture, pilot, noise, _LARGE, guide=guide(pilot))
         found["wiener"] = wiener
-        found["twice"] = collaborative_wiener(picture, (wiener + thresholded) / 2, noise, _LARGE)
-        _, thresholded = wiener_and_thresholded(picture, pilot, noise, _SMALL)
-        found["fine"] = collaborative_wiener(picture, (found["twice"] + thresholded) / 2, noise, _SMALL)
+        better = (wiener + thresholded) / 2
+        found["twice"] = collaborative_wiener(picture, better, noise, _LARGE, guide=guide(better))
+        _, thresholded = wiener_and_thresholded(picture, pilot, noise, _SMALL, guide=guide(pilot))
+        better = (found["twice"] + thresholded) / 2
+        found["fine"] = collaborative_wiener(picture, better, noise, _SMALL, guide=guide(better))
     return found
 
 

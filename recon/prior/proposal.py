@@ -30,6 +30,10 @@ _BORDER_BLUR = (1, 1, 2)
 # photographs, as are the spacings of the blurs of the change and of what is in detail.
 _DETAIL_SHARE, _CHANGE_BLUR, _DETAIL_BLUR = 0.15, (1, 1), (1, 1, 2)
 
+# What a plane has beyond its blurred self counts where its square exceeds this share of the noise's variance. Chosen on
+# the scenes of `CHOSEN_ON` in benchmarks/uncertainty.py; the blur of that square.
+_SHARP_SHARE, _SHARP_BLUR = 0.1, (1,)
+
 # Candidates of one plane by name, all as blurred as the evidence.
 type Candidates = Callable[[Evidence], dict[str, Image]]
 
@@ -49,11 +53,17 @@ class PlaneProposal:
         Standard deviation of the back-projection, in electrons; infinite where no view sees.
     mixture : dict of str to dict of str to float
         Weight of each candidate, by region: "light" or "dark", "detail" or "smooth".
+    evidence : Evidence
+        What it is made of.
+    again : callable
+        Returns the picture that the same mixture makes of other evidence and total variation's plane.
     """
 
     picture: Image
     sigma: Image
     mixture: dict[str, dict[str, float]]
+    evidence: Evidence
+    again: Callable[[Evidence, Image], Image]
 
 
 def propose(
@@ -62,6 +72,8 @@ def propose(
     evidences: Sequence[Evidence],
     penalty_weight: float,
     candidates: Candidates,
+    *,
+    others: Image | None = None,
 ) -> list[PlaneProposal]:
     """Return a proposal for each plane of a scene: a mixture of candidates, with weights from held-out views.
 
@@ -81,6 +93,8 @@ def propose(
     candidates : callable
         Returns the candidates for one plane by name, given its evidence: always the same names. The first is chosen
         where all predict alike.
+    others : float array (samples), optional
+        The planes in other colours, for the evidence of the folds.
 
     Raises
     ------
@@ -91,16 +105,16 @@ def propose(
     views = operator.seeing_views
     if len(views) < MIN_VIEWS:
         raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {len(views)}")
-    regions = [_regions(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
+    regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
     totals: list[list[Scores]] = [[] for _ in evidences]
     for fold in range(max(_MIN_FOLDS, folds_to_predict(problem))):
         held_out = views[validation_views(len(views), fold)]
         planes = _planes_of_fold(problem, samples, penalty_weight, np.setdiff1d(views, held_out))
-        found = _fold_scores(problem, planes, held_out, candidates, regions)
+        found = _fold_scores(problem, planes, held_out, candidates, regions, others)
         totals = [_summed(*of_plane) for of_plane in zip(totals, found, strict=True)]
     mixtures = [[best_mixture(of_region) for of_region in of_plane] for of_plane in totals]
-    made = (candidates(evidence) for evidence in evidences)
-    return [_mixed(*of_plane) for of_plane in zip(evidences, made, regions, mixtures, strict=True)]
+    pictures = operator.planes_of(samples)
+    return [_proposal(candidates, *of_plane) for of_plane in zip(pictures, evidences, regions, mixtures, strict=True)]
 
 
 def _summed(total: list[Scores], more: list[Scores]) -> list[Scores]:
@@ -108,7 +122,7 @@ def _summed(total: list[Scores], more: list[Scores]) -> list[Scores]:
     return [a + b for a, b in zip(total, more, strict=True)] if total else more
 
 
-def _regions(plane: Image, evidence: Evidence) -> Regions:
+def regions_of(plane: Image, evidence: Evidence) -> Regions:
     """Return the regions of a plane with light or without, with detail or without."""
     lit = blurred((opacity(plane) > 0.5).astype(np.float32), _BORDER_BLUR)
     seen = np.isfinite(evidence.noise.variance)
@@ -125,12 +139,18 @@ def _regions(plane: Image, evidence: Evidence) -> Regions:
 
 
 def _fold_scores(
-    problem: SceneProblem, planes: Image, held_out: NDArray[np.intp], candidates: Candidates, regions: list[Regions]
+    problem: SceneProblem,
+    planes: Image,
+    held_out: NDArray[np.intp],
+    candidates: Candidates,
+    regions: list[Regions],
+    others: Image | None,
 ) -> list[list[Scores]]:
     """Return the scores of each plane's candidates from the training views, by region."""
     operator, images = problem.operator, problem.images
     training = np.setdiff1d(operator.seeing_views, held_out)
-    made = [list(candidates(one).values()) for one in evidence_of_planes(operator, images, planes, training)]
+    known = evidence_of_planes(operator, images, planes, training, others=others)
+    made = [list(candidates(one).values()) for one in known]
     truths = evidence_of_planes(operator, images, planes, held_out)
     return [
         [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]
@@ -155,16 +175,44 @@ def _planes_of_fold(problem: SceneProblem, samples: Image, penalty_weight: float
     return iterate.plane
 
 
-def _mixed(
-    evidence: Evidence, made: dict[str, Image], regions: Regions, mixture: list[NDArray[np.float64]]
+def _proposal(
+    candidates: Candidates, plane: Image, evidence: Evidence, regions: Regions, mixture: list[NDArray[np.float64]]
 ) -> PlaneProposal:
     """Return the proposal for one plane from the evidence of all views."""
-    picture = np.zeros_like(evidence.picture)
+    made = candidates(evidence)
+    named = {
+        region: dict(zip(made, weights.tolist(), strict=True)) for region, weights in zip(regions, mixture, strict=True)
+    }
+
+    def again(other: Evidence, other_plane: Image) -> Image:
+        return _sharpened(_mixed(candidates(other), regions, mixture), other_plane, other)
+
+    picture = _sharpened(_mixed(made, regions, mixture), plane, evidence)
+    return PlaneProposal(picture, np.sqrt(evidence.noise.variance), named, evidence, again)
+
+
+def _sharpened(mixed: Image, plane: Image, evidence: Evidence) -> Image:
+    """Return x̂ ≥ 0: a mixture, which is as blurred as the evidence, with the edges that the plane f has beyond that.
+
+    They are `s (f − u)` with `s = d / (d + c v)`, d the mean of (f − u)² nearby and v the noise's variance: where the
+    noise is small they are what the views show, and where it is large the blur does less harm than what TV removed.
+    Where no view sees the plane, f is all there is.
+    """
+    edges = plane - evidence.pilot
+    variance = evidence.noise.variance
+    seen = np.isfinite(variance)
+    squares = blurred(np.square(edges).astype(np.float32), _SHARP_BLUR)
+    noise = np.float32(_SHARP_SHARE) * np.where(seen, variance, 0)
+    share = np.ones_like(squares)
+    np.divide(squares, squares + noise, out=share, where=noise > 0)
+    return np.asarray(np.maximum(mixed + share * edges, 0), mixed.dtype)
+
+
+def _mixed(made: dict[str, Image], regions: Regions, mixture: list[NDArray[np.float64]]) -> Image:
+    """Return the mixture of candidates."""
+    picture = np.zeros_like(next(iter(made.values())))
     for weights, share in zip(mixture, regions.values(), strict=True):
         for weight, candidate in zip(weights, made.values(), strict=True):
             if weight > 0:
                 picture += np.float32(weight) * share * candidate
-    named = {
-        region: dict(zip(made, weights.tolist(), strict=True)) for region, weights in zip(regions, mixture, strict=True)
-    }
-    return PlaneProposal(np.maximum(picture, 0), np.sqrt(evidence.noise.variance), named)
+    return picture

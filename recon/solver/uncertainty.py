@@ -1,7 +1,8 @@
 """The standard deviation of each sample of a penalised plane."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,28 +13,24 @@ from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import well_seen_samples
-from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.penalties import Penalty, differences
 from faintfield.recon.solver.pmlem import norm
 from faintfield.recon.solver.proximal import DualField
 
-# Draws of the noise as it is, and size of the small change that gives the derivative.
+# Draws of the noise, and size of the small change that gives the derivative.
 _DRAWS, _SMALL_CHANGE = 4, 0.2
 
 # Proximal steps of each answer; error of a step relative to its change and to the plane, and limit on its inner steps.
 _STEPS, _OF_CHANGE, _OF_PLANE, _MAX_INNER_STEPS = 3, 0.1, 3e-3, 300
 
-# What is known of the squared error relative to the mean square answer before it is measured, and its least value.
-_USUAL_RATIO, _DOUBT, _LEAST_RATIO = 1.1, 0.6, 1.0
+# How much the squared error relative to the mean square answer differs from scene to scene.
+_DOUBT = 0.6
 
 # Deviations of the ratio that are added to it.
 _CAUTION = 0.5
 
-# What is added to the usual ratio of small objects: the weight that predicts best suits their dark surroundings.
-_FOR_SMALL_OBJECTS = 0.9
-
-# Blurs of the square answer, and weights of the two and of its mean over the region.
-_NARROW, _WIDE = (1, 2, 4), (1, 2, 4, 8, 8, 16)
-_OF_NARROW, _OF_WIDE, _OF_MEAN = 0.3, 0.5, 0.2
+# Blurs of the square answer, and of the square gradient.
+_NARROW, _WIDE, _OF_GRADIENT = (1, 2, 4), (1, 2, 4, 8, 8, 16), (1,)
 
 # Least variance, relative to that of a sample without penalty.
 _LEAST_VARIANCE = 1e-4
@@ -117,26 +114,48 @@ def standard_deviation(local: LocalFit, weight: float, penalty: Penalty, generat
     """
     if weight == 0 or penalty.name == "none":
         return np.asarray(1 / np.sqrt(local.metric), local.plane.dtype)
-    problem = _LocalProblem(local, weight, penalty)
-    answers = [problem.answer(problem.noise(generator)) for _ in range(_DRAWS)]
-    squares = _mean([np.square(answer) for answer in answers])
-    seen_squares = _mean([np.square(problem.as_seen(answer)) for answer in answers])
-    errors = _stein_errors(problem, local, generator)
+    return error_of_answers(PenaltyAnswers(LocalProblem(local, weight, penalty)), generator)
+
+
+def error_of_answers(answers: "Answers", generator: np.random.Generator) -> Image:
+    """Return the root of the expected squared error (row, column) of an estimate, from its answers to noise."""
+    problem, usual = answers.problem, answers.usual
+    noises = [problem.noise(generator) for _ in range(_DRAWS)]
+    size = np.float32(usual.change)
+    drawn = [answers(size * noise) / size for noise in noises]
+    squares = _mean([np.square(answer) for answer in drawn])
+    seen_squares = _mean([np.square(problem.as_seen(answer)) for answer in drawn])
+    if usual.change > _SMALL_CHANGE:
+        noises = [problem.noise(generator)]
+        drawn = [answers(np.float32(_SMALL_CHANGE) * noises[0]) / np.float32(_SMALL_CHANGE)]
+    errors = _stein_errors(problem, noises, drawn)
+    return _spread(problem.local, usual, squares, seen_squares, errors)
+
+
+def _spread(local: LocalFit, usual: "UsualErrors", squares: Image, seen_squares: Image, errors: Image) -> Image:
+    """Return σ (row, column), from the answers' squares scaled in each region to the error expected there."""
     variance = np.zeros_like(squares)
     local_part = np.zeros_like(squares)
-    for region, seen, usual in _regions(local):
+    weights = usual.weights
+    slopes = None
+    if weights.gradient:
+        slopes = blurred(np.square(np.hypot(*differences(local.plane))).astype(squares.dtype), _OF_GRADIENT)
+    for region, seen, expected in _regions(local, usual):
         noise_variance = local.noise_share[seen] / local.metric[seen]
-        ratio, excess = _ratio_and_excess(errors[seen], seen_squares[seen], noise_variance, local.alternation, usual)
+        ratio, excess = _ratio_and_excess(errors[seen], seen_squares[seen], noise_variance, local.alternation, expected)
         local_part[region] = ratio * squares[region]
         mean = float(squares[seen if seen.any() else region].mean(dtype=np.float64))
         level = float(seen_squares[seen].mean(dtype=np.float64)) if seen.any() else 0.0
-        variance[region] = _OF_MEAN * ratio * mean + excess * (mean / level if level > 0 else 1.0)
-    variance += np.float32(_OF_NARROW) * blurred(local_part, _NARROW)
-    variance += np.float32(_OF_WIDE) * blurred(local_part, _WIDE)
+        variance[region] = weights.mean * ratio * mean + excess * (mean / level if level > 0 else 1.0)
+        if slopes is not None:
+            usual_slope = max(float(slopes[region].mean(dtype=np.float64)), _TINY)
+            variance[region] += weights.gradient * ratio * mean / usual_slope * slopes[region]
+    variance += np.float32(weights.narrow) * blurred(local_part, _NARROW)
+    variance += np.float32(weights.wide) * blurred(local_part, _WIDE)
     return np.asarray(np.sqrt(np.maximum(variance, _LEAST_VARIANCE / local.metric)), local.plane.dtype)
 
 
-class _LocalProblem:
+class LocalProblem:
     """The optimum for changed data, from the quadratic of L near f: no pass over the data.
 
     L is taken for `½ (x − f)ᵀ √W K √W (x − f) + ∇L(f)·(x − f)`, and K for a blur of three samples along rows and
@@ -144,14 +163,13 @@ class _LocalProblem:
     """
 
     def __init__(self, local: LocalFit, weight: float, penalty: Penalty) -> None:
-        self._plane, self._metric, self._gradient = (
+        self.local = local
+        self.plane, self._metric, self._gradient = (
             np.ascontiguousarray(array, np.float32) for array in (local.plane, local.metric, local.gradient)
         )
         self._weight, self._penalty = weight, penalty
         self._alternation = np.clip(local.alternation, _LEAST_ALTERNATION, 1)
-        self._root, self._size = np.sqrt(self._metric), norm(self._plane, self._metric)
-        start = DualField.zero([self._plane.shape], self._plane.dtype)
-        self._optimum, self._dual = self._solved(np.zeros_like(self._plane), self._plane, start)
+        self._root, self._size = np.sqrt(self._metric), norm(self.plane, self._metric)
 
     def as_seen(self, x: Image) -> Image:
         """Return K x."""
@@ -159,20 +177,17 @@ class _LocalProblem:
 
     def noise(self, generator: np.random.Generator) -> Image:
         """Return a draw of the noise of −∇L, of covariance `√W K √W`."""
-        white = generator.standard_normal(self._plane.shape, np.float32)
+        white = generator.standard_normal(self.plane.shape, np.float32)
         return self._root * _three_sample_blur(white, np.sqrt(self._alternation))
 
-    def answer(self, change: Image) -> Image:
-        """Return by how much the optimum changes if −∇L changes."""
-        return self._solved(change, self._optimum, self._dual)[0] - self._optimum
-
-    def _solved(self, change: Image, x: Image, dual: DualField) -> tuple[Image, DualField]:
-        """Return the optimum and its dual field, starting from x and another field, by proximal steps."""
-        dual = dual.copy()
+    def optimum(self, change: Image | None, x: Image, dual: DualField) -> Image:
+        """Return the optimum if −∇L changes, by proximal steps from x and a dual field, which becomes its own."""
         for _ in range(_STEPS):
-            slope = self._root * self.as_seen(self._root * (x - self._plane)) + self._gradient - change
+            slope = self._root * self.as_seen(self._root * (x - self.plane)) + self._gradient
+            if change is not None:
+                slope -= change
             x = self._step(x, x - slope / self._metric, dual)
-        return x, dual
+        return x
 
     def _step(self, before: Image, point: Image, dual: DualField) -> Image:
         """Return the plane nearest to a point under the penalty; the dual field becomes its own."""
@@ -184,22 +199,100 @@ class _LocalProblem:
         return dual.prox(point, self._metric, self._weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS).plane
 
 
-def _stein_errors(problem: _LocalProblem, local: LocalFit, generator: np.random.Generator) -> Image:
+class Expected(NamedTuple):
+    """The squared error of a region relative to the mean square answer: usually, at most where the answers are, least.
+
+    What it has beyond `most` is spread evenly.
+    """
+
+    usually: float
+    most: float
+    least: float
+
+
+class Weights(NamedTuple):
+    """How σ² is composed: of the square answers under two blurs, their mean over the region, and the square gradient.
+
+    The last is for edges, which are more uncertain than the answers show: their place is. It is scaled such that its
+    mean over the region is that of the square answers.
+    """
+
+    narrow: float
+    wide: float
+    mean: float
+    gradient: float = 0.0
+
+
+@dataclass(frozen=True)
+class UsualErrors:
+    """What is known of the squared errors of an estimate before they are measured.
+
+    Attributes
+    ----------
+    change : float
+        Size of the noise that is added to see the answers, relative to that of the data.
+    opaque, beside : Expected
+        On opaque samples and beside them.
+    weights : Weights
+        How they are spread over a region.
+    for_small_objects : float
+        What is added to the usual ratio of opaque samples, times the part of the plane that is dark.
+    """
+
+    change: float
+    opaque: Expected
+    beside: Expected
+    weights: Weights
+    for_small_objects: float = 0.0
+
+
+class Answers(Protocol):
+    """By how much an estimate changes (row, column) if −∇L changes by so much."""
+
+    @property
+    def problem(self) -> LocalProblem:
+        """What the views say near the estimate."""
+
+    @property
+    def usual(self) -> UsualErrors:
+        """What is known of its errors."""
+
+    def __call__(self, change: Image) -> Image:
+        """Return the change of the estimate."""
+
+
+class PenaltyAnswers:
+    """The answers of the optimum of likelihood and penalty."""
+
+    # Small objects: the weight that predicts best suits their dark surroundings.
+    usual = UsualErrors(1.0, Expected(1.1, 1.1, 1.0), Expected(1.1, 1.1, 1.0), Weights(0.3, 0.5, 0.2), 0.9)
+
+    def __init__(self, problem: LocalProblem) -> None:
+        self.problem = problem
+        self._dual = DualField.zero([problem.local.plane.shape], np.dtype(np.float32))
+        self._optimum = problem.optimum(None, problem.plane, self._dual)
+
+    def __call__(self, change: Image) -> Image:
+        """Return by how much the optimum changes."""
+        return self.problem.optimum(change, self._optimum, self._dual.copy()) - self._optimum
+
+
+def _stein_errors(problem: LocalProblem, noises: list[Image], derivatives: list[Image]) -> Image:
     """Return an unbiased estimate (row, column) of `|K(f − truth)|²`, of much noise: it counts on average only.
 
     With the residual `q = −∇L/W = K(truth − f) + ν`, it is `q² − Var ν + 2 ν · K(∂f/∂ν) ν` (Stein 1981), the derivative
-    by a small change along one draw of ν (Ramani, Blu and Unser 2008).
+    by a small change along draws of ν (Ramani, Blu and Unser 2008).
     """
-    noise = problem.noise(generator)
-    derivative = problem.answer(np.float32(_SMALL_CHANGE) * noise) / np.float32(_SMALL_CHANGE)
-    covariance = noise / local.metric * problem.as_seen(derivative)
+    local = problem.local
+    pairs = zip(noises, derivatives, strict=True)
+    covariance = _mean([noise * problem.as_seen(derivative) for noise, derivative in pairs]) / local.metric
     return np.asarray(np.square(local.gradient / local.metric) - local.noise_share / local.metric + 2 * covariance)
 
 
 def _ratio_and_excess(
-    errors: Image, squares: Image, noise_variance: Image, alternation: tuple[float, float], usual: float
+    errors: Image, squares: Image, noise_variance: Image, alternation: tuple[float, float], expected: Expected
 ) -> tuple[float, float]:
-    """Return the squared error of a region relative to its answers, up to 1.1, and what it has beyond that.
+    """Return the squared error of a region relative to its answers, up to the most, and what it has beyond that.
 
     The squared error is the mean of the measured and of the usual, by their variances, plus half the deviation of that
     mean, since a σ that is too small does more harm. It is no less than the measured surely is: if the penalty leaves
@@ -207,24 +300,25 @@ def _ratio_and_excess(
     noise.
     """
     if not errors.size:
-        return _USUAL_RATIO, 0.0
+        return expected.usually, 0.0
     level, measured, of_noise = (float(x.mean(dtype=np.float64)) for x in (squares, errors, noise_variance))
     correlation = np.prod([1 + 2 * ((1 - k) / (2 + 2 * k)) ** 2 for k in alternation])
     deviation = float(np.sqrt(2 * correlation / errors.size)) * of_noise
     trust = (_DOUBT * level) ** 2 / max((_DOUBT * level) ** 2 + deviation**2, _TINY)
-    weighted = trust * measured + (1 - trust) * usual * level + _CAUTION * np.sqrt(trust) * deviation
-    expected = max(_LEAST_RATIO * level, float(weighted), measured - 2 * deviation)
-    ratio = min(expected / max(level, _TINY), _USUAL_RATIO)
-    return ratio, max(expected - _USUAL_RATIO * level, 0.0)
+    weighted = trust * measured + (1 - trust) * expected.usually * level + _CAUTION * np.sqrt(trust) * deviation
+    error = max(expected.least * level, float(weighted), measured - 2 * deviation)
+    ratio = min(error / max(level, _TINY), expected.most)
+    return ratio, max(error - expected.most * level, 0.0)
 
 
-def _regions(local: LocalFit) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_], float]]:
-    """Yield the opaque samples and those beside them, each with those that views see, and the usual ratio there."""
+def _regions(local: LocalFit, usual: UsualErrors) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_], Expected]]:
+    """Yield the opaque samples and those beside them, each with those that views see, and the errors expected there."""
     opaque, visible = opacity(local.plane) > 0.5, local.noise_share > 0
-    beside = float(np.mean(~opaque[visible])) if visible.any() else 0.0
-    for region, usual in ((opaque, _USUAL_RATIO + _FOR_SMALL_OBJECTS * beside), (~opaque, _USUAL_RATIO)):
+    dark = float(np.mean(~opaque[visible])) if visible.any() else 0.0
+    on_objects = usual.opaque._replace(usually=usual.opaque.usually + usual.for_small_objects * dark)
+    for region, expected in ((opaque, on_objects), (~opaque, usual.beside)):
         if region.any():
-            yield region, region & visible, usual
+            yield region, region & visible, expected
 
 
 def _coupling(operator: SceneOperator, index: int) -> Iterator[Image]:
@@ -248,6 +342,6 @@ def _three_sample_blur(image: Image, alternation: NDArray[np.floating]) -> Image
     return np.ascontiguousarray(image)
 
 
-def _mean(planes: list[Image]) -> Image:
+def _mean(planes: Sequence[Image]) -> Image:
     """Return the mean of planes."""
     return np.asarray(sum(planes) / np.float32(len(planes)))

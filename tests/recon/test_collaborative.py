@@ -9,8 +9,8 @@ from scipy.fft import dctn, idctn
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.collaborative import Patches, collaborative_wiener, wiener_and_thresholded
-from faintfield.recon.prior.evidence import Noise, noise_of_back_projection
-from faintfield.recon.prior.patches import refined
+from faintfield.recon.prior.evidence import Evidence, Noise, noise_of_back_projection
+from faintfield.recon.prior.patches import patch_candidates, refined
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.initialization import back_projection, smooth_start, universal_penalty_weight
 from faintfield.recon.solver.pmlem import pmlem
@@ -43,8 +43,11 @@ def coefficient_variances(kernel: Image, size: int) -> Image:
     return np.asarray(np.diag(basis @ covariance @ basis.T).reshape(size, size))
 
 
-def slow_filters(y: Image, pilot: Image, noise: Noise, patches: Patches) -> tuple[Image, Image]:
+def slow_filters(
+    y: Image, pilot: Image, noise: Noise, patches: Patches, guide: Image | None = None
+) -> tuple[Image, Image]:
     """One group after the other, in float64: filtered by Wiener's gains, and with small coefficients set to zero."""
+    guide = pilot if guide is None else guide
     size, step, radius, members = patches
     above, below = np.zeros((2, 2, *y.shape))
     window = np.outer(np.kaiser(size, 2.0), np.kaiser(size, 2.0))
@@ -54,7 +57,7 @@ def slow_filters(y: Image, pilot: Image, noise: Noise, patches: Patches) -> tupl
     for row in firsts[0]:
         for column in firsts[1]:
             candidates = [
-                (np.sum((cut(pilot, row, column, size) - cut(pilot, r, c, size)) ** 2), r, c)
+                (np.sum((cut(guide, row, column, size) - cut(guide, r, c, size)) ** 2), r, c)
                 for r in range(max(0, row - radius), min(last[0], row + radius) + 1)
                 for c in range(max(0, column - radius), min(last[1], column + radius) + 1)
                 if np.isfinite(cut(noise.variance, r, c, size)).all()
@@ -117,6 +120,31 @@ def test_the_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patch
     np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches, workers=2))
 
 
+@pytest.mark.parametrize("partly_unseen", [False, True])
+def test_with_a_guide_its_patches_decide_who_is_alike_and_the_pilot_what_is_kept(partly_unseen: bool) -> None:
+    y, pilot, noise = pictures((45, 38), 17)
+    _, guide, _ = pictures((45, 38), 18)
+    if partly_unseen:
+        noise.variance[:20, -3:] = np.inf
+        guide[:20, -3:] = np.nan
+    patches = Patches(8, 5, 4, 16)
+    both = wiener_and_thresholded(y, pilot, noise, patches, guide=guide, workers=2)
+    unguided = slow_filters(y, pilot, noise, patches)
+    for found, expected, other in zip(both, slow_filters(y, pilot, noise, patches, guide), unguided, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(y).max())
+        assert np.abs(found - other).max() > 0.1
+    np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches, guide=guide))
+
+
+def test_a_guide_in_another_unit_finds_the_groups_of_the_pilot() -> None:
+    y, pilot, noise = pictures((60, 50), 19)
+    expected = collaborative_wiener(y, pilot, noise)
+    for guide in (pilot, -4 * pilot):  # powers of two keep all digits
+        np.testing.assert_array_equal(collaborative_wiener(y, pilot, noise, guide=guide), expected)
+    shuffled = np.random.default_rng(20).permutation(pilot.ravel()).reshape(pilot.shape)
+    assert np.abs(collaborative_wiener(y, pilot, noise, guide=shuffled) - expected).max() > 0.1
+
+
 @pytest.mark.parametrize("workers", [1, 2, 5])
 def test_the_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
     y, pilot, noise = pictures((300, 64), 9)
@@ -173,9 +201,33 @@ def test_shapes_and_sizes_that_do_not_fit_are_refused() -> None:
     y, pilot, noise = pictures((20, 20), 13)
     with pytest.raises(ValueError, match="give all the same"):
         collaborative_wiener(y[1:], pilot, noise)
+    with pytest.raises(ValueError, match="give all the same"):
+        collaborative_wiener(y, pilot, noise, guide=pilot[:, 1:])
     for size in (0, 6, 24):
         with pytest.raises(ValueError, match=f"patches of {size} samples"):
             collaborative_wiener(y, pilot, noise, Patches(size))
+
+
+# --- the candidates --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("with_others", [False, True])
+def test_candidates_are_those_of_slow_filters_in_groups_that_all_colours_show(with_others: bool) -> None:
+    y, pilot, noise = pictures((24, 26), 21)
+    _, shown, _ = pictures((24, 26), 22)
+    others = 3 * shown if with_others else None
+    found = patch_candidates(Evidence(y, pilot, noise, np.ones_like(y), others))
+    large, small = Patches(8, 6, 16, 64), Patches(4, 3, 8, 32)
+
+    def filtered(pilot: Image, patches: Patches) -> tuple[Image, Image]:
+        return slow_filters(y, pilot, noise, patches, pilot + (0 if others is None else others))
+
+    wiener, kept = filtered(pilot, large)
+    twice, _ = filtered((wiener + kept) / 2, large)
+    _, kept_small = filtered(pilot, small)
+    fine, _ = filtered((twice + kept_small) / 2, small)
+    for name, expected in {"tv": pilot, "wiener": wiener, "twice": twice, "fine": fine}.items():
+        np.testing.assert_allclose(found[name], expected, atol=1e-3, err_msg=name)
 
 
 # --- the refinement --------------------------------------------------------------------------------------------------
@@ -212,3 +264,14 @@ def test_a_refined_picture_is_the_picture_plus_what_the_filter_changed_and_never
     unseen = operator.coverage() == 0
     assert unseen.any()
     np.testing.assert_array_equal(result[unseen], plane[unseen])
+
+
+def test_a_kernel_that_is_not_positive_definite_leaves_the_result_within_the_picture() -> None:
+    generator = np.random.default_rng(8)
+    stripes = np.where(np.arange(64) % 2, 1.0, -1.0)[:, np.newaxis] * np.linspace(0, 1, 96)
+    pilot = (3 + stripes).astype(np.float32)
+    picture = (pilot + generator.normal(0, 0.5, pilot.shape)).astype(np.float32)
+    kernel = np.outer([0.6, 1.0, 0.6], [0.2, 1.0, 0.2])  # samples alternating by row would have a variance below zero
+    noise = Noise(np.full(pilot.shape, 0.25, np.float32), kernel)
+    for found in wiener_and_thresholded(picture, pilot, noise, Patches(8, 6, 16, 64)):
+        assert np.abs(found - 3).max() < np.abs(picture - 3).max()

@@ -45,6 +45,11 @@ def test_the_picture_of_one_plane_is_its_back_projection_and_the_pilot_is_as_blu
     operator, (light,), images = tiny_scene(1, 1)
     views = None if held_out is None else np.setdiff1d(operator.all_views, held_out)
     (found,) = evidence_of_planes(operator, images, operator.samples_of([light]), views)
+    assert found.others is None
+    samples = operator.samples_of([light])
+    (again,) = evidence_of_planes(operator, images, samples, views, others=2 * samples)
+    assert again.others is not None
+    np.testing.assert_allclose(again.others, 2 * found.pilot, rtol=1e-10)
     dense = columns_of(operator, views)
     coverage = (dense.T @ dense.sum(axis=1)).reshape(TINY)
     np.testing.assert_allclose(found.coverage, coverage, atol=1e-12)
@@ -69,7 +74,8 @@ def test_the_picture_of_a_plane_is_the_back_projection_of_what_the_others_leave(
     operator, lights, images = tiny_scene(2, 2, occluded=occluded)
     views = operator.all_views if held_out is None else np.setdiff1d(operator.all_views, held_out)
     dense = np.split(columns_of(operator, views), 2, axis=1)
-    found = evidence_of_planes(operator, images, operator.samples_of(lights), None if held_out is None else views)
+    colour, some = operator.samples_of([3 - light for light in lights]), None if held_out is None else views
+    found = evidence_of_planes(operator, images, operator.samples_of(lights), some, others=colour)
     signal = (images.electrons - images.background_e)[views].ravel()
     for own, other, here, there, evidence in zip(dense, dense[::-1], lights, lights[::-1], found, strict=True):
         coverage = (own.T @ own.sum(axis=1)).reshape(TINY)
@@ -77,6 +83,8 @@ def test_the_picture_of_a_plane_is_the_back_projection_of_what_the_others_leave(
         np.testing.assert_allclose(evidence.coverage, coverage, atol=1e-12)
         np.testing.assert_allclose(evidence.picture, divided(left, coverage), atol=1e-10)
         np.testing.assert_allclose(evidence.pilot, divided(own.T @ own @ here.ravel(), coverage), atol=1e-10)
+        assert evidence.others is not None
+        np.testing.assert_allclose(evidence.others, divided(own.T @ own @ (3 - here).ravel(), coverage), atol=1e-10)
 
 
 def test_where_no_view_sees_a_plane_there_is_no_light_and_no_end_to_the_noise() -> None:

@@ -1,16 +1,22 @@
 """Standard deviations against inverse matrices, known errors, and errors that were really made."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
+from faintfield.pipelines.reconstruction.penalised import Objective, certified, solve_pmlem, with_sigma
 from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.prior.answers import ProposalAnswers
+from faintfield.recon.prior.evidence import evidence_of_planes
+from faintfield.recon.prior.patches import patch_candidates
+from faintfield.recon.prior.proposal import propose
 from faintfield.recon.smoothing import blurred
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
-from faintfield.recon.solver.uncertainty import LocalFit, local_fits, standard_deviation
+from faintfield.recon.solver.uncertainty import LocalFit, LocalProblem, local_fits, standard_deviation
 from tests.recon.small_problems import SHAPE, difference_matrix
 from tests.recon.test_cross_validation import dark_views
 from tests.recon.test_cross_validation import scene as pieces
@@ -122,21 +128,54 @@ def texture(size: int) -> Image:
     return np.asarray(np.maximum(1 + 0.25 * rough / rough.std(), 0), np.float32)
 
 
+@pytest.mark.parametrize("prior", ["tv", "patches"])
 @pytest.mark.parametrize("truth", [pieces(64), texture(64)], ids=["pieces", "texture"])
-def test_intervals_cover_the_truth_on_objects(truth: Image) -> None:
+def test_intervals_cover_the_truth_on_objects(truth: Image, prior: PriorName) -> None:
     held = []
     for seed in range(3):
         operator, images = dark_views(truth, seed)
-        found = solve(operator, images, "pmlem", Settings(uncertainty=True))
+        found = solve(operator, images, "pmlem", Settings(uncertainty=True, prior=prior))
         held.append(np.mean((np.abs(found.plane - truth) <= 1.645 * found.sidecars["sigma"])[8:-8, 8:-8]))
     assert 0.85 <= np.mean(held) <= 0.96
+
+
+def test_a_plane_about_a_proposal_answers_as_it_does_to_other_data() -> None:
+    operator, images = dark_views(pieces(64), 3)
+    objective = Objective.of(SceneProblem(operator, images), Settings())
+    (pilot,) = solve_pmlem(objective, Settings())
+    weight = pilot.record.penalty_weight or 0.0
+    (evidence,) = evidence_of_planes(operator, images, pilot.plane)
+    (proposal,) = propose(objective.posed, pilot.plane, [evidence], weight, patch_candidates)
+
+    def about(posed: SceneProblem, proposed: Image) -> Image:
+        dual = replace(posed.dual(), proposal=proposed)
+        return certified(replace(objective, posed=posed), objective.start, weight, dual, Settings())[1]
+
+    plane = about(objective.posed, proposal.picture)
+    deviation = np.sqrt(images.background_e + images.read_variance_e2)
+    noise = np.random.default_rng(5).normal(0, deviation, images.electrons.shape)
+    noisy = replace(objective.posed.images, electrons=(images.electrons + 0.5 * noise).astype(np.float32))
+    others = replace(objective.posed, images=noisy)
+    (other_pilot,) = solve_pmlem(replace(objective, posed=others), Settings(penalty_weight=weight))
+    (other_evidence,) = evidence_of_planes(operator, noisy, other_pilot.plane)
+    really = about(others, proposal.again(other_evidence._replace(noise=evidence.noise), other_pilot.plane)) - plane
+
+    (local,) = local_fits(operator, objective.posed.fit(objective.level_e), plane)
+    gradient = others.fit(objective.level_e).value_and_gradient(plane)[1]
+    answer = ProposalAnswers(LocalProblem(local, weight, objective.penalty), proposal, pilot.plane)(
+        (local.gradient - gradient).astype(np.float32)
+    )
+    inner = np.s_[8:-8, 8:-8]
+    assert np.corrcoef(answer[inner].ravel(), really[inner].ravel())[0, 1] > 0.8
+    assert answer[inner].std() == pytest.approx(really[inner].std(), rel=0.3)
 
 
 def test_each_plane_of_a_scene_has_sigma() -> None:
     posed = scene()
     images = ElementalImages(posed.images.electrons, 0.3, 1.0)
     settings = Settings(penalty_weight=0.8, uncertainty=True)
-    found = solve_pmlem(Objective.of(SceneProblem(posed.operator, images), settings), settings)
+    objective = Objective.of(SceneProblem(posed.operator, images), settings)
+    found = with_sigma(objective, solve_pmlem(objective, settings))
     for solution, grid in zip(found, posed.operator.grids, strict=True):
         assert solution.sidecars["sigma"].shape == grid.shape
         assert solution.sidecars["sigma"].min() > 0
