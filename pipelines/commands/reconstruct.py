@@ -2,6 +2,7 @@
 
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,7 +18,13 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_s
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.cluster import make_runner
-from faintfield.pipelines.reconstruction.request import Request, resolve, select_planes, selected_methods
+from faintfield.pipelines.reconstruction.request import (
+    Request,
+    chosen_prior,
+    resolve,
+    select_planes,
+    selected_methods,
+)
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
 from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
@@ -50,7 +57,7 @@ def reconstruct(
     penalty: PenaltyName = "tv",
     likelihood: LikelihoodName | Literal["auto"] = "auto",
     uncertainty: bool = False,
-    prior: PriorName = "tv",
+    prior: PriorName | None = None,
     proposal: bool = False,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
@@ -118,14 +125,17 @@ def reconstruct(
         Noise model of a pixel. auto: poisson-gaussian (exact) for read noise below 3 electrons, shifted-poisson
         (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
     uncertainty
-        Save the standard deviation of each sample beside the planes of pmlem and joint; see docs/physics.md for what
-        it covers.
+        Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
+        docs/results.md for how often its intervals hold.
     prior
         What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
         repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
-        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md.
+        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md. By default auto
+        for pmlem, joint and occlusion, but tv for sweeps, which take several times as long with auto. A
+        surface without this option has the picture of tv with detail added by a filter of patches.
     proposal
-        Save, beside each plane, what the prior proposed, and in standard deviations how far the data moved the plane.
+        Save, beside each plane or the picture of a surface, what the prior proposed, and in standard deviations how far
+        the data moved it.
     passes
         Largest number of passes over the data.
     pitch_mm
@@ -140,23 +150,26 @@ def reconstruct(
         Address of a dask scheduler whose workers make the planes; they must see OUT under the same path.
     """
     weight = None if penalty_weight == "auto" else penalty_weight
-    settings = Settings(weight, passes, likelihood, penalty, uncertainty, prior, proposal)
-    asked = select_surface(surface, depth_range_mm, disparity_range_px, settings)
-    if asked is not None:
+    settings = Settings(weight, passes, likelihood, penalty, uncertainty, prior or "tv", proposal)
+    if surface:
         _refuse_beside_surface(
             depth=depth, sweep=sweep,
             depth_mm=depth_mm, sweep_mm=sweep_mm, disparity_px=disparity_px, sweep_px=sweep_px, plane_pose=plane_pose,
             depth_map=depth_map, method=method, joint=joint, occlusion=occlusion, uncertainty=uncertainty,
-            prior=prior != "tv", proposal=proposal, pitch_mm=pitch_mm, workers=workers, scheduler=scheduler,
+            pitch_mm=pitch_mm, workers=workers, scheduler=scheduler,
         )  # fmt: skip
+    asked = select_surface(surface, depth_range_mm, disparity_range_px, settings, filtered=prior is None)
+    if asked is not None:
         loaded, page_in = _open(elemental_set, out, scene, geometry)
         return surface_and_report(loaded, out or page_in / SURFACE_FOLDER, asked.resolve(loaded), page_in=page_in)
     runner = make_runner(workers, scheduler)
+    methods = selected_methods(method or [], joint=joint, occlusion=occlusion)
+    sweeps = bool(sweep or sweep_mm or sweep_px) and "auto" not in [*(depth or []), *(depth_mm or [])]
     selection = select_planes(
         *(depth or [], sweep, depth_mm or [], sweep_mm, disparity_px or [], sweep_px, plane_pose or []),
         depth_map=depth_map,
-        methods=selected_methods(method or [], joint=joint, occlusion=occlusion),
-        settings=settings,
+        methods=methods,
+        settings=replace(settings, prior=chosen_prior(prior, methods, settings, sweeps=sweeps)),
         pitch_mm=pitch_mm,
     )
     loaded, out = _open(elemental_set, out, scene, geometry)

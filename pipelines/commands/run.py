@@ -1,5 +1,6 @@
 """`faintfield run`: everything after the capture of a session, only what is out of date."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
@@ -16,10 +17,12 @@ from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
 from faintfield.pipelines.reconstruction.request import (
     DEFAULT_METHOD,
     Request,
+    check_prior,
+    chosen_prior,
     distinct_depths,
     folder_of_method,
 )
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.changes import present_settings
@@ -36,6 +39,7 @@ def run(
     depth_range_mm: str | None = None,
     method: list[Method] | None = None,
     penalty_weight: NotNegative | None = None,
+    prior: PriorName | None = None,
     passes: Count | None = None,
     pitch_mm: Positive | None = None,
     lens: LensName = "opencv5",
@@ -63,6 +67,8 @@ def run(
         Method of reconstruction, as for `reconstruct`; repeat it for further methods.
     penalty_weight
         β of the paper; by default pmlem chooses it by cross-validation, pmlem-osl from the noise level.
+    prior
+        What is expected of a picture, as for `reconstruct`: auto by default, tv for sweeps.
     passes
         Largest number of passes over the data.
     pitch_mm
@@ -78,12 +84,15 @@ def run(
     depths = distinct_depths([*(depth_mm or ([] if swept else present_settings(session).scene.depth_mm)), *swept])
     settings = Settings(penalty_weight, passes)
     relief = select_surface(surface, depth_range_mm, None, settings)
-    if not depths and (relief is None or method or pitch_mm):
+    if not depths and (relief is None or method or pitch_mm or prior):
         raise WrongUsage(
             "no plane is asked for; give --depth-mm or --sweep-mm FIRST:LAST:COUNT, or state [scene] depth_mm in the "
             "rig.toml before a capture, or give --surface without options of planes"
         )
-    planes = Request(depths, method or [DEFAULT_METHOD], settings, pitch_mm, bool(swept)) if depths else None
+    methods = method or [DEFAULT_METHOD]
+    of_planes = replace(settings, prior=chosen_prior(prior, methods, settings, sweeps=bool(swept)))
+    check_prior(methods, of_planes)
+    planes = Request(depths, methods, of_planes, pitch_mm, bool(swept)) if depths else None
     asked = None if relief is None else SurfaceRequest(relief.range_mm, settings=settings)
     return run_steps(session, session_steps(session, planes, lens, limit_px, asked))
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ _MAX_ROWS = 6
 # Widths of the pictures side by side and on the sliders.
 _GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
 
+# Ends of the scale of what the data moved, in standard deviations.
+_MOST_MOVED = 3.0
+
 
 @dataclass(frozen=True)
 class Row:
@@ -43,6 +46,14 @@ class Sigmas:
 
     white: float
     pictures: list[tuple[str, float, str]]
+
+
+class Proposed(NamedTuple):
+    """What a prior proposed for a plane, and how far the data moved it, as data URIs."""
+
+    title: str
+    proposal: str
+    moved: str
 
 
 class Slide(TypedDict):
@@ -81,6 +92,8 @@ class PlaneSections:
         Titles, and pictures side by side.
     slider, slider_column, slider_depth : list, int, int
         The sliders, and what they show first.
+    proposals : list of Proposed
+        What a prior proposed, where that was saved.
     depths : int
         Number of planes per column.
     white : float
@@ -102,6 +115,7 @@ class PlaneSections:
     slider_column: int = 0
     slider_depth: int = 0
     sigmas: Sigmas | None = None
+    proposals: list[Proposed] = field(default_factory=list)
     depths: int = 0
     white: float = 0.0
     focus_curve: str | None = None
@@ -143,6 +157,7 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         slider_column=place,
         slider_depth=_first_depth([depth for depth, _ in places], focus),
         sigmas=_sigmas(planes, titles, shown),
+        proposals=_proposals(planes, titles, shown, white),
         depths=len(places),
         white=white,
         focus_curve=focus_curve(focus, units) if focus else None,
@@ -203,6 +218,21 @@ def _sigmas(planes: list[Plane], titles: dict[str, str], depths: list[float]) ->
         for plane, sigma in found
     ]
     return Sigmas(white, pictures)
+
+
+def _proposals(planes: list[Plane], titles: dict[str, str], depths: list[float], white: float) -> list[Proposed]:
+    """Return what was proposed on the scale of the planes, and what the data moved, on one of ± 3 σ."""
+    found = []
+    for plane in sorted(planes, key=lambda plane: plane.depth_mm):
+        if not (plane.name or plane.depth_mm in depths):
+            continue
+        proposal, moved = plane.proposal_e(), plane.moved_sigma()
+        if proposal is not None and moved is not None:
+            levels = shrunk(grey_levels(moved, _MOST_MOVED, -_MOST_MOVED), _GRID_WIDTH_PX)
+            picture = _picture(proposal, white, _GRID_WIDTH_PX, ".png")
+            title = f"{titles[plane.column]}, {plane.words}"
+            found.append(Proposed(title, picture, data_uri(encoded(levels, ".png"), ".png")))
+    return found
 
 
 def _slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[SliderColumn]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile
@@ -100,7 +100,18 @@ class Plane:
 
     def sigma_e(self) -> NDArray[Any] | None:
         """Return the standard deviation of each sample, None if it was not asked for."""
-        name = self.records[0].sigma_file
+        return self._beside(self.records[0].sigma_file)
+
+    def proposal_e(self) -> NDArray[Any] | None:
+        """Return what a prior proposed, None if it was not saved."""
+        return self._beside(self.records[0].proposal_file)
+
+    def moved_sigma(self) -> NDArray[Any] | None:
+        """Return how far the data moved the plane from the proposal, in standard deviations, None if not saved."""
+        return self._beside(self.records[0].moved_file)
+
+    def _beside(self, name: str | UnsetType) -> NDArray[Any] | None:
+        """Return the pixels of a file beside that of the plane, None without one."""
         return read_frame(_existing(self.path.with_name(Path(name).name))).pixels_dn if name else None
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from faintfield.pipelines.formats.limits import MAX_PREVIEW_BYTES
 from faintfield.pipelines.formats.reading import read_content
@@ -98,7 +98,7 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
     circling = "From viewpoints between the nodes; the middle depth stands still, what is nearer moves most"
     measured = "in the unit of the poses, whose length is not known" if unit == "relative" else f"in {unit}"
     known = f"Where each sample is, {measured}; hatched where that is not known"
-    entries = [
+    entries: list[tuple[str | UnsetType, str, str]] = [
         (surface.picture, "Sharp everywhere.", "One picture from all views, as the reference camera would see it"),
         (surface.depth, f"{what.capitalize()}, {unit}.", known),
         (surface.depth_confidence, "How sure.", f"Probability that the {what} is right within {_tolerance(surface)}"),
@@ -109,11 +109,13 @@ def _figures(folder: Path, surface: SurfaceRecord, units: StatedUnits) -> list[F
             "Standard deviation of the light of each sample by noise, if its depth is right",
         ),
         (surface.visibility, "Seen by.", "Number of views in which nothing hides the sample"),
+        (surface.picture_proposal, "Proposal.", "What the prior proposed"),
+        (surface.picture_moved, "Moved, σ.", "Picture less proposal, in standard deviations of the noise"),
     ]
     found = [
         Figure(src, name, caption)
         for file, name, caption in entries
-        if (src := _embedded(folder / preview_name(file))) is not None
+        if file is not UNSET and (src := _embedded(folder / preview_name(file))) is not None
     ]
     if film is not None:
         still = _embedded(folder / preview_name(surface.picture)) or film

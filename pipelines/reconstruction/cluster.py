@@ -19,7 +19,8 @@ from faintfield.pipelines.formats.files import UNFINISHED, translated_write_erro
 from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
-from faintfield.pipelines.reconstruction.sweep import Channel, PlaneTask, Runner, run_serially
+from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
+from faintfield.pipelines.reconstruction.tasks import Channel, PlaneTask, do_task
 from faintfield.recon.likelihood.images import ElementalImages
 
 _LOST = "run the same command again, and only what is missing is done; the logs of the workers say more"
@@ -106,13 +107,14 @@ def _as_done(
     pending: dict[Any, PlaneTask] = {}
     try:
         for task in tasks:
-            name = task.layout.name
-            if name not in colours:
-                colours[name] = _share(loaded, task.layout, shared)
+            for layout in task.layouts:
+                if layout.name not in colours:
+                    colours[layout.name] = _share(loaded, layout, shared)
             elsewhere = replace(
                 task, files=tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
             )
-            pending[client.submit(_do, colours[name], elsewhere, pure=False)] = task
+            needed = [colours[layout.name] for layout in task.layouts]
+            pending[client.submit(_do, needed, elsewhere, pure=False)] = task
         for future in distributed.as_completed(list(pending)):
             messages = future.result()
             future.release()  # otherwise it would be computed again if its worker died
@@ -198,6 +200,7 @@ def _opened(colour: _Colour) -> Channel:
     return Channel(loaded, colour.layout, ElementalImages(electrons, valid=valid, **maps))
 
 
-def _do(colour: _Colour, task: PlaneTask) -> list[str]:
+def _do(colours: Sequence[_Colour], task: PlaneTask) -> list[str]:
     """Do a task on a worker."""
-    return _opened(colour).do(task)
+    by_name = {colour.layout.name: colour for colour in colours}
+    return do_task(task, lambda layout: _opened(by_name[layout.name]))

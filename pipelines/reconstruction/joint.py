@@ -13,9 +13,9 @@ from faintfield.pipelines.formats.results.records import Method, SolveRecord
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
 from faintfield.pipelines.reconstruction.prior import with_prior
-from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
+from faintfield.pipelines.reconstruction.solutions import Pilot, Settings, Solution, mean_e
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import opacity, transmission
 from faintfield.recon.solver.data_fit import SceneProblem
@@ -30,6 +30,7 @@ def solve_together(
     grids: Mapping[Place, PlaneGrid],
     methods: Collection[Method],
     settings: Settings,
+    pilots: Mapping[Place, Pilot] | None = None,
 ) -> dict[Method, dict[Place, Solution]]:
     """Reconstruct all planes of one colour together, so that no plane has to explain the light of the others.
 
@@ -39,6 +40,8 @@ def solve_together(
         The samples of each plane.
     methods : collection of Method
         "joint", "occlusion" or both; with the latter planes hide those behind them if that explains the images better.
+    pilots : mapping of Place to Pilot, optional
+        What a prior begins with: planes of "joint" by total variation.
 
     Returns
     -------
@@ -48,12 +51,13 @@ def solve_together(
     _check_memory(images, len(grids) if "occlusion" in methods else 0)
     operator = factory.of_scene(grids)
     objective = Objective.of(SceneProblem(operator, images), settings)
-    joint = solve_pmlem(objective, settings)
+    joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective, settings)
+    others = operator.samples_of([pilots[place].others for place in grids]) if pilots else None
     found: dict[Method, list[Solution]] = {}
     if "joint" in methods:
-        found["joint"] = with_prior(objective, joint, settings)
+        found["joint"] = with_prior(objective, joint, settings, others=others)
     if "occlusion" in methods:
-        found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings)
+        found["occlusion"] = _with_occlusion(factory, objective, grids, joint, settings, others, found.get("joint"))
     return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
 
 
@@ -73,8 +77,12 @@ def _with_occlusion(
     grids: Mapping[Place, PlaneGrid],
     joint: list[Solution],
     settings: Settings,
+    others: Image | None,
+    done: list[Solution] | None,
 ) -> list[Solution]:
     """Estimate opacity from the planes, then reconstruct the light again behind it with the same penalty weight.
+
+    Where that explains the images no better, the planes of joint stay, which may be done already.
 
     Likelihood and penalty stay the same, too, so that the lower of both objectives explains the images better.
     The plane written is `α f`: where a plane is transparent it has no light of its own. The certificate is that of f.
@@ -86,15 +94,17 @@ def _with_occlusion(
     try:
         occluded = factory.of_scene(grids, hidden)
     except GeometryMismatch:
-        return _without_occlusion(with_prior(objective, joint, settings), "a plane would be hidden from all views")
+        unchanged = done or with_prior(objective, joint, settings, others=others)
+        return _without_occlusion(unchanged, "a plane would be hidden from all views")
     behind = replace(objective, posed=replace(objective.posed, operator=occluded))
     better = solve_pmlem(behind, settings)
     objectives = better[0].record.objective, first.objective
     assert objectives[0] is not None
     assert objectives[1] is not None
     if objectives[0] >= objectives[1]:
-        return _without_occlusion(with_prior(objective, joint, settings), "it explains the images no better")
-    return [_of_opaque_part(one, first) for one in with_prior(behind, better, settings)]
+        unchanged = done or with_prior(objective, joint, settings, others=others)
+        return _without_occlusion(unchanged, "it explains the images no better")
+    return [_of_opaque_part(one, first) for one in with_prior(behind, better, settings, others=others)]
 
 
 def _of_opaque_part(one: Solution, first: SolveRecord) -> Solution:

@@ -9,15 +9,20 @@ from msgspec import structs
 
 from faintfield.pipelines.formats.results.records import Certificate, PenaltyRecord, SolveRecord, WeightScore
 from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
-from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
-from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.likelihood.images import Image, select_likelihood
 from faintfield.recon.solver.cross_validation import MIN_VIEWS, cross_validated_weight
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.proximal import DualField
-from faintfield.recon.solver.uncertainty import local_fits, standard_deviation
+from faintfield.recon.solver.uncertainty import (
+    Answers,
+    LocalProblem,
+    error_of_answers,
+    local_fits,
+    standard_deviation,
+)
 
 # Largest number of passes over the data.
 MAX_PASSES = 30
@@ -80,15 +85,39 @@ def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
         passes_before=1 + choice.passes,
         penalty_weight_curve=choice.curve,
     )
-    operator, penalty = objective.posed.operator, objective.penalty
-    planes = operator.planes_of(iterate)
-    solutions = [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
-    if settings.uncertainty:
-        generator = np.random.default_rng(_SEED)
-        fits = local_fits(operator, objective.posed.fit(objective.level_e), iterate)
-        for one, local in zip(solutions, fits, strict=True):
-            one.sidecars["sigma"] = standard_deviation(local, choice.weight, penalty, generator)
-    return solutions
+    planes = objective.posed.operator.planes_of(iterate)
+    return [Solution(plane, structs.replace(record, mean_e=mean_e(plane))) for plane in planes]
+
+
+def with_sigma(
+    objective: Objective, solutions: list[Solution], answers: Callable[[int, LocalProblem], Answers] | None = None
+) -> list[Solution]:
+    """Return planes with their standard deviation beside them.
+
+    Parameters
+    ----------
+    objective : Objective
+        What they minimise.
+    solutions : list of Solution
+        All planes of one colour.
+    answers : callable, optional
+        Returns how the plane of an index answers to noise, given what the views say near it; as the optimum of
+        likelihood and penalty by default.
+    """
+    operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
+    samples = operator.samples_of([one.plane for one in solutions])
+    generator = np.random.default_rng(_SEED)
+    fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
+    sigmas = []
+    for index, local in enumerate(fits):
+        if answers is None:
+            sigmas.append(standard_deviation(local, weight, objective.penalty, generator))
+        else:
+            problem = LocalProblem(local, weight, objective.penalty)
+            sigmas.append(error_of_answers(answers(index, problem), generator))
+    return [
+        replace(one, sidecars=one.sidecars | {"sigma": sigma}) for one, sigma in zip(solutions, sigmas, strict=True)
+    ]
 
 
 def certified(
@@ -123,16 +152,13 @@ def certified(
     return record, iterate.plane
 
 
-def solve_then_sigma(
-    operator: PlaneOperator, images: ElementalImages, settings: Settings
-) -> tuple[Solution, Callable[[], Image]]:
+def solve_then_sigma(objective: Objective, settings: Settings) -> tuple[Solution, Callable[[], Image]]:
     """Reconstruct one colour of one plane by PMLEM; also return a function that computes its standard deviation.
 
     That takes memory for many planes, but neither the images nor the operator: the caller can drop these first.
     """
-    objective = Objective.of(SceneProblem(operator, images), settings)
-    (solution,) = solve_pmlem(objective, replace(settings, uncertainty=False))
-    (local,) = local_fits(operator, objective.posed.fit(objective.level_e), solution.plane)
+    (solution,) = solve_pmlem(objective, settings)
+    (local,) = local_fits(objective.posed.operator, objective.posed.fit(objective.level_e), solution.plane)
     weight, generator = solution.record.penalty_weight or 0.0, np.random.default_rng(_SEED)
     return solution, partial(standard_deviation, local, weight, objective.penalty, generator)
 

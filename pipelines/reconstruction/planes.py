@@ -7,7 +7,7 @@ import numpy as np
 from faintfield.pipelines.formats.results.records import Certificate, Method, SolveRecord
 from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
 from faintfield.pipelines.reconstruction.prior import with_prior
-from faintfield.pipelines.reconstruction.solutions import Settings, Solution, mean_e
+from faintfield.pipelines.reconstruction.solutions import Pilot, Settings, Solution, mean_e
 from faintfield.recon.likelihood.images import ElementalImages, Image, select_likelihood
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
@@ -39,8 +39,10 @@ _EPSILON_OF_SCALE = 0.005
 _ONE_STEP_LATE_CERTIFICATE = "relative change of the last pass; one-step-late iterations prove no optimum"
 
 
-def solve(operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings) -> Solution:
-    """Reconstruct one plane of one colour.
+def solve(
+    operator: PlaneOperator, images: ElementalImages, method: Method, settings: Settings, pilot: Pilot | None = None
+) -> Solution:
+    """Reconstruct one plane of one colour, by a prior from its pilot if there is one.
 
     Raises
     ------
@@ -55,6 +57,8 @@ def solve(operator: PlaneOperator, images: ElementalImages, method: Method, sett
         )
     if method == "pmlem":
         objective = Objective.of(SceneProblem(operator, images), settings)
+        if pilot:
+            return with_prior(objective, [pilot.solution], settings, others=pilot.others)[0]
         return with_prior(objective, solve_pmlem(objective, settings), settings)[0]
     start = smooth_start(operator, images)
     likelihood = select_likelihood(images, settings.likelihood, mean_light_e(operator, start))

@@ -22,12 +22,15 @@ from faintfield.pipelines.formats.sets.stated import plane_stem
 from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, sweep_of_range
 from faintfield.pipelines.reconstruction.given_sweeps import swept, swept_depths
 from faintfield.pipelines.reconstruction.operators import check_in_front
-from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 
 DEFAULT_METHOD: Method = "pmlem"
 
 # Fewer depths leave nothing to interpolate between.
 _MIN_DEPTHS_OF_A_MAP = 5
+
+# Methods whose planes a prior can improve.
+_WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
 
 
 def distinct_depths(depths: list[float], loaded: ElementalSet | None = None) -> list[float]:
@@ -100,8 +103,8 @@ class Request:
             penalty=self.settings.penalty,
             likelihood=self.settings.likelihood,
             uncertainty=self.settings.uncertainty,
-            prior=UNSET if self.settings.prior == "tv" else self.settings.prior,
-            proposal=self.settings.proposal or UNSET,
+            prior=UNSET if self.settings.prior == "tv" or method not in _WITH_PRIOR else self.settings.prior,
+            proposal=(self.settings.proposal and method in _WITH_PRIOR) or UNSET,
             passes=self.settings.passes,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
@@ -198,7 +201,7 @@ def select_planes(
         pitch_mm=pitch_mm,
     )
     _check_methods(selection, methods, settings)
-    _check_prior(methods, settings)
+    check_prior(methods, settings)
     return selection
 
 
@@ -208,19 +211,29 @@ def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> li
     return [*given, *(name for name, wanted in by_option.items() if wanted)] or [DEFAULT_METHOD]
 
 
-def _check_prior(methods: list[Method], settings: Settings) -> None:
+def chosen_prior(
+    given: PriorName | None, methods: Sequence[Method], settings: Settings, *, sweeps: bool = False
+) -> PriorName:
+    """Return the prior as given; else auto, or tv where a prior has no effect or, in a sweep, would take long."""
+    if given is not None:
+        return given
+    helps = settings.penalty == "tv" and settings.penalty_weight != 0 and bool(_WITH_PRIOR & set(methods))
+    return "auto" if helps and not sweeps else "tv"
+
+
+def check_prior(methods: list[Method], settings: Settings) -> None:
     """Refuse a prior beside options that it does not know (WrongUsage)."""
     if settings.prior == "tv":
         if settings.proposal:
-            raise WrongUsage("--proposal saves what a prior proposes, and tv proposes nothing; give --prior patches")
+            raise WrongUsage("--proposal saves what a prior proposes, and tv proposes nothing; give --prior auto")
         return
     option = f"--prior {settings.prior}"
-    if not {"pmlem", *JOINT_METHODS} & set(methods):
+    if not _WITH_PRIOR & set(methods):
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
+    if settings.penalty_weight == 0:
+        raise WrongUsage(f"{option} has no effect with --penalty-weight 0; leave one out")
     if settings.penalty != "tv":
         raise WrongUsage(f"{option} starts from total variation, not from --penalty {settings.penalty}; leave one out")
-    if settings.uncertainty:
-        raise WrongUsage(f"--uncertainty is known for total variation only, not for {option}; leave one out")
 
 
 def _check_methods(selection: Selection, methods: list[Method], settings: Settings) -> None:
@@ -231,7 +244,7 @@ def _check_methods(selection: Selection, methods: list[Method], settings: Settin
         )
     if settings.likelihood == "least-squares" and {"mlem", "pmlem-osl"} & set(methods):
         raise WrongUsage("least squares has ratios below zero, which mlem and pmlem-osl cannot take; use pmlem")
-    if (settings.uncertainty or settings.penalty != "tv") and not {"pmlem", *JOINT_METHODS} & set(methods):
+    if (settings.uncertainty or settings.penalty != "tv") and not _WITH_PRIOR & set(methods):
         option = "--uncertainty" if settings.uncertainty else f"--penalty {settings.penalty}"
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
 

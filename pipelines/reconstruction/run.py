@@ -196,6 +196,11 @@ def _warn(loaded: ElementalSet, records: list[PlaneRecord]) -> None:
             f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
             f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
         )
+    without = [one.prior.left_out for one in records if one.prior and one.prior.left_out]
+    if without:
+        inform(
+            f"the prior is left out of {len(without)} of {len(records)} planes, total variation's stay: {without[0]}"
+        )
     black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(loaded)]
     if black:
         first = loaded.units.depths_text([black[0].depth_mm])

@@ -64,6 +64,22 @@ class Solution:
     sidecars: dict[str, Image] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class Pilot:
+    """What the prior of one colour begins with.
+
+    Attributes
+    ----------
+    solution : Solution
+        The plane of total variation.
+    others : float array (row, column)
+        The sum of the same plane in the other colours, in electrons.
+    """
+
+    solution: Solution
+    others: Image
+
+
 def mean_e(plane: Image) -> float:
     """Return the mean of a plane, summed in float64."""
     return float(np.mean(plane, dtype=np.float64))

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,7 @@ from faintfield.pipelines.formats.files import remove, remove_leftovers, require
 from faintfield.pipelines.formats.large_arrays import memory_or_file
 from faintfield.pipelines.formats.provenance import provenance
 from faintfield.pipelines.formats.results.plane_files import read_current
-from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE, SolveRecord
+from faintfield.pipelines.formats.results.records import DEPTH_MAP_FILE
 from faintfield.pipelines.formats.results.surface import (
     SURFACE_FILE,
     HeldOutRecord,
@@ -33,8 +33,9 @@ from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_error
 from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
 from faintfield.pipelines.reconstruction.parallax import aperture_of
-from faintfield.pipelines.reconstruction.penalised import solve_then_sigma
-from faintfield.pipelines.reconstruction.solutions import Settings, mean_e
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_then_sigma
+from faintfield.pipelines.reconstruction.prior import with_prior
+from faintfield.pipelines.reconstruction.solutions import Solution, mean_e
 from faintfield.pipelines.reconstruction.surface_depths import (
     check_views,
     depths_of_set,
@@ -47,6 +48,7 @@ from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write
 from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
 from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.prior.patches import refined
+from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.confidence import RIGHT_WITHIN, SURE, UNKNOWN_BELOW
 from faintfield.recon.surface.estimate import SurfaceEstimate
 from faintfield.recon.surface.held_out import Prediction
@@ -54,24 +56,6 @@ from faintfield.recon.surface.held_out import Prediction
 # Bytes of a sample in the files: TIFFs of one number and of one per colour, a point, and the picture on the page; and
 # bytes of previews, film and page, which do not grow with the picture.
 _NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
-
-
-@dataclass(frozen=True)
-class _Light:
-    """One colour of the picture.
-
-    Attributes
-    ----------
-    picture, sigma, visibility : float arrays (row, column)
-        Light and its standard deviation in electrons; number of views that see each sample.
-    record : SolveRecord
-        How it was solved.
-    """
-
-    picture: NDArray[np.floating]
-    sigma: NDArray[np.floating]
-    visibility: NDArray[np.floating]
-    record: SolveRecord
 
 
 def reconstruct_surface(
@@ -114,7 +98,7 @@ def reconstruct_surface(
         return kept.surface
     layouts = channel_layouts(loaded)
     grid = plane_grid(loaded, 1.0)
-    require_room(out, _needed_bytes(grid.shape, len(layouts)))
+    require_room(out, _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal))
     range_mm = limits_mm(loaded, request)
     find_range = request.depth_range_mm is None and imported_range_px(loaded) is None
     remove_leftovers(out)
@@ -124,8 +108,7 @@ def reconstruct_surface(
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
     with naming_range(loaded, far, near):
         lights = {
-            layout.name: _light(loaded, layout, inverse_depth, request.settings, out)
-            for layout in progress(layouts, "picture")
+            layout.name: _light(loaded, layout, inverse_depth, request, out) for layout in progress(layouts, "picture")
         }
     facts = SurfaceFacts(
         unit=unit,
@@ -156,25 +139,33 @@ def _check(loaded: ElementalSet, out: Path) -> None:
         )
 
 
-def _needed_bytes(shape: tuple[int, int], colours: int) -> int:
+def _needed_bytes(shape: tuple[int, int], colours: int, *, proposal: bool) -> int:
     """Return about how much disk the results take, with the page that shows them again."""
-    numbers = _NUMBERS + _NUMBERS_PER_COLOUR * colours
+    numbers = _NUMBERS + (1 + proposal) * _NUMBERS_PER_COLOUR * colours
     of_sample = numbers * np.dtype(np.float32).itemsize + _POINT_BYTES + 3 * colours
     return shape[0] * shape[1] * of_sample + _FIXED_BYTES
 
 
 def _light(
-    loaded: ElementalSet, layout: ChannelLayout, inverse_depth: NDArray[np.floating], settings: Settings, out: Path
-) -> _Light:
-    """Return one colour of the picture on a surface of known depth; its σ is computed when the images are gone."""
+    loaded: ElementalSet, layout: ChannelLayout, inverse_depth: NDArray[np.floating], request: SurfaceRequest, out: Path
+) -> Solution:
+    """Return one colour of the picture on a surface of known depth, with `sigma` and `visibility` beside it.
+
+    `sigma` is that of total variation's picture; it is computed when the images are gone.
+    """
     images = load_channel(loaded, layout, memory_or_file(out))
     factory = OperatorFactory(loaded, layout, images)
     operator = factory.of_surface(inverse_depth, plane_grid(loaded, 1.0))
     _name_blind_views(loaded, operator, len(layout.lattices))
-    solution, sigma = solve_then_sigma(operator, images, settings)
-    picture, visibility = refined(operator, images, solution.plane), _visibility(operator, layout)
-    del images, factory, operator
-    return _Light(picture, sigma(), visibility, solution.record)
+    objective = Objective.of(SceneProblem(operator, images), request.settings)
+    solution, sigma = solve_then_sigma(objective, request.settings)
+    if request.filtered:
+        solution = replace(solution, plane=refined(operator, images, solution.plane))
+    else:
+        (solution,) = with_prior(objective, [solution], request.settings)
+    visibility = _visibility(operator, layout)
+    del images, factory, operator, objective
+    return replace(solution, sidecars=solution.sidecars | {"sigma": sigma(), "visibility": visibility})
 
 
 def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.floating]:
@@ -196,7 +187,7 @@ def _name_blind_views(loaded: ElementalSet, operator: SurfaceOperator, phases: i
         inform(f"{len(blind)} views see nothing of the surface, {first} for one; are their poses right?")
 
 
-def _channel(name: str, light: _Light) -> SurfaceChannel:
+def _channel(name: str, light: Solution) -> SurfaceChannel:
     """Return the record of one colour."""
     record = light.record
     return SurfaceChannel(
@@ -207,7 +198,8 @@ def _channel(name: str, light: _Light) -> SurfaceChannel:
         certificate=record.certificate,
         passes=record.passes,
         likelihood=record.likelihood or "",
-        mean_e=mean_e(light.picture),
+        mean_e=mean_e(light.plane),
+        prior=record.prior,
     )
 
 
@@ -229,7 +221,7 @@ def _maps(
     loaded: ElementalSet,
     inverse_depth: NDArray[np.float64],
     estimate: SurfaceEstimate,
-    lights: list[_Light],
+    lights: list[Solution],
     unit: Literal["mm", "px", "relative"],
     bins: int,
 ) -> SurfaceMaps:
@@ -242,14 +234,17 @@ def _maps(
     sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
     slope = np.abs(in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
     light = light_per_e(loaded)
+    proposed = all("proposal" in one.sidecars for one in lights)
     return SurfaceMaps(
         grid=grid,
-        picture=_colours([light * one.picture for one in lights]),
-        picture_sigma=_colours([light * one.sigma for one in lights]),
+        picture=_colours([light * one.plane for one in lights]),
+        picture_sigma=_colours([light * one.sidecars["sigma"] for one in lights]),
+        picture_proposal=_colours([light * one.sidecars["proposal"] for one in lights]) if proposed else None,
+        picture_moved=_colours([one.sidecars["moved"] for one in lights]) if proposed else None,
         depth=np.where(known, depth, np.nan),
         depth_sigma=np.where(known, sigma * slope, np.nan),
         depth_confidence=confidence,
-        visibility=np.mean([one.visibility for one in lights], axis=0),
+        visibility=np.mean([one.sidecars["visibility"] for one in lights], axis=0),
         inverse_depth=inverse_depth,
         aperture_mm=aperture_of(loaded.poses_rt_cam_ref),
     )

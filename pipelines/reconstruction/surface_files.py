@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from msgspec import UNSET
 from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform
@@ -35,6 +36,9 @@ from faintfield.pipelines.reconstruction.parallax import FRAME_MS, render_parall
 from faintfield.recon.operator.grid import PlaneGrid
 
 POINTS, FILM = "surface.ply", "parallax.webp"
+
+# What a prior proposed, and how far the data moved the picture from it.
+_PROPOSED = ("picture_proposal.tiff", "picture_moved.tiff")
 
 # The depth and its standard deviation, by unit.
 _DEPTH_FILES = {
@@ -68,6 +72,8 @@ class SurfaceMaps:
         Best estimate of 1/depth in 1/mm, everywhere: what the film is rendered from.
     aperture_mm : (float, float)
         Distance of the outermost nodes along x and y, see `parallax.aperture_of`.
+    picture_proposal, picture_moved : float arrays (row, column[, colour]), optional
+        What the prior proposed, in the unit of the set, and the picture less that, in standard deviations of the noise.
     """
 
     grid: PlaneGrid
@@ -79,6 +85,8 @@ class SurfaceMaps:
     visibility: NDArray[np.floating] | NDArray[np.integer]
     inverse_depth: NDArray[np.floating]
     aperture_mm: tuple[float, float]
+    picture_proposal: NDArray[np.floating] | None = None
+    picture_moved: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
         for name, values in vars(self).items():
@@ -109,7 +117,7 @@ def write_surface(
     """
     remove(folder / SURFACE_FILE)
     depths = [name for of_unit in _DEPTH_FILES.values() for name in of_unit]  # an earlier surface may have another unit
-    for name in (POINTS, FILM, *depths, *map(preview_name, depths)):
+    for name in (POINTS, FILM, *depths, *_PROPOSED, *map(preview_name, (*depths, *_PROPOSED))):
         remove(folder / name)
     levels = grey_levels(maps.picture, white_level(maps.picture))
     points = _write_points(folder, maps, levels, facts.unit) if facts.unit != "px" else None
@@ -125,11 +133,14 @@ def write_surface(
 def _record(maps: SurfaceMaps, facts: SurfaceFacts, points: str | None, film: str | None) -> SurfaceRecord:
     """Return the record of a surface; its numbers are those of the maps."""
     depth, depth_sigma = _DEPTH_FILES[facts.unit]
+    proposal, moved = (UNSET, UNSET) if maps.picture_proposal is None else _PROPOSED
     known = np.isfinite(maps.depth)
     return SurfaceRecord(
         **msgspec.structs.asdict(facts),
         picture="picture.tiff",
         picture_sigma="picture_sigma.tiff",
+        picture_proposal=proposal,
+        picture_moved=moved,
         depth=depth,
         depth_sigma=depth_sigma,
         depth_confidence="depth_confidence.tiff",
@@ -149,14 +160,11 @@ def _named_maps(
     """Yield each map with the name of its file and its preview."""
     what = "disparity" if record.unit == "px" else "depth"
     yield record.picture, maps.picture, encoded(levels, ".png")
-    sigma = maps.picture_sigma
-    # One scale for all colours: that of their mean
-    shown = sigma if sigma.ndim == 2 else sigma.mean(axis=2)
-    yield (
-        record.picture_sigma,
-        sigma,
-        map_picture(shown, f"σ of the light ({_LIGHT[units.light]})", *robust_limits(shown)),
-    )
+    sigma, proposal, moved = maps.picture_sigma, maps.picture_proposal, maps.picture_moved
+    yield record.picture_sigma, sigma, _colour_map(sigma, f"σ of the light ({_LIGHT[units.light]})")
+    if proposal is not None and moved is not None:
+        yield _PROPOSED[0], proposal, encoded(grey_levels(proposal, white_level(maps.picture)), ".png")
+        yield _PROPOSED[1], moved, _colour_map(moved, "picture less proposal (σ)")
     label = f"{what} ({record.unit})"
     yield record.depth, maps.depth, map_picture(maps.depth, label, *robust_limits(maps.depth))
     label = f"σ of the {what} ({record.unit})"
@@ -166,6 +174,12 @@ def _named_maps(
     visibility = maps.visibility.astype(np.float32)
     most = max(float(np.nanmax(visibility, initial=1.0)), 1.0)
     yield record.visibility, visibility, map_picture(visibility, "views that see it", 0.0, most)
+
+
+def _colour_map(values: NDArray[np.floating], label: str) -> bytes:
+    """Return the preview of a map (row, column[, colour]); one scale for all colours: that of their mean."""
+    shown = values if values.ndim == 2 else values.mean(axis=2)
+    return map_picture(shown, label, *robust_limits(shown))
 
 
 def _write_points(folder: Path, maps: SurfaceMaps, levels: Picture, unit: str) -> str:

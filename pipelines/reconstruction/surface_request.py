@@ -4,10 +4,13 @@ import re
 from dataclasses import dataclass, field
 from typing import Literal
 
+from msgspec import UNSET
+
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+from faintfield.pipelines.reconstruction.request import check_prior
 from faintfield.pipelines.reconstruction.solutions import Settings
 
 # Folder of the surface among the results of a session.
@@ -31,11 +34,14 @@ class SurfaceRequest:
         Unit of the depths in its files: mm, or px of disparity from node to node.
     settings : Settings
         How its light is solved.
+    filtered : bool
+        Add the detail that the penalty removed, by a filter; otherwise the picture is that of the prior alone.
     """
 
     depth_range_mm: tuple[float, float] | None = None
     unit: Literal["mm", "px"] = "mm"
     settings: Settings = field(default_factory=Settings)
+    filtered: bool = True
 
     def options(self, poses: Poses) -> SurfaceOptions:
         """Return the options that the results record."""
@@ -46,6 +52,8 @@ class SurfaceRequest:
             penalty_weight="auto" if weight is None else weight,
             penalty=self.settings.penalty,
             likelihood=self.settings.likelihood,
+            prior=UNSET if self.filtered else self.settings.prior,
+            proposal=self.settings.proposal or UNSET,
             passes=self.settings.passes,
             poses=poses,
         )
@@ -59,13 +67,14 @@ class SurfaceSelection:
     ----------
     range_mm, range_px : (float, float), optional
         Depths, nearest first; disparities.
-    settings : Settings
-        How its light is solved.
+    settings, filtered : Settings, bool
+        As in `SurfaceRequest`.
     """
 
     range_mm: tuple[float, float] | None
     range_px: tuple[float, float] | None
     settings: Settings
+    filtered: bool
 
     def resolve(self, loaded: ElementalSet) -> SurfaceRequest:
         """Return the request for a set, whose disparities become depths.
@@ -76,20 +85,25 @@ class SurfaceSelection:
             A disparity has no depth.
         """
         if self.range_px is None:
-            return SurfaceRequest(self.range_mm, "mm", self.settings)
+            return SurfaceRequest(self.range_mm, "mm", self.settings, self.filtered)
         near_mm, far_mm = sorted(loaded.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
-        return SurfaceRequest((near_mm, far_mm), "px", self.settings)
+        return SurfaceRequest((near_mm, far_mm), "px", self.settings, self.filtered)
 
 
 def select_surface(
-    wanted: bool, depth_range_mm: str | None, disparity_range_px: str | None, settings: Settings
+    wanted: bool,
+    depth_range_mm: str | None,
+    disparity_range_px: str | None,
+    settings: Settings,
+    *,
+    filtered: bool = True,
 ) -> SurfaceSelection | None:
     """Return the surface that options select, None if none is `wanted`.
 
     Raises
     ------
     WrongUsage
-        A range is no range, two are given, or one although no surface is wanted.
+        A range is no range, two are given, or one although no surface is wanted; or a prior does not suit.
     """
     if not wanted:
         if depth_range_mm or disparity_range_px:
@@ -104,7 +118,8 @@ def select_surface(
             f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
             "NEAR:FAR, such as 400:1500"
         )
-    return SurfaceSelection(range_mm, range_px, settings)
+    check_prior(["pmlem"], settings)
+    return SurfaceSelection(range_mm, range_px, settings, filtered)
 
 
 def _ends(option: str, given: str, example: str) -> tuple[float, float]:

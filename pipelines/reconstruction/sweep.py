@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from msgspec import UNSET, structs
-from numpy.typing import NDArray
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import FileFailed
 from faintfield.pipelines.formats.large_arrays import memory_or_file
-from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
+from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
 from faintfield.pipelines.formats.results.plane_files import Origin, PlaneFiles
 from faintfield.pipelines.formats.results.records import (
     JOINT_METHODS,
@@ -23,129 +21,11 @@ from faintfield.pipelines.formats.results.records import (
     PlaneRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.formats.sets.stated import in_units, light_per_e
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
-from faintfield.pipelines.reconstruction.joint import solve_together
-from faintfield.pipelines.reconstruction.operators import OperatorFactory
-from faintfield.pipelines.reconstruction.planes import solve
-from faintfield.pipelines.reconstruction.solutions import Settings, Solution
-from faintfield.recon.depth.focus import FocusMeasure, focus_measure, sharp_depths_mm
-from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.pipelines.reconstruction.tasks import Channel, PlaneTask, do_task
+from faintfield.recon.depth.focus import FocusMeasure, sharp_depths_mm
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.plane_operator import PlaneOperator
-
-
-@dataclass(frozen=True)
-class PlaneTask:
-    """One colour of one plane by the methods that still lack it; holds paths and options, no pixels.
-
-    For methods that reconstruct all planes together: one colour of all planes.
-
-    Attributes
-    ----------
-    layout : ChannelLayout
-        The colour.
-    grids : dict of Place to PlaneGrid
-        The samples of each plane.
-    files : tuple of PlaneFiles
-        Where the result of each method and plane goes.
-    settings : Settings
-        Settings of the methods.
-    with_focus : bool
-        Measure the power of detail, too.
-    """
-
-    layout: ChannelLayout
-    grids: dict[Place, PlaneGrid]
-    files: tuple[PlaneFiles, ...]
-    settings: Settings
-    with_focus: bool
-
-
-class Channel:
-    """One colour of a set in memory: what all of its tasks share."""
-
-    def __init__(self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
-        self._loaded = loaded
-        self._images = images
-        self._phases = len(layout.lattices)
-        self._factory = OperatorFactory(loaded, layout, images)
-
-    def do(self, task: PlaneTask) -> list[str]:
-        """Reconstruct and save what a task asks for, and return messages for the user.
-
-        Raises
-        ------
-        GeometryMismatch, NotConverged
-            Of the task's depth, or method.
-        """
-        messages: list[str] = []
-        focus: dict[Place, FocusPoint | None] = dict.fromkeys(task.grids)
-        for place, grid in task.grids.items():
-            try:
-                operator = self._factory.at(place, grid)
-            except GeometryMismatch as failure:
-                raise GeometryMismatch(f"plane at {self._words(place)}: {failure}") from failure
-            messages += self._blind_views(operator, place)
-            if task.with_focus:
-                focus[place] = FocusPoint(*focus_measure(operator, self._images, self._halves()))
-            for files in task.files:
-                if files.method not in JOINT_METHODS and files.place == place:
-                    self._save(task, files, solve(operator, self._images, files.method, task.settings), focus[place])
-        joint = [method for method in JOINT_METHODS if any(files.method == method for files in task.files)]
-        solved = solve_together(self._factory, self._images, task.grids, joint, task.settings) if joint else {}
-        for files in task.files:
-            if files.method in joint:
-                self._save(task, files, solved[files.method][files.place], focus[files.place])
-        return messages
-
-    def _save(self, task: PlaneTask, files: PlaneFiles, solution: Solution, focus: FocusPoint | None) -> None:
-        """Save one plane of this colour with its record."""
-        place, grid = files.place, task.grids[files.place]
-        tilted = place if isinstance(place, TiltedPlane) else None
-        px_per_sample = grid.pitch_mm * self._loaded.settings.camera.fx_px / depth_of(place)  # on the axis
-        cosine = abs(float(tilted.normal[2])) if tilted else 1.0
-        record = PlaneRecord(
-            name=tilted.name if tilted else UNSET,
-            depth_mm=depth_of(place),
-            rt_ref_plane=tilted.rt_ref_plane if tilted else UNSET,
-            method=files.method,
-            channel=task.layout.name,
-            file=files.path.name,
-            shape=grid.shape,
-            pitch_mm=grid.pitch_mm,
-            origin_mm=grid.origin_mm,
-            **structs.asdict(solution.record),
-            flux_e=float(solution.plane.sum(dtype=np.float64)) * (px_per_sample**2 * cosine),
-        )
-        arrays = {"plane": solution.plane, **solution.sidecars}
-        light = light_per_e(self._loaded)
-        if light != 1:
-            arrays |= {name: light * arrays[name] for name in ("plane", "sigma", "proposal") if name in arrays}
-        focus = in_units(self._loaded, focus) if focus else None
-        files.save_part(task.layout.name, arrays, in_units(self._loaded, record), focus)
-
-    def _words(self, place: Place) -> str:
-        """Return the name of a plane in messages."""
-        return f"'{place.name}'" if isinstance(place, TiltedPlane) else self._loaded.depth_text(place)
-
-    def _halves(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the views on both colours of a checkerboard of nodes; even and odd ones if no nodes are stated."""
-        views = self._loaded.settings.view
-        odd = np.array([(sum(view.node) if view.node else index) % 2 for index, view in enumerate(views)])
-        odd = np.repeat(odd, self._phases)
-        return np.flatnonzero(odd == 0), np.flatnonzero(odd == 1)
-
-    def _blind_views(self, operator: PlaneOperator, place: Place) -> list[str]:
-        """Return a message on views that see nothing of a plane: a pose may be wrong."""
-        blind = {int(view) // self._phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
-        if not blind:
-            return []
-        first, count = self._loaded.settings.view[min(blind)].image, len(blind)
-        place_words = self._words(place)
-        return [f"{place_words}: {count} views see nothing of the plane, {first} for one; are their poses right?"]
-
 
 # Does the tasks of a set in any order, with a folder for temporary files; yields each when saved, with its messages.
 type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]
@@ -153,14 +33,16 @@ type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tupl
 
 def run_serially(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
     """Do tasks in this process with all its threads, one colour at a time, from a file if memory is short."""
-    layout: ChannelLayout | None = None
+    held: list[tuple[ChannelLayout, Channel]] = []
+
+    def opened(layout: ChannelLayout) -> Channel:
+        if not held or held[0][0] is not layout:
+            held.clear()  # frees the previous channel before the next is read
+            held.append((layout, Channel(loaded, layout, load_channel(loaded, layout, memory_or_file(out)))))
+        return held[0][1]
+
     for task in tasks:
-        if task.layout is not layout:
-            channel = None  # frees the previous channel before the next is read
-            channel = Channel(loaded, task.layout, load_channel(loaded, task.layout, memory_or_file(out)))
-            layout = task.layout
-        assert channel is not None
-        yield task, channel.do(task)
+        yield task, do_task(task, opened)
 
 
 @dataclass(frozen=True)
@@ -199,7 +81,8 @@ class Sweep:
     def needed_bytes(self) -> int:
         """Return about how much disk the results take: planes, previews, and the report that shows them again."""
         samples = sum(grid.shape[0] * grid.shape[1] for grid in self.grids.values()) * len(self.layouts)
-        files = len(self.origins) * (2 if self.settings.uncertainty else 1) + ("occlusion" in self.origins)
+        beside = self.settings.uncertainty + 2 * self.settings.proposal
+        files = len(self.origins) * (1 + beside) + ("occlusion" in self.origins)
         return samples * files * (np.dtype(np.float32).itemsize + 3)
 
     def run(self, runner: Runner, out: Path) -> None:
@@ -232,18 +115,19 @@ class Sweep:
                 )
 
     def _tasks(self) -> list[PlaneTask]:
-        """Return the missing tasks, one channel after the other."""
+        """Return the missing tasks, one channel after the other; with all channels in each if a prior compares them."""
         wanted = [files for files in self.files if (files.method, files.place) not in self.finished]
         missing = [files.missing() for files in wanted]
         tasks = []
-        for layout in self.layouts:
-            left = [files for files, channels in zip(wanted, missing, strict=True) if layout.name in channels]
+        for layouts in [self.layouts] if self.settings.prior != "tv" else [[layout] for layout in self.layouts]:
+            names = {layout.name for layout in layouts}
+            left = [files for files, channels in zip(wanted, missing, strict=True) if names.intersection(channels)]
             single = [files for files in left if files.method not in JOINT_METHODS]
             for place, grid in self.grids.items():
                 of_plane = tuple(files for files in single if files.place == place)
-                tasks.append(PlaneTask(layout, {place: grid}, of_plane, self.settings, self.with_focus))
+                tasks.append(PlaneTask(tuple(layouts), {place: grid}, of_plane, self.settings, self.with_focus))
             joint = tuple(files for files in left if files.method in JOINT_METHODS)
-            tasks.append(PlaneTask(layout, self.grids, joint, self.settings, self.with_focus))
+            tasks.append(PlaneTask(tuple(layouts), self.grids, joint, self.settings, self.with_focus))
         return [task for task in tasks if task.files]
 
     def _write_complete(self, candidates: Sequence[PlaneFiles]) -> None:

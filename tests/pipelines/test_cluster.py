@@ -17,7 +17,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_s
 from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import reconstruct_set
-from faintfield.pipelines.reconstruction.sweep import PlaneTask
+from faintfield.pipelines.reconstruction.tasks import PlaneTask
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -92,15 +92,16 @@ def test_a_task_that_fails_is_the_failure_of_the_command(
 
 
 @pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("prior", [(), pytest.param(("--prior", "patches"), marks=pytest.mark.slow)])
 def test_workers_of_this_machine_give_colour_planes_with_saturated_pixels(
-    tmp_path: Path, done: Command, small_options: tuple[object, ...]
+    prior: tuple[object, ...], tmp_path: Path, done: Command, small_options: tuple[object, ...]
 ) -> None:
     done("simulate", tmp_path / "set", *small_options, "--colour", "bayer", "--snr", 60)
     settings = tmp_path / "set" / "elemental.toml"
     text = settings.read_text()
     settings.write_text(text.replace("saturation_dn = 65535", "saturation_dn = 8000"))
     assert settings.read_text() != text
-    words = ("reconstruct", tmp_path / "set", *("--depth-mm", 500, "--depth-mm", 700, "--passes", 1))
+    words = ("reconstruct", tmp_path / "set", *("--depth-mm", 500, "--depth-mm", 700, "--passes", 1), *prior)
     done(*words, "--out", tmp_path / "local")
     done(*words, "--out", tmp_path / "spread", "--workers", 1)
     assert _planes(tmp_path / "spread") == _planes(tmp_path / "local")

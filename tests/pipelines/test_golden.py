@@ -37,12 +37,14 @@ SWEEP = ("--sweep-mm", "400:800:9", "--method", "backprojection")
 
 # Options that make a result of the same kind from the small scene, and the name of its file.
 FRESH: dict[str, tuple[str, tuple[object, ...]]] = {
-    "reconstruction_pmlem": ("reconstruction.json", PAIR),
+    "reconstruction_pmlem": ("reconstruction.json", (*PAIR, "--prior", "tv")),
+    "reconstruction_prior": ("reconstruction.json", PAIR),
     "reconstruction_pmlem-osl": ("reconstruction.json", ("--depth-mm", 500, "--method", "pmlem-osl")),
     "reconstruction_sweep": ("reconstruction.json", SWEEP),
-    "reconstruction_auto": ("reconstruction.json", ("--depth-mm", "auto")),
+    "reconstruction_auto": ("reconstruction.json", ("--depth-mm", "auto", "--prior", "tv")),
     "depth_map_sweep": ("depth_map.json", (*SWEEP, "--depth-map")),
-    "plane_pmlem": ("plane_00500.0.json", PAIR),
+    "plane_pmlem": ("plane_00500.0.json", (*PAIR, "--prior", "tv")),
+    "plane_prior": ("plane_00500.0.json", PAIR),
     "metrics_set": ("metrics.json", PAIR),
     "overview_set": ("overview.json", PAIR),
 }

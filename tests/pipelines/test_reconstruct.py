@@ -215,7 +215,7 @@ def test_options_take_effect_and_are_recorded(scene: Path, tmp_path: Path, done:
     assert plane["flux_e"] == pytest.approx(total * samples_per_px, rel=1e-6)
     stated = {"method": "pmlem", "depth_mm": [500.0], "penalty_weight": 0.25, "passes": 3, "pitch_mm": 10.0}
     others = {"poses": "stated", "penalty": "tv", "likelihood": "auto", "uncertainty": False, "focus": False}
-    others |= {"depth_map": None, "plane_pose": {}}
+    others |= {"depth_map": None, "plane_pose": {}, "prior": "auto"}
     assert record["options"] == stated | others
 
 

@@ -287,7 +287,7 @@ def test_the_page_leads_with_the_planes_beside_one_view(session: Path, done: Com
     text = (session / "report.html").read_text()
     places = [
         text.index(words)
-        for words in ('class="facts"', 'id="result"', "What the camera saw.", "What was there, 500 mm.")
+        for words in ('class="facts"', 'id="result"', "What the camera saw.", "What all views show, 500 mm.")
     ]
     later = [text.index(f'id="{name}"') for name in ("errors", "noise", "geometry", "light", "provenance")]
     assert places + later == sorted(places + later)

@@ -63,7 +63,7 @@ def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command
     assert "The surface predicts them best" in said
     page = (surface / "report.html").read_text()
     assert "<title>faintfield · &lt;toys &amp; more&gt;: a surface</title>" in page
-    assert "What was there, sharp everywhere." in page
+    assert "What all views show, sharp everywhere." in page
     assert "The planes below" not in page
     assert "within 0.40 % of the optimum" in page  # in the provenance
     assert "total variation" in page
@@ -110,7 +110,7 @@ def test_planes_and_a_surface_stand_on_one_page(
     assert section.count("<figure>") == 7
     page = (out / "report.html").read_text()
     assert "The planes below are by back-projection." in page
-    assert "What was there, sharp everywhere." not in page
+    assert "What all views show, sharp everywhere." not in page
     assert "planes at 500 mm, a surface" in page
 
 

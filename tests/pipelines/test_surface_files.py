@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ from faintfield.pipelines.formats.results.plane_files import read_current
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
 from faintfield.pipelines.reconstruction import surface_files
 from faintfield.pipelines.reconstruction.map_pictures import robust_limits
-from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps
-from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_maps, write_example
+from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
+from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_facts, surface_maps, write_example
 
 # Every file of a surface in mm.
 FILES = {
@@ -263,3 +264,20 @@ def test_the_limits_of_a_map_leave_outliers_out() -> None:
     assert low < 3 < high
     low, high = robust_limits(np.zeros(5))
     assert low < 0 < high
+
+
+def test_a_proposal_stands_beside_the_picture_until_a_surface_has_none(tmp_path: Path) -> None:
+    maps = surface_maps(colours=3)
+    proposed = replace(maps, picture_proposal=0.9 * maps.picture, picture_moved=(maps.picture - 1) / 2)
+    facts, origin = surface_facts(channels=("red", "green", "blue")), provenance("reconstruct", OPTIONS, {})
+    record = write_surface(tmp_path, proposed, facts, origin)
+    assert (record.picture_proposal, record.picture_moved) == ("picture_proposal.tiff", "picture_moved.tiff")
+    np.testing.assert_allclose(tifffile.imread(tmp_path / "picture_proposal.tiff"), 0.9 * maps.picture, rtol=1e-6)
+    np.testing.assert_allclose(tifffile.imread(tmp_path / "picture_moved.tiff"), (maps.picture - 1) / 2, rtol=1e-6)
+    beside = {f"picture_{name}{suffix}" for name in ("proposal", "moved") for suffix in (".tiff", ".png")}
+    assert {path.name for path in tmp_path.iterdir()} == FILES | beside | {SURFACE_FILE}
+    (tmp_path / "picture_moved.tiff").write_bytes(b"")
+    with pytest.raises(ResultDamaged, match=r"picture_moved\.tiff: was altered"):
+        verify(tmp_path)
+    write_surface(tmp_path, maps, facts, origin)
+    assert {path.name for path in tmp_path.iterdir()} == FILES | {SURFACE_FILE}

@@ -21,9 +21,10 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction import surface_depths
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
-from faintfield.pipelines.reconstruction.penalised import solve_then_sigma
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_then_sigma
 from faintfield.pipelines.reconstruction.planes import solve
 from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
 from tests.pipelines.surfaces import Searches
 
@@ -232,7 +233,7 @@ def test_the_deviation_without_images_is_that_of_a_plane(simulated_scene: Path) 
     images = load_channel(loaded, layout)
     operator = OperatorFactory(loaded, layout, images).at(500.0, plane_grid(loaded, 500.0))
     settings = Settings(penalty_weight=0.5, passes=5)
-    solution, sigma = solve_then_sigma(operator, images, settings)
+    solution, sigma = solve_then_sigma(Objective.of(SceneProblem(operator, images), settings), settings)
     expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
     np.testing.assert_array_equal(solution.plane, expected.plane)
     np.testing.assert_array_equal(sigma(), expected.sidecars["sigma"])

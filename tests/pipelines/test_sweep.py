@@ -134,7 +134,7 @@ def test_a_failure_leaves_the_planes_before_it(
             raise GeometryMismatch("made up")
         return solve(*arguments)
 
-    monkeypatch.setattr("faintfield.pipelines.reconstruction.sweep.solve", failing)
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.tasks.solve", failing)
     with pytest.raises(GeometryMismatch, match="made up"):
         reconstruct_and_report(load_set(simulated_scene), tmp_path, Request([500.0, 700.0], ["backprojection"]))
     assert {path.name for path in tmp_path.iterdir()} == {f"plane_00500.0.{kind}" for kind in ("tiff", "png", "json")}

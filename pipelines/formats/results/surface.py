@@ -17,6 +17,7 @@ from faintfield.pipelines.formats.results.records import (
     Count,
     FileName,
     Poses,
+    PriorRecord,
     ReconstructionRecord,
     Sha256,
     WeightScore,
@@ -32,7 +33,8 @@ type Share = Annotated[float, Meta(ge=0, le=1)]
 class SurfaceOptions(Struct, frozen=True, kw_only=True):
     """The options of `faintfield reconstruct --surface` as they took effect.
 
-    `depth_range_mm` is None if the range was to be found.
+    `depth_range_mm` is None if the range was to be found. `prior` is stated if one was asked for; otherwise the picture
+    is that of total variation with detail added by a filter.
     """
 
     depth_range_mm: tuple[float, float] | None
@@ -40,6 +42,8 @@ class SurfaceOptions(Struct, frozen=True, kw_only=True):
     penalty_weight: float | Literal["auto"]
     penalty: str
     likelihood: str
+    prior: str | UnsetType = UNSET
+    proposal: bool | UnsetType = UNSET
     passes: int | None = None
     poses: Poses
 
@@ -80,6 +84,7 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
     passes: int
     likelihood: str
     mean_e: float
+    prior: PriorRecord | UnsetType = UNSET
 
 
 class SurfaceFacts(Struct, frozen=True, kw_only=True):
@@ -128,6 +133,8 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     ----------
     picture, picture_sigma : str
         The light of each sample and its standard deviation.
+    picture_proposal, picture_moved : str, optional
+        What the prior proposed, and how far the data moved the picture from it.
     depth, depth_sigma : str
         The depth of each sample and its standard deviation, in `unit`; NaN where the depth is not known.
     depth_confidence : str
@@ -148,6 +155,8 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
 
     picture: FileName
     picture_sigma: FileName
+    picture_proposal: FileName | UnsetType = UNSET
+    picture_moved: FileName | UnsetType = UNSET
     depth: FileName
     depth_sigma: FileName
     depth_confidence: FileName
@@ -162,9 +171,11 @@ class SurfaceRecord(SurfaceFacts, frozen=True, kw_only=True):
     @property
     def maps(self) -> list[str]:
         """Names of the TIFFs, each of which has a preview."""
+        proposed = [name for name in (self.picture_proposal, self.picture_moved) if name is not UNSET]
         return [
             self.picture,
             self.picture_sigma,
+            *proposed,
             self.depth,
             self.depth_sigma,
             self.depth_confidence,
