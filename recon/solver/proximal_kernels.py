@@ -1,13 +1,14 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""Steps on the dual field of a penalised plane, compiled: several at a time on a strip of rows.
+"""Steps of a primal-dual iteration on a penalised plane, compiled: several at a time on a strip of rows.
 
 The penalty of a plane x is `β Σ φ(|∇(x − x̂)|)`, with `(∇x)[i,j] = (x[i+1,j] − x[i,j], x[i,j+1] − x[i,j])` and no
 difference taken across an edge. x̂ is a proposal, by default zero. The dual field p has a vector of length at most one
-for each sample (of any length where φ is quadratic everywhere), and determines the plane: `x = ( v − β/w ∇ᵀp )₊`.
+for each sample (of any length where φ is quadratic everywhere).
 
-A step changes a row of p using the rows next to it, so n steps on a strip need n more rows on each side, whose values
-become stale one after the other. Each strip works on a copy, so strips can be processed in any order, and the result
-does not depend on their number.
+A step changes a row using the rows next to it. The steps follow one another down the strip, each a row behind the one
+before, so that the rows in work stay in the cache and the planes pass through memory once for all steps. n steps on a
+strip need n rows of its neighbours on each side, whose values become stale one after the other. They are copied before
+any strip is changed, so that strips can be processed in any order, and the result does not depend on their number.
 """
 
 import numpy as np
@@ -16,111 +17,99 @@ from faintfield.recon.numba_tools import compiled
 
 
 @compiled
-def _plane_row(row, down, right, centre, reach, origin, values):
-    """Set `values` to a row of `( v − β/w ∇ᵀp )₊ − x̂`, with its last value twice.
-
-    The fields begin with a row and a column of zeros.
-    """
-    for j in range(centre.shape[1]):
-        divergence = down[row + 1, j + 1] - down[row, j + 1] + right[row + 1, j + 1] - right[row + 1, j]
-        values[j] = max(centre[row, j] + reach[row, j] * divergence, values.dtype.type(0))
-    if origin.size > 0:
-        for j in range(centre.shape[1]):
-            values[j] -= origin[row, j]
-    values[values.size - 1] = values[values.size - 2]
-
-
-@compiled
-def _step_row(x, below, step, smoothing, bounded, momentum, fields):
-    """Make one accelerated step on a row of the dual field; return how far it opposes the momentum."""
-    p_down, p_right, q_down, q_right = fields
-    number = x.dtype.type
-    one, against = number(1), number(0)
-    for j in range(step.size):
-        size = step[j]
-        shrink = one / (one + size * smoothing)
-        down = (q_down[j] + size * (below[j] - x[j])) * shrink
-        right = (q_right[j] + size * (x[j + 1] - x[j])) * shrink
-        length = np.sqrt(down * down + right * right)
-        inverse = one / max(length, one) if bounded else one
-        down *= inverse
-        right *= inverse
-        ahead_down, ahead_right = down - p_down[j], right - p_right[j]
-        against += (q_down[j] - down) * ahead_down + (q_right[j] - right) * ahead_right
-        p_down[j] = down
-        p_right[j] = right
-        q_down[j] = down + momentum * ahead_down
-        q_right[j] = right + momentum * ahead_right
-    return against
-
-
-@compiled
 def step_strip(
-    first, stop, dual, ahead, next_dual, next_ahead, centre, reach, steps, origin, smoothing, bounded, momenta
+    first, stop, above, below, dual, plane, ahead, centre, reach, sizes, origin, smoothing, bounded, lengths, momenta
 ):
-    """Make `momenta.size` accelerated projected gradient steps on rows `first` to `stop` of the dual field.
+    """Make `momenta.size` steps on rows `first` to `stop` of the dual field, the plane, and the plane ahead.
 
     Parameters
     ----------
-    dual, ahead, next_dual, next_ahead : array (2, row, column)
-        The field p and the field extrapolated beyond it; the strip's rows of both after the steps.
-    centre, reach, steps : array (row, column)
-        v, β/w, and the size of the step at each sample.
+    above, below : array (4, step, column)
+        The rows before and after the strip of p, of x and of x ahead; without rows at an edge of the plane.
+    dual, plane, ahead : array (2, row, column), (row, column), (row, column)
+        p; x; x extrapolated beyond its last step, less x̂. They are changed.
+    centre, reach, sizes : array (row, column)
+        v, β/w, and the size of a step on p.
     origin : array (row, column)
         x̂; of size zero where it is zero everywhere.
     smoothing, bounded : number, bool
         δ of the penalty, in the unit of the plane; whether |p| ≤ 1.
-    momenta : array (step,)
-        Extrapolation of each step.
-
-    Returns
-    -------
-    float
-        How far the last step opposed its momentum; when positive, the momentum should be dropped.
+    lengths, momenta : array (step,)
+        τ, the length of each step on x in the metric; its extrapolation.
     """
-    top, bottom = max(first - momenta.size, 0), min(stop + momenta.size, centre.shape[0])
-    local = _with_halo(top, bottom, dual, ahead)
-    against = 0.0
-    planes = centre[top:bottom], reach[top:bottom], steps[top:bottom], origin[top:bottom]
-    for momentum in momenta:
-        options = (centre.dtype.type(smoothing), bounded, centre.dtype.type(momentum))
-        against = _step_rows(first - top, stop - top, local, planes, options)
-    next_dual[:, first:stop] = local[:2, 1 + first - top : 1 + stop - top, 1:]
-    next_ahead[:, first:stop] = local[2:, 1 + first - top : 1 + stop - top, 1:]
-    return against
-
-
-@compiled
-def _with_halo(top, bottom, dual, ahead):
-    """Return a copy (4, row, column) of rows of both fields, after the row above and a column of zeros."""
-    local = np.zeros((4, bottom - top + 1, dual.shape[2] + 1), dual.dtype)
-    local[:2, 1:, 1:] = dual[:, top:bottom]
-    local[2:, 1:, 1:] = ahead[:, top:bottom]
-    if top > 0:
-        local[2, 0, 1:] = ahead[0, top - 1]
-    return local
-
-
-@compiled
-def _step_rows(first, stop, local, planes, options):
-    """Make one step on all rows of a copy; return how far rows `first` to `stop` oppose the momentum."""
-    centre, reach, steps, origin = planes
-    height, columns = centre.shape
-    here, below = np.empty(columns + 1, centre.dtype), np.empty(columns + 1, centre.dtype)
-    smoothing, bounded, momentum = options
-    _plane_row(0, local[2], local[3], centre, reach, origin, here)
-    against = 0.0
-    for row in range(height):
-        if row + 1 < height:
-            _plane_row(row + 1, local[2], local[3], centre, reach, origin, below)
-        else:
-            below[:] = here
-        fields = (local[0, row + 1, 1:], local[1, row + 1, 1:], local[2, row + 1, 1:], local[3, row + 1, 1:])
-        sums = _step_row(here, below, steps[row], smoothing, bounded, momentum, fields)
+    count, columns = momenta.size, centre.shape[1]
+    top, bottom = first - above.shape[1], stop + below.shape[1]
+    number = centre.dtype.type
+    one, smoothing = number(1), number(smoothing)
+    # A ring of rows in work, those of p after a column of zeros, those ahead with their last value twice
+    kept = count + 3
+    p, x = np.zeros((kept, 2, columns + 1), dual.dtype), np.empty((kept, columns), dual.dtype)
+    x_ahead, over_top = np.empty((kept, columns + 1), dual.dtype), np.zeros((2, columns + 1), dual.dtype)
+    for front in range(top, bottom + count):
+        if front < bottom:
+            k = front % kept
+            if front < first:
+                _load(above, front - top, p[k], x[k], x_ahead[k])
+            elif front >= stop:
+                _load(below, front - stop, p[k], x[k], x_ahead[k])
+            else:
+                p[k, :, 1:], x[k], x_ahead[k, :columns] = dual[:, front], plane[front], ahead[front]
+            x_ahead[k, columns] = x_ahead[k, columns - 1]
+        for step in range(count):
+            row = front - 1 - step
+            if row < top:
+                break
+            if row < bottom:
+                k = row % kept
+                next_row = (row + 1) % kept if row + 1 < bottom else k
+                length, momentum = number(lengths[step]), number(momenta[step])
+                _step_dual(x_ahead[k], x_ahead[next_row], sizes[row], one / length, smoothing, bounded, p[k])
+                over = p[(row - 1) % kept] if row > top else over_top
+                _step_primal(over, p[k], centre[row], reach[row], length, momentum, x[k], x_ahead[k])
+                if origin.size > 0:
+                    for j in range(columns):
+                        x_ahead[k, j] -= origin[row, j]
+                    x_ahead[k, columns] = x_ahead[k, columns - 1]
+        row = front - count
         if first <= row < stop:
-            against += sums
-        here, below = below, here
-    return against
+            k = row % kept
+            dual[:, row], plane[row], ahead[row] = p[k, :, 1:], x[k], x_ahead[k, :columns]
+
+
+@compiled
+def _load(rows, row, p, x, x_ahead):
+    """Copy a row of a neighbour."""
+    p[0, 1:], p[1, 1:], x[:], x_ahead[: x.size] = rows[0, row], rows[1, row], rows[2, row], rows[3, row]
+
+
+@compiled
+def _step_dual(x, below, sizes, scale, smoothing, bounded, p):
+    """Make a step on a row of the dual field, given the planes ahead in this row and the next."""
+    one = x.dtype.type(1)
+    down_field, right_field, beside = p[0, 1:], p[1, 1:], x[1:]
+    for j in range(sizes.size):
+        size = sizes[j] * scale
+        shrink = one / (one + size * smoothing)
+        down = (down_field[j] + size * (below[j] - x[j])) * shrink
+        right = (right_field[j] + size * (beside[j] - x[j])) * shrink
+        inverse = one / np.sqrt(max(down * down + right * right, one)) if bounded else one
+        down_field[j] = down * inverse
+        right_field[j] = right * inverse
+
+
+@compiled
+def _step_primal(above, p, centre, reach, length, momentum, x, ahead):
+    """Make a step on a row of the plane, given p in this row and the one above; set the row ahead, with x̂ = 0."""
+    number = x.dtype.type
+    share, zero = number(1) / (number(1) + length), number(0)
+    over, down, right, left = above[0, 1:], p[0, 1:], p[1, 1:], p[1, :-1]
+    for j in range(x.size):
+        before = x[j]
+        minimum = centre[j] + reach[j] * (down[j] - over[j] + right[j] - left[j])
+        after = max((before + length * minimum) * share, zero)
+        x[j] = after
+        ahead[j] = after + momentum * (after - before)
+    ahead[x.size] = ahead[x.size - 1]
 
 
 @compiled
@@ -133,6 +122,27 @@ def primal_of_dual(first, stop, dual, centre, reach, plane):
             divergence -= dual[0, row - 1, j] if row > 0 else zero
             divergence -= dual[1, row, j - 1] if j > 0 else zero
             plane[row, j] = centre[row, j] + reach[row, j] * divergence
+
+
+@compiled
+def distance_from_primal(first, stop, plane, dual, centre, reach):
+    """Return Σ w/β ( ½ (x − (u)₊)² + (−u)₊ x ) over rows of a plane x ≥ 0, with `u = v − β/w ∇ᵀp`.
+
+    It is how far x is from the minimum for a fixed p; each term is at least zero.
+    """
+    zero, half, total = centre.dtype.type(0), centre.dtype.type(0.5), 0.0
+    for row in range(first, stop):
+        of_row = zero
+        for j in range(centre.shape[1]):
+            divergence = dual[0, row, j] + dual[1, row, j]
+            divergence -= dual[0, row - 1, j] if row > 0 else zero
+            divergence -= dual[1, row, j - 1] if j > 0 else zero
+            minimum = centre[row, j] + reach[row, j] * divergence
+            x = plane[row, j]
+            change = x - max(minimum, zero)
+            of_row += (half * change * change + max(-minimum, zero) * x) / reach[row, j]
+        total += of_row
+    return total
 
 
 @compiled

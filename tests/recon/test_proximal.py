@@ -105,25 +105,26 @@ def test_strips_and_threads_change_nothing(dtype: type[np.float32] | type[np.flo
 
 
 def test_steps_follow_the_textbook_iteration() -> None:
+    """Chambolle and Pock's algorithm 2, written in the variable √w x, in which the metric is that of all textbooks."""
     generator = np.random.default_rng(6)
-    v, w = generator.normal(2, 1, (7, 6)), generator.uniform(0.5, 2, (7, 6))
-    reach = 1.3 / w
-    steps = step_sizes(reach)
-    p = q = np.zeros((2, 7, 6))
-    t = 1.0
-    for _ in range(20):
-        field = np.pad(q, [(0, 0), (1, 0), (1, 0)])
-        x = np.maximum(v + reach * (q.sum(0) - field[0, :-1, 1:] - field[1, 1:, :-1]), 0)
-        down, right = np.zeros_like(x), np.zeros_like(x)
-        down[:-1], right[:, :-1] = np.diff(x, axis=0), np.diff(x, axis=1)
-        ahead = q + steps * np.stack([down, right])
-        ahead /= np.maximum(np.hypot(*ahead), 1)
-        t_next = (1 + np.sqrt(1 + 4 * t * t)) / 2
-        q = ahead + (t - 1) / t_next * (ahead - p)
-        p, t = ahead, t_next
-    dual = DualField.zero([(v.shape[0], v.shape[1])], v.dtype)
-    dual.prox(v, w, 1.3, TV, lambda _: 0.0, 20)
+    v, w, proposal = generator.normal(1, 1, (7, 6)), generator.uniform(0.5, 2, (7, 6)), generator.normal(0, 1, (7, 6))
+    steps, root, weight = step_sizes(1.3 / w), np.sqrt(w), 1.3
+    p, x = np.zeros((2, 7, 6)), np.maximum(v, 0)
+    ahead, length = root * x, 1.0
+    for _ in range(40):
+        dual_steps = steps / (weight * length)  # on weight * p
+        p = weight * p + dual_steps * weight**2 * differences_of(ahead / root - proposal)
+        p /= np.maximum(np.hypot(*p) / weight, 1)
+        y = (root * x - length * adjoint_differences(p) / root + length * root * v) / (1 + length)
+        y = np.maximum(y, 0)
+        p /= weight
+        momentum = 1 / np.sqrt(1 + 1.4 * length)
+        ahead, x, length = y + momentum * (y - root * x), y / root, length * momentum
+    dual = DualField([np.zeros((2, 7, 6))], proposal)
+    found = dual.prox(v, w, weight, TV, lambda _: 0.0, 40)
+    assert (x == 0).any()
     np.testing.assert_allclose(dual.vectors[0], p, atol=1e-12)
+    np.testing.assert_allclose(found.plane, x, atol=1e-12)
 
 
 def test_the_largest_step_is_the_smallest_of_the_samples_that_it_changes() -> None:
