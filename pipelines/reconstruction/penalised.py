@@ -77,7 +77,7 @@ class Objective:
 
 def solve_pmlem(objective: Objective, settings: Settings) -> list[Solution]:
     """Run PMLEM to its certificate and return the planes; all their records are of the one iteration."""
-    choice = _choose_weight(objective.posed, objective.start, objective.penalty, settings)
+    choice = _choose_weight(objective, settings)
     record, iterate = certified(objective, choice.start, choice.weight, choice.dual, settings)
     record = structs.replace(
         record,
@@ -190,8 +190,9 @@ class _Choice:
     curve: list[WeightScore] | None = None
 
 
-def _choose_weight(posed: SceneProblem, start: Image, penalty: Penalty, settings: Settings) -> _Choice:
+def _choose_weight(objective: Objective, settings: Settings) -> _Choice:
     """Return the penalty weight for PMLEM: as given, or else by cross-validation."""
+    posed, start = objective.posed, objective.start
     if settings.penalty == "none":
         return _Choice(0.0, "none: no penalty", start, posed.dual())
     if settings.penalty_weight is not None:
@@ -199,7 +200,10 @@ def _choose_weight(posed: SceneProblem, start: Image, penalty: Penalty, settings
     guess = universal_penalty_weight(posed.operator, posed.images, start)
     if len(posed.operator.seeing_views) < MIN_VIEWS:
         return _Choice(guess, "from the noise level: too few views to hold some out", start, posed.dual())
-    found = cross_validated_weight(posed, guess, penalty)
+    found = cross_validated_weight(posed, guess, objective.penalty, objective.level_e)
     curve = [WeightScore(weight, loss) for weight, loss in found.candidates.items()]
+    chosen = "predicts held-out views best"
+    if found.solution is None:
+        return _Choice(found.weight, f"{chosen}, in windows of the plane", start, posed.dual(), found.passes, curve)
     nearest = np.maximum(found.solution.plane, 1e-3 * start)
-    return _Choice(found.weight, "predicts held-out views best", nearest, found.solution.dual, found.passes, curve)
+    return _Choice(found.weight, chosen, nearest, found.solution.dual, found.passes, curve)

@@ -12,6 +12,9 @@ from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.placement import BLOCK_PX
 from faintfield.recon.operator.relief import Relief
 
+# Distance of the pixels at which the part of the detector that sees a window is looked for.
+_NODE_PX = 16
+
 # How homographies (view, 3, 3) to samples change with 1/depth, and where each pixel meets the surface.
 type Surface = tuple[NDArray[np.float64], Relief]
 
@@ -70,6 +73,61 @@ def scene_geometry(
         () if surface is None else (True,),
         np.tile(np.array([0, padded], np.intp), (views, rows, 1)),
     )
+
+
+def window_geometry(geometry: SceneGeometry, grid: PlaneGrid, first: tuple[int, int]) -> SceneGeometry:
+    """Return the geometry of a part of the only plane, whose grid begins at sample `first` (row, column) of the whole.
+
+    `reach` covers at least the pixels that see the part.
+    """
+    rows, columns, padded = geometry.detector
+    moved = np.eye(3)
+    moved[:2, 2] = -first[1], -first[0]
+    homographies = moved @ geometry.homographies.reshape(-1, 3, 3).astype(np.float64)
+    rays = geometry.maps.reshape(3, -1, rows, padded)[:2, :, :, :columns]
+    reach = np.zeros((len(homographies), rows, 2), np.intp)
+    for view, lattice in enumerate(geometry.lattice_of_view.tolist()):
+        top, bottom, left, right = _pixels_of(homographies[view], grid.shape, rays[:, lattice])
+        reach[view, top:bottom] = left // BLOCK_PX * BLOCK_PX, min(-(-right // BLOCK_PX) * BLOCK_PX, padded)
+    return geometry._replace(
+        homographies=np.ascontiguousarray(homographies, geometry.homographies.dtype).reshape(-1),
+        layout=np.array([[0, *grid.shape]], np.intp),
+        reach=reach,
+    )
+
+
+def _pixels_of(
+    homography: NDArray[np.float64], shape: tuple[int, int], rays: NDArray[Any]
+) -> tuple[int, int, int, int]:
+    """Return a range of rows and one of columns that hold all pixels whose rays (2, row, column) meet some samples.
+
+    Each part of the detector between two nodes of a coarse lattice lies in the range if one of its neighbours does.
+    """
+    rows, columns = rays.shape[1:]
+    row_nodes, column_nodes = (_nodes(count) for count in (rows, columns))
+    x, y = rays[:, row_nodes[:, np.newaxis], column_nodes].astype(np.float64)
+    x, y, scale = np.tensordot(homography, np.stack([x, y, np.ones_like(x)]), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = x / scale, y / scale
+    beyond = [np.abs(np.diff(part, axis=axis)).max(initial=0.0) for part in (column, row) for axis in (0, 1)]
+    if not np.isfinite(beyond).all() or (scale <= 0).any():
+        return 0, rows, 0, columns
+    reach = 2 * max(beyond)
+    meets = (column > -reach) & (column < shape[1] + reach) & (row > -reach) & (row < shape[0] + reach)
+    if not meets.any():
+        return 0, 0, 0, 0
+    met_rows, met_columns = np.flatnonzero(meets.any(axis=1)), np.flatnonzero(meets.any(axis=0))
+    return (
+        int(row_nodes[met_rows[0]]),
+        int(row_nodes[met_rows[-1]]) + 1,
+        int(column_nodes[met_columns[0]]),
+        int(column_nodes[met_columns[-1]]) + 1,
+    )
+
+
+def _nodes(count: int) -> NDArray[np.intp]:
+    """Return pixels a few apart, the first and the last among them."""
+    return np.unique([*range(0, count, _NODE_PX), count - 1])
 
 
 def _check_shapes(

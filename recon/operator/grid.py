@@ -49,6 +49,12 @@ class PlaneGrid:
         first = tuple(origin + self.pitch_mm * (bins - 1) / 2 for origin in self.origin_mm)
         return PlaneGrid((self.shape[0] // bins, self.shape[1] // bins), self.pitch_mm * bins, (first[0], first[1]))
 
+    def window(self, rows: slice, columns: slice) -> "PlaneGrid":
+        """Return the grid of a part of these samples; both slices have a start and a stop."""
+        x_mm, y_mm = self.origin_mm
+        origin_mm = x_mm + columns.start * self.pitch_mm, y_mm + rows.start * self.pitch_mm
+        return PlaneGrid((rows.stop - rows.start, columns.stop - columns.start), self.pitch_mm, origin_mm)
+
     def index_from_plane(self) -> NDArray[np.float64]:
         """Return the 3 x 3 matrix from plane coordinates (x, y, 1) in mm to sample indices (column, row, 1)."""
         x_mm, y_mm = self.origin_mm

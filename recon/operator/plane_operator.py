@@ -1,10 +1,13 @@
 """H of a single plane, for callers that have one plane: its samples are an array (row, column)."""
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.recon.operator.geometry import Surface
+from faintfield.recon.operator.geometry import Surface, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.scene_operator import SceneOperator
 
 
@@ -52,4 +55,32 @@ class PlaneOperator(SceneOperator):
             surface=surface,
         )
         self.grid = grid
+        self.samples_shape = grid.shape
+
+    def window(self, rows: slice, columns: slice) -> "PlaneOperator":
+        """Return H of a part of the samples, on the same images; pixels that see another part see nothing.
+
+        It shares all maps with this operator, and its sweeps take about as much less time as it has fewer samples.
+
+        Parameters
+        ----------
+        rows, columns : slice
+            The samples, with a start and a stop.
+
+        Raises
+        ------
+        GeometryMismatch
+            No pixel of any view sees this part.
+        """
+        grid = self.grid.window(rows, columns)
+        part = copy(self)
+        part._take_window(grid, window_geometry(self._geometry, grid, (rows.start, columns.start)))  # noqa: SLF001
+        return part
+
+    def _take_window(self, grid: PlaneGrid, geometry: SceneGeometry) -> None:
+        """Become the operator of a window of the plane that this was."""
+        for cached in ("_sensitivity", "seeing_views"):
+            self.__dict__.pop(cached, None)
+        self.grid = grid
+        self._see(geometry, (grid,))
         self.samples_shape = grid.shape

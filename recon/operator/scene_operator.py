@@ -79,20 +79,26 @@ class SceneOperator:
         workers: int | None = None,
         surface: Surface | None = None,
     ) -> None:
-        self.grids = tuple(grids)
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
+        grids = tuple(grids)
         self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
-        self._geometry = scene_geometry(
-            plane_from_ray, rays, self.grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
+        geometry = scene_geometry(
+            plane_from_ray, rays, grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
         )
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
+        self._constant_maps: dict[float, Image] = {}
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
-        self._size = sum(grid.shape[0] * grid.shape[1] for grid in self.grids)
-        self.samples_shape: tuple[int, ...] = (self._size,)
-        self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), self._geometry.lattice_of_view
+        self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), geometry.lattice_of_view
         # Each pixel that sees the scene has weights that sum to its response: H 1 is known without a sweep
-        self.row_sums_are_response = len(self.grids) == 1 and transmission is None
+        self.row_sums_are_response = len(grids) == 1 and transmission is None
+        self._see(geometry, grids)
+
+    def _see(self, geometry: kernels.SceneGeometry, grids: tuple[PlaneGrid, ...]) -> None:
+        """Take the planes that the views see, and find which pixels see them."""
+        self._geometry, self.grids = geometry, grids
+        self._size = sum(grid.shape[0] * grid.shape[1] for grid in grids)
+        self.samples_shape: tuple[int, ...] = (self._size,)
         self._sweep(kernels.REACH, self.all_views, self.all_views)
         self._check_seen()
 
@@ -129,13 +135,26 @@ class SceneOperator:
 
     def sensitivity(self, views: ViewSelection = None) -> Image:
         """Return s = Hᵀ 1 (samples): without flat field, the number of views that see each sample."""
-        return self.adjoint_of_map(1.0, views)
+        return self._sensitivity.reshape(self.samples_shape) if views is None else self.adjoint_of_map(1.0, views)
+
+    @cached_property
+    def _sensitivity(self) -> Image:
+        """Sensitivity to all views, which every solver asks for several times."""
+        sensitivity = self.adjoint_of_map(1.0)
+        sensitivity.flags.writeable = False
+        return sensitivity
 
     def coverage(self, views: ViewSelection = None) -> Image:
         """Return Hᵀ H 1 (samples), by which a back-projection is divided to keep constant planes constant."""
         if self.row_sums_are_response:
-            return self.adjoint_of_map(self.response(), views)
+            return self.sensitivity(views) if self._binary_response else self.adjoint_of_map(self.response(), views)
         return self.adjoint_of_forward(np.ones(self.samples_shape, self.dtype), views)
+
+    @cached_property
+    def _binary_response(self) -> bool:
+        """Whether each pixel's response is 1 or 0: then Hᵀ H 1 = Hᵀ 1."""
+        response = self.response()
+        return bool(((response == 0) | (response == 1)).all())
 
     @cached_property
     def seeing_views(self) -> NDArray[np.intp]:
@@ -254,6 +273,12 @@ class SceneOperator:
         return np.ascontiguousarray(array, self.dtype)
 
     def _map(self, value: float | Image) -> Image:
+        """Return a map of all lattices; those of a number are kept, because a sweep of a window takes hardly longer."""
+        if np.ndim(value) == 0:
+            number = float(value)
+            if number not in self._constant_maps:
+                self._constant_maps[number] = np.full(self.maps_shape, number, self.dtype)
+            return self._constant_maps[number]
         try:
             return np.ascontiguousarray(np.broadcast_to(value, self.maps_shape), self.dtype)
         except ValueError:

@@ -10,6 +10,7 @@ from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.windows import windows_of
 
 # Largest number of folds; each leaves out one view in as many.
 MAX_FOLDS = 7
@@ -40,14 +41,15 @@ class CrossValidatedWeight:
         validation views under the plane from the other views, summed over the folds.
     passes : float
         Passes over all the data that the search took; passes over some of the views count in proportion.
-    solution : PmlemIterate
-        The best candidate's plane, from most of the views: a start for the reconstruction.
+    solution : PmlemIterate, optional
+        The best candidate's plane, from most of the views: a start for the reconstruction. None if only windows of the
+        plane were reconstructed.
     """
 
     weight: float
     candidates: dict[float, float]
     passes: float
-    solution: PmlemIterate
+    solution: PmlemIterate | None
 
 
 def validation_views(views: int, fold: int = 0) -> NDArray[np.intp]:
@@ -67,11 +69,13 @@ def _folds(views: int) -> int:
     return max(2, min(MAX_FOLDS, views // 2))
 
 
-def cross_validated_weight(problem: SceneProblem, guess: float, penalty: Penalty) -> CrossValidatedWeight:
+def cross_validated_weight(
+    problem: SceneProblem, guess: float, penalty: Penalty, level_e: float | None = None
+) -> CrossValidatedWeight:
     """Return the penalty weight under which the training views best predict the validation views.
 
     Candidates are tried from larger to smaller weights, each starting from the last solution, until predictions have
-    become worse on both sides of the best.
+    become worse on both sides of the best. Windows that are spread over it stand for a large plane.
 
     Parameters
     ----------
@@ -81,6 +85,8 @@ def cross_validated_weight(problem: SceneProblem, guess: float, penalty: Penalty
         A weight to start from, for all views.
     penalty : Penalty
         φ.
+    level_e : float, optional
+        Mean light of the samples that the views see, in electrons; by default that of each window or plane itself.
 
     Raises
     ------
@@ -92,23 +98,30 @@ def cross_validated_weight(problem: SceneProblem, guess: float, penalty: Penalty
     The data's part of the objective grows with the number of views n, and its noise with √n. A weight that balances
     that noise is therefore scaled by the ratio of the roots, from the training views to all views.
     """
-    folds = _needed_folds(problem, penalty)
+    views = len(problem.operator.seeing_views)
+    if views < MIN_VIEWS:
+        raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {views}")
+    windows = windows_of(problem, MIN_VIEWS)
+    if windows:
+        # A dark window is solved with the light of the whole plane, as that will be
+        folds = [fold for window in windows for fold in _folds_of(window, penalty, 1, level_e)]
+    else:
+        folds = _folds_of(problem, penalty, folds_to_predict(problem))
     losses = _losses(folds, guess)
     best = min(losses, key=losses.__getitem__)
     offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
     candidates = {guess * _CANDIDATE_RATIO**step: loss for step, loss in sorted(losses.items())}
-    passes = sum(fold.passes for fold in folds)
+    samples = np.prod(problem.operator.samples_shape)
+    passes = sum(fold.passes * fold.samples for fold in folds) / float(samples)
     weight = guess * _CANDIDATE_RATIO ** (best + offset)
-    return CrossValidatedWeight(weight, candidates, passes, folds[0].solutions[best])
+    return CrossValidatedWeight(weight, candidates, passes, None if windows else folds[0].solutions[best])
 
 
-def _needed_folds(problem: SceneProblem, penalty: Penalty) -> list["_Fold"]:
-    """Return the folds that are scored."""
+def _folds_of(problem: SceneProblem, penalty: Penalty, count: int, level_e: float | None = None) -> list["_Fold"]:
+    """Return the first folds of a problem, at most as many as it has."""
     views = problem.operator.seeing_views
-    count = len(views)
-    if count < MIN_VIEWS:
-        raise ValueError(f"need at least {MIN_VIEWS} views that see anything to leave some out, got {count}")
-    return [_Fold(problem, penalty, views[validation_views(count, n)]) for n in range(folds_to_predict(problem))]
+    left_out = [views[validation_views(len(views), n)] for n in range(min(count, _folds(len(views))))]
+    return [_Fold(problem, penalty, validation, level_e) for validation in left_out]
 
 
 def folds_to_predict(problem: SceneProblem) -> int:
@@ -121,13 +134,16 @@ def folds_to_predict(problem: SceneProblem) -> int:
 class _Fold:
     """A division into training and validation views, and the solutions so far."""
 
-    def __init__(self, problem: SceneProblem, penalty: Penalty, validation: NDArray[np.intp]) -> None:
+    def __init__(
+        self, problem: SceneProblem, penalty: Penalty, validation: NDArray[np.intp], level_e: float | None
+    ) -> None:
         views = problem.operator.seeing_views
         training = np.setdiff1d(views, validation)
         self._start = problem.start(training)
-        self._fit = problem.fit(mean_light_e(problem.operator, self._start), training)
+        self._fit = problem.fit(level_e or mean_light_e(problem.operator, self._start), training)
         self._problem, self._validation, self._penalty = problem, validation, penalty
         self._share = len(training) / len(views)
+        self.samples = self._start.size
         self.passes = self._share
         self.solutions: dict[int, PmlemIterate] = {}
 

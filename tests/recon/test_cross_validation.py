@@ -6,6 +6,7 @@ import pytest
 from faintfield.recon.likelihood.images import ElementalImages, Image, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.solver import windows
 from faintfield.recon.solver.cross_validation import cross_validated_weight, validation_views
 from faintfield.recon.solver.data_fit import DataFit, SceneProblem
 from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
@@ -73,6 +74,23 @@ def test_the_weight_is_nearly_as_good_as_the_best_for_the_truth(seed: int) -> No
     assert chosen.weight == pytest.approx(tried[middle] * 2 ** (-b / (4 * a)), rel=1e-6)
     assert tried[0] == pytest.approx(guess / 3 / 2**0.5)
     assert middle == len(tried) - 2
+
+
+def test_windows_choose_nearly_the_weight_of_the_whole_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = np.tile(scene(128), (2, 2))
+    operator, images = dark_views(truth, 3)
+    problem = SceneProblem(operator, images)
+    guess = universal_penalty_weight(operator, images, smooth_start(operator, images))
+    whole = cross_validated_weight(problem, guess, Penalty())
+    monkeypatch.setattr(windows, "SIDE", 64)
+    monkeypatch.setattr(windows, "_MIN_SAMPLES", 16_384)
+    parts = cross_validated_weight(problem, guess, Penalty(), level_e=float(truth.mean()))
+    assert whole.solution is not None
+    assert parts.solution is None
+    assert parts.passes < 0.4 * whole.passes
+    assert parts.weight == pytest.approx(whole.weight, rel=0.25)
+    # The loss is that of the windows' pixels: a quarter of the whole
+    assert max(parts.candidates.values()) < 0.5 * max(whole.candidates.values())
 
 
 def test_candidates_weigh_the_penalty_by_the_root_of_the_share_of_views_that_they_learn_from() -> None:

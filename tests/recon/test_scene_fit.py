@@ -165,4 +165,5 @@ def test_validation_views_choose_one_weight_for_all_planes() -> None:
     )
     weights = list(chosen.candidates)
     assert min(weights) <= chosen.weight <= max(weights)
+    assert chosen.solution is not None
     assert chosen.solution.plane.shape == (10 * 9 + 7 * 8,)
