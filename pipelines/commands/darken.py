@@ -8,7 +8,8 @@ from cyclopts import Parameter
 from faintfield.pipelines.arguments import Fraction, NotNegative, Positive, Seed
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.simulation.darken import Darkened, DarkeningOptions, darken_set
+from faintfield.pipelines.simulation.darken import Darkened, darken_set
+from faintfield.pipelines.simulation.options import DarkeningOptions
 
 _DEFAULT = DarkeningOptions()
 

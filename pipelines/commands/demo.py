@@ -7,12 +7,13 @@ from typing import get_args
 import msgspec
 
 from faintfield.pipelines.arguments import Positive, Seed
+from faintfield.pipelines.choices import Method
 from faintfield.pipelines.commands.capture import capture
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, write_json, write_record
-from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method, Metrics
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Metrics
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.session_set import nominal_session
 from faintfield.pipelines.formats.toml_files import write_toml

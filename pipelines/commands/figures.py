@@ -7,8 +7,9 @@ import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, Positive, Seed, SizePx
+from faintfield.pipelines.choices import FigureNumber
 from faintfield.pipelines.paper.figure_records import Figure2, Figure3, Figure4
-from faintfield.pipelines.paper.figures import PAGE_FILE, FigureNumber, FigureOptions, make_figures
+from faintfield.pipelines.paper.figures import PAGE_FILE, FigureOptions, make_figures
 
 
 class FiguresMade(msgspec.Struct, frozen=True):

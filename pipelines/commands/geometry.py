@@ -5,13 +5,14 @@ from pathlib import Path
 import msgspec
 
 from faintfield.calib.geometry import GeometrySettings
-from faintfield.pipelines.arguments import LensName, Positive
+from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.calibration.geometry import (
     MeasuredGeometry,
     files_beside,
     geometry_record,
     measure_geometry,
 )
+from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.results.geometry import (
     DEFAULT_DEPTHS_MM,

@@ -10,12 +10,13 @@ import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
+from faintfield.pipelines.choices import Method, PriorName, SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.files import exclusive
-from faintfield.pipelines.formats.results.records import REPORT_FILE, Method
+from faintfield.pipelines.formats.results.records import REPORT_FILE
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
-from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
+from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.reconstruction.cluster import make_runner
 from faintfield.pipelines.reconstruction.request import (
@@ -26,11 +27,10 @@ from faintfield.pipelines.reconstruction.request import (
     selected_methods,
 )
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
-from faintfield.recon.likelihood.images import LikelihoodName
-from faintfield.recon.solver.penalties import PenaltyName
+from faintfield.recon.names import LikelihoodName, PenaltyName
 from faintfield.rig.session.session import has_session
 
 
@@ -176,7 +176,7 @@ def reconstruct(
     return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
 
 
-def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
+def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner | None = None) -> Outcome:
     """Reconstruct planes of a set into `out`, and write the report of them.
 
     Raises
@@ -186,7 +186,7 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     """
     started = time.monotonic()
     with exclusive(out):
-        outcome = reconstruct_set(loaded, out, request, runner)
+        outcome = reconstruct_set(loaded, out, request, runner or run_serially)
         with working("writing the report"):
             report = write_report(out)
     planes = len({record.file for record in outcome.planes})

@@ -3,13 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
-from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
+from faintfield.pipelines.arguments import Count, NotNegative, Positive
+from faintfield.pipelines.choices import LensName, Method, PriorName
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report, surface_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
 from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
 from faintfield.pipelines.formats.results.noise import NOISE_FILE
 from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
-from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method
+from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE
 from faintfield.pipelines.formats.results.surface import SURFACE_FILE
 from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
 from faintfield.pipelines.pages.report import write_report
@@ -22,7 +23,7 @@ from faintfield.pipelines.reconstruction.request import (
     distinct_depths,
     folder_of_method,
 )
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
 from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
 from faintfield.rig.session.changes import present_settings

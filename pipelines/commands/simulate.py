@@ -7,7 +7,8 @@ import msgspec
 
 from faintfield.pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
+from faintfield.pipelines.simulation.options import SyntheticOptions
+from faintfield.pipelines.simulation.synthetic_set import write_synthetic_set
 
 _DEFAULT = SyntheticOptions()
 
