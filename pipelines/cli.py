@@ -4,10 +4,12 @@ import sys
 from collections.abc import Sequence
 
 import faintfield
+from faintfield.recon.compiling import on_compiling
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit: 0 done, 1 a named failure (one line), 2 wrong usage."""
+    on_compiling.append(_say_compiling)
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
@@ -19,3 +21,10 @@ def run(arguments: Sequence[str]) -> int:
     from faintfield.pipelines.launcher import launch
 
     return launch(arguments)
+
+
+def _say_compiling() -> None:
+    """Say why the command takes longer than usual."""
+    from faintfield.pipelines.console import inform
+
+    inform("compiling kernels, which takes up to a minute; later runs find them where numba can write its cache")

@@ -53,8 +53,9 @@ def test_the_help_names_every_command(faintfield: Command) -> None:
         assert f" {name} " in said
 
 
-def test_the_version_is_printed(faintfield: Command) -> None:
-    ended = faintfield("--version")
+@pytest.mark.parametrize("words", [("--version",), ("--json", "--version"), ("report", "--version")])
+def test_the_version_is_printed(words: tuple[str, ...], faintfield: Command) -> None:
+    ended = faintfield(*words)
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     assert (ended.returncode, ended.stdout) == (0, f"{project['version']}\n")
 
