@@ -43,8 +43,13 @@ app = App(
 # `run` reports an interrupt in one line.
 app.suppress_keyboard_interrupt = app.meta.suppress_keyboard_interrupt = False
 register_commands(app)
-app.register_install_completion_command(help="Complete commands and options with the tab key of your shell.")
-for _flag in ("--install-completion", "--help", "--version"):
+app.command(
+    "faintfield.pipelines.completion:install_completion",
+    name="--install-completion",
+    help="Complete commands and options with the tab key of your shell.",
+    group=EVERY_COMMAND,
+)
+for _flag in ("--help", "--version"):
     app[_flag].group = EVERY_COMMAND
 
 
