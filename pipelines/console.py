@@ -7,17 +7,13 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sized
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 console = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 
@@ -82,25 +78,39 @@ def progress[T](items: Iterable[T], label: str, total: int | None = None) -> Gen
     total : int, optional
         The number of items, if `items` has no length.
     """
-    columns = (
+    # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
+    if not console.is_terminal:
+        yield from _in_lines(items, label, total if total is not None else _length(items))
+        return
+    with _bar() as bar:
+        _bars.append(label)
+        try:
+            yield from bar.track(items, description=visible(label), total=total)
+        finally:
+            _bars.remove(label)
+
+
+def _bar() -> "Progress":
+    """Return a bar with steps and the time left, to be drawn."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("to go"),
         TimeRemainingColumn(),
+        console=console,
+        transient=True,
     )
-    # Redraw only on a terminal: the thread of a generator that its caller abandons would block the exit
-    drawn = console.is_terminal
-    if not drawn:
-        yield from _in_lines(items, label, total if total is not None else _length(items))
-        return
-    with Progress(*columns, console=console, transient=True, disable=not drawn, auto_refresh=drawn) as bar:
-        _bars.append(label)
-        try:
-            yield from bar.track(items, description=visible(label), total=total)
-        finally:
-            _bars.remove(label)
 
 
 @contextmanager

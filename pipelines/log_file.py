@@ -17,7 +17,6 @@ from typing import Any
 
 from faintfield.pipelines.console import console, visible, without_secrets
 from faintfield.pipelines.errors import CannotWrite
-from faintfield.pipelines.formats.provenance import versions
 
 logger = logging.getLogger("faintfield")
 logger.setLevel(logging.INFO)
@@ -45,6 +44,8 @@ def logged(path: Path | None, words: Sequence[str], one_line: tuple[type[BaseExc
     if path is None:
         yield
         return
+    from faintfield.pipelines.formats.provenance import versions
+
     handler = _opened(path)
     logging.getLogger().addHandler(handler)
     logging.captureWarnings(capture=True)

@@ -64,24 +64,33 @@ def register_commands(app: App) -> None:
         (EXPORTS, "Write lens and poses of a set, planes, or dark and flat frames, for other people's programs."),
     ):
         verb = examples[0].split()[0]
-        app.command(App(name=verb, help=words, group=files, help_epilogue=f"Example: faintfield {examples[0]}"))
+        app.command(
+            App(
+                name=verb,
+                help=words,
+                group=files,
+                help_epilogue=f"Example: faintfield {examples[0]}",
+                help_format="plaintext",
+            )
+        )
         for place, example in enumerate(examples, start=1):
             name = example.split()[1]
             _register(app[verb], name, f"{verb}s.{name}:{verb}_{name}", example, place)
 
 
 def _register(app: App, name: str, target: str, example: str, place: int, group: Group | None = None) -> None:
-    """Register a command by its module and function, with the docstring read from the source.
+    """Register a command by its module and function, with what its docstring says before the parameters.
 
-    Importing all modules for their docstrings would take seconds.
+    It is read from the source: importing all modules would take seconds.
     """
     module, _, function = target.partition(":")
     source = Path(__file__).parent.joinpath("commands", *module.split(".")).with_suffix(".py").read_text("utf-8")
     app.command(
         f"{_COMMANDS}.{target}",
         name=name,
-        help=source.partition(f"\ndef {function}(")[2].split('"""')[1],
+        help=source.partition(f"\ndef {function}(")[2].split('"""')[1].partition("\n    Parameters\n")[0],
         group=group,
         sort_key=place,
         help_epilogue=f"Example: faintfield {example}",
+        help_format="markdown",
     )

@@ -10,18 +10,29 @@ they are the library's.
 """
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
+
+from faintfield.recon.compiling import on_compiling
 
 # Options of all compiled code: sums may be reordered, but infinities and NaN keep their meaning, because callers test
 # for them.
 _OPTIONS = {"error_model": "numpy", "fastmath": {"contract", "nsz", "arcp", "reassoc"}}
-compiled = numba.njit(nogil=True, cache=True, **_OPTIONS)
+
+
+def compiled(function: Any) -> Any:
+    """Return a function that is compiled at its first call with new types, or found in numba's cache."""
+    try:
+        return numba.njit(nogil=True, cache=True, **_OPTIONS)(function)
+    except RuntimeError:  # numba has no folder for its cache that can be written
+        return numba.njit(nogil=True, **_OPTIONS)(function)
+
 
 # For small functions called per pixel or block, where passing arrays would cost more than the work.
 inlined = numba.njit(inline="always", **_OPTIONS)
@@ -34,6 +45,24 @@ _LN2, _LN2_HIGH, _LN2_LOW = np.float32(0.6931472), np.float32(0.693359375), np.f
 _LOG2_E = np.float32(1.442695)
 # eˣ is a normal float32 between these.
 _MIN_EXPONENT, _MAX_EXPONENT = np.float32(-87.0), np.float32(88.0)
+
+
+class _First(event.Listener):  # type: ignore[misc]
+    """Announces the first compilation of a process."""
+
+    announced = False
+
+    def on_start(self, _):
+        if not self.announced:
+            self.announced = True
+            for announce in on_compiling:
+                announce()
+
+    def on_end(self, _):
+        pass
+
+
+event.register("numba:compile", _First())
 
 
 @intrinsic

@@ -2,17 +2,18 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
-from faintfield.calib.board import Board
 from faintfield.pipelines.arguments import Count, Positive
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM, board_pdf
-from faintfield.pipelines.formats.files import write_whole
-from faintfield.pipelines.formats.sets.board_set import BoardEntry
+
+if TYPE_CHECKING:
+    from faintfield.calib.board import Board
+    from faintfield.pipelines.formats.sets.board_set import BoardEntry
+
 
 # Width and height, the long side across.
 _PAPERS_MM = {"A4": (297.0, 210.0), "A3": (420.0, 297.0), "A2": (594.0, 420.0), "letter": (279.4, 215.9)}
@@ -26,7 +27,7 @@ class BoardSheets(msgspec.Struct, frozen=True):
 
     out: str
     paper: str
-    board: list[BoardEntry]
+    board: "list[BoardEntry]"
 
 
 def board(
@@ -62,6 +63,10 @@ def board(
     dictionary
         OpenCV's dictionary of the markers.
     """
+    from faintfield.pipelines.formats.board_pdf import board_pdf
+    from faintfield.pipelines.formats.files import write_whole
+    from faintfield.pipelines.formats.sets.board_set import BoardEntry
+
     across, down = _squares(paper, columns, rows, square_mm)
     made = _boards(boards, across, down, square_mm, dictionary)
     write_whole(out, board_pdf(made, _PAPERS_MM[paper]))
@@ -70,8 +75,10 @@ def board(
     return BoardSheets(str(out), paper, entries)
 
 
-def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> list[Board]:
+def _boards(count: int, across: int, down: int, square_mm: float, dictionary: str) -> "list[Board]":
     """Return boards of one size that share no marker."""
+    from faintfield.calib.board import Board
+
     marker_mm, markers = round(_MARKER_SHARE * square_mm, 1), across * down // 2
     try:
         return [
@@ -84,6 +91,8 @@ def _boards(count: int, across: int, down: int, square_mm: float, dictionary: st
 
 def _squares(paper: str, columns: int | None, rows: int | None, square_mm: float) -> tuple[int, int]:
     """Return how many squares a board has across and down: as many as asked for, or as fit the paper."""
+    from faintfield.pipelines.formats.board_pdf import FOOT_MM, MARGIN_MM
+
     width_mm, height_mm = _PAPERS_MM[paper]
     max_across = int((width_mm - 2 * MARGIN_MM) // square_mm)
     max_down = int((height_mm - 2 * MARGIN_MM - FOOT_MM) // square_mm)

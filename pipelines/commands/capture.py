@@ -6,8 +6,6 @@ from typing import Any
 
 from faintfield.pipelines.console import console
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.rig_file import read_rig
-from faintfield.pipelines.live.guided import capture_session
 
 
 def capture(rig: Path, session: Path, /, *, yes: bool = False, page: bool = False) -> dict[str, Any]:
@@ -27,6 +25,9 @@ def capture(rig: Path, session: Path, /, *, yes: bool = False, page: bool = Fals
     page
         Also serve a local web page, on this computer alone.
     """
+    from faintfield.pipelines.formats.rig_file import read_rig
+    from faintfield.pipelines.live.guided import capture_session
+
     if not (yes or page or (console.is_terminal and sys.stdin.isatty())):
         raise WrongUsage("there is no terminal to answer prompts on; give --yes, or --page and answer there")
     taken = capture_session(read_rig(rig), session, unattended=yes, page=page)

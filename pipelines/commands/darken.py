@@ -1,16 +1,22 @@
 """`faintfield darken`: a photon-starved set from a bright one."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Fraction, NotNegative, Positive, Seed
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.simulation.darken import Darkened, DarkeningOptions, darken_set
+from faintfield.pipelines.simulation.options import DarkeningOptions
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.simulation.darken import Darkened
+
 
 _DEFAULT = DarkeningOptions()
+
+
+type Result = Darkened
 
 
 def darken(
@@ -25,7 +31,7 @@ def darken(
     dark_current_e_per_s: NotNegative = _DEFAULT.dark_current_e_per_s,
     quantum_efficiency: Fraction = _DEFAULT.quantum_efficiency,
     overwrite: bool = False,
-) -> Darkened:
+) -> Result:
     """Make a dark set from a bright one: the same views with a few photons per pixel.
 
     Each bright view is taken as the expected light, scaled so that the object region of the reference view (its
@@ -54,6 +60,9 @@ def darken(
         Replace an earlier set in OUT.
     """
     options = {name: value for name, value in locals().items() if name not in ("elemental_set", "out", "overwrite")}
+    from faintfield.pipelines.formats.sets.elemental_set import load_set
+    from faintfield.pipelines.simulation.darken import darken_set
+
     darkened = darken_set(load_set(elemental_set), out, DarkeningOptions(**options), overwrite=overwrite)
     measured = "no SNR" if darkened.snr_measured is None else f"SNR {darkened.snr_measured:.3f}"
     photons = f"{darkened.photons_on_object:.2f} photons per pixel on the object"

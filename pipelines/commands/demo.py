@@ -7,20 +7,12 @@ from typing import get_args
 import msgspec
 
 from faintfield.pipelines.arguments import Positive, Seed
+from faintfield.pipelines.choices import Method
 from faintfield.pipelines.commands.capture import capture
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.commands.run import session_steps
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.files import check_free, write_json, write_record
-from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Method, Metrics
-from faintfield.pipelines.formats.sets.elemental_set import load_set
-from faintfield.pipelines.formats.sets.session_set import nominal_session
-from faintfield.pipelines.formats.toml_files import write_toml
-from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.paper.demo import FULL, QUICK, demo_metrics, demo_rig, true_set, write_truth
-from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
-from faintfield.pipelines.reconstruction.steps import run_steps
-from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE
+from faintfield.pipelines.formats.results.records import JOINT_METHODS, METRICS_FILE, Metrics
 
 # The file that marks a folder as made by a demo; the next demo may replace such a folder.
 _MARK = "demo.json"
@@ -56,6 +48,16 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     seed
         Seed of the random generator.
     """
+    from faintfield.pipelines.formats.files import write_record
+    from faintfield.pipelines.formats.sets.elemental_set import load_set
+    from faintfield.pipelines.formats.sets.session_set import nominal_session
+    from faintfield.pipelines.formats.toml_files import write_toml
+    from faintfield.pipelines.pages.report import write_report
+    from faintfield.pipelines.paper.demo import FULL, QUICK, demo_metrics, demo_rig, true_set, write_truth
+    from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+    from faintfield.pipelines.reconstruction.steps import run_steps
+    from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE
+
     _make_free(out)
     settings = demo_rig(QUICK if quick else FULL, snr, seed)
     write_toml(out / "rig.toml", settings)
@@ -79,6 +81,8 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
 
 def _make_free(out: Path) -> None:
     """Remove what an earlier demo left, and nothing else."""
+    from faintfield.pipelines.formats.files import check_free, write_json
+
     check_free(out, replace_if=_MARK)
     for name in ("session", "truth", "noise-free", "nominal", "true"):
         shutil.rmtree(out / name, ignore_errors=True)

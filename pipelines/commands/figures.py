@@ -7,8 +7,8 @@ import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, Positive, Seed, SizePx
+from faintfield.pipelines.choices import FigureNumber
 from faintfield.pipelines.paper.figure_records import Figure2, Figure3, Figure4
-from faintfield.pipelines.paper.figures import PAGE_FILE, FigureNumber, FigureOptions, make_figures
 
 
 class FiguresMade(msgspec.Struct, frozen=True):
@@ -50,6 +50,8 @@ def figures(
     size_px
         Width and height of the detector.
     """
+    from faintfield.pipelines.paper.figures import PAGE_FILE, FigureOptions, make_figures
+
     options = FigureOptions(only=sorted(set(only or (2, 3, 4))), snr=snr, seed=seed, seeds=seeds, size_px=size_px)
     made = make_figures(out, options)
     return FiguresMade(str(out), str(out / PAGE_FILE), made)

@@ -1,30 +1,23 @@
 """`faintfield geometry`: where the camera was at every node, from images of ChArUco boards."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
-from faintfield.calib.geometry import GeometrySettings
-from faintfield.pipelines.arguments import LensName, Positive
-from faintfield.pipelines.calibration.geometry import (
-    MeasuredGeometry,
-    files_beside,
-    geometry_record,
-    measure_geometry,
-)
+from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.results.geometry import (
-    DEFAULT_DEPTHS_MM,
-    GEOMETRY_PAGE,
-    GeometryOptions,
-    GeometryRecord,
-    LensRecord,
-    RepeatabilityRecord,
-    StageRecord,
-    write_geometry,
-)
-from faintfield.pipelines.formats.sets.board_set import load_board_set
-from faintfield.pipelines.pages.geometry_page import geometry_page
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.calibration.geometry import MeasuredGeometry
+    from faintfield.pipelines.formats.results.geometry import (
+        GeometryRecord,
+        LensRecord,
+        RepeatabilityRecord,
+        StageRecord,
+    )
+
 
 # Above this the nodes of one sweep no longer stand for those of another.
 _MAX_REPEATABILITY_MM = 0.020
@@ -35,14 +28,14 @@ class GeometrySummary(msgspec.Struct, frozen=True):
 
     out: str
     report: str
-    lens: LensRecord
+    lens: "LensRecord"
     rms_inlier_px: float
     corners: int
     outliers: int
     holdout_ratio: float | None
     transfer_sigma_px: dict[str, float]
-    repeatability: RepeatabilityRecord | None
-    stage: StageRecord
+    repeatability: "RepeatabilityRecord | None"
+    stage: "StageRecord"
 
 
 def geometry(
@@ -72,6 +65,17 @@ def geometry(
     limit_px
         How well the transfer between views by such a plane must be known: standard deviation, rms over views.
     """
+    from faintfield.calib.geometry import GeometrySettings
+    from faintfield.pipelines.calibration.geometry import files_beside, geometry_record, measure_geometry
+    from faintfield.pipelines.formats.results.geometry import (
+        DEFAULT_DEPTHS_MM,
+        GEOMETRY_PAGE,
+        GeometryOptions,
+        write_geometry,
+    )
+    from faintfield.pipelines.formats.sets.board_set import load_board_set
+    from faintfield.pipelines.pages.geometry_page import geometry_page
+
     board_set = load_board_set(directory)
     out = out or board_set.source.parent
     options = GeometryOptions(lens, tuple(depth_mm or DEFAULT_DEPTHS_MM), limit_px)
@@ -83,7 +87,7 @@ def geometry(
     return GeometrySummary(str(out), str(out / GEOMETRY_PAGE), **figures)
 
 
-def _inform_of(measured: MeasuredGeometry, record: GeometryRecord) -> None:
+def _inform_of(measured: "MeasuredGeometry", record: "GeometryRecord") -> None:
     """Print in a few lines how good the geometry is."""
     known = ", ".join(f"{sigma:.3f} px at {depth} mm" for depth, sigma in record.transfer_sigma_px.items())
     inform(f"{len(record.nodes)} nodes, {record.corners} corners, residual {record.rms_inlier_px:.3f} px")

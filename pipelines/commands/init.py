@@ -5,8 +5,6 @@ from typing import Any
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import OutputExists
-from faintfield.pipelines.formats.files import write_whole
-from faintfield.pipelines.formats.rig_file import rig_template
 
 
 def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
@@ -17,6 +15,9 @@ def init(rig: Path = Path("rig.toml"), /) -> dict[str, Any]:
     rig
         File to write; an existing one is left alone.
     """
+    from faintfield.pipelines.formats.files import write_whole
+    from faintfield.pipelines.formats.rig_file import rig_template
+
     if rig.exists():
         raise OutputExists(f"{rig}: exists and is not overwritten; name another file, or edit this one")
     write_whole(rig, rig_template())

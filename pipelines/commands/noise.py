@@ -1,17 +1,16 @@
 """`faintfield noise`: a sensor measured from dark and flat frames."""
 
 from pathlib import Path
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
-from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
-from faintfield.pipelines.calibration.noise_comparison import CHANCE, MapChange, NoiseComparison, compare_noise
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import MissingFile, WrongUsage
-from faintfield.pipelines.formats.results.noise import NOISE_FILE, STANDARD, NoiseRecord, write_noise
-from faintfield.pipelines.formats.results.noise_fit import FitRecord, Measured
-from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
-from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
-from faintfield.pipelines.pages.noise_page import draw_page
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.calibration.noise_comparison import MapChange, NoiseComparison
+    from faintfield.pipelines.formats.results.noise import NoiseRecord
+    from faintfield.pipelines.formats.results.noise_fit import FitRecord
+
 
 _SHOWN = (
     ("gain_dn_per_e", "K, system gain", "DN/e⁻"),
@@ -24,13 +23,16 @@ _SHOWN = (
 )
 
 
+type Result = NoiseRecord | NoiseComparison
+
+
 @overload
-def noise(folder: Path, /, *, out: Path | None = None) -> NoiseRecord: ...
+def noise(folder: Path, /, *, out: Path | None = None) -> "NoiseRecord": ...
 @overload
-def noise(*, compare: tuple[Path, Path]) -> NoiseComparison: ...
+def noise(*, compare: tuple[Path, Path]) -> "NoiseComparison": ...
 def noise(
     folder: Path | None = None, /, *, out: Path | None = None, compare: tuple[Path, Path] | None = None
-) -> NoiseRecord | NoiseComparison:
+) -> Result:
     """Measure offset, gain, read noise and dark current from dark frames, and flats if there are any.
 
     Writes noise.json (numbers with 95 % intervals, or why there are none), noise_maps.npz (per pixel), a page of
@@ -46,6 +48,8 @@ def noise(
     compare
         Two results of this command, noise.json or their folders: the earlier and the later one.
     """
+    from faintfield.pipelines.calibration.noise_comparison import compare_noise
+
     if compare is not None:
         if folder is not None or out is not None:
             raise WrongUsage("--compare takes two results and writes nothing; leave out FOLDER and --out")
@@ -57,8 +61,14 @@ def noise(
     return measure(folder, out)
 
 
-def measure(folder: Path, out: Path | None) -> NoiseRecord:
+def measure(folder: Path, out: Path | None) -> "NoiseRecord":
     """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
+    from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
+    from faintfield.pipelines.formats.results.noise import NOISE_FILE, write_noise
+    from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
+    from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
+    from faintfield.pipelines.pages.noise_page import draw_page
+
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     folder, settings = load_noise_set(folder)
@@ -79,8 +89,11 @@ def measure(folder: Path, out: Path | None) -> NoiseRecord:
     return record
 
 
-def _inform_of(record: NoiseRecord) -> None:
+def _inform_of(record: "NoiseRecord") -> None:
     """Print the main numbers and every warning; a reason that holds for several numbers is given once."""
+    from faintfield.pipelines.formats.results.noise import STANDARD
+    from faintfield.pipelines.formats.results.noise_fit import Measured
+
     inform(f"{STANDARD}; likelihood: {record.likelihood}")
     explained: dict[str, str] = {}
     for name, label, unit in _SHOWN:
@@ -100,7 +113,7 @@ def _inform_of(record: NoiseRecord) -> None:
         inform(f"  warning: {warning}")
 
 
-def _inform_of_fit(fit: FitRecord) -> None:
+def _inform_of_fit(fit: "FitRecord") -> None:
     """Print what the flats say of saturation and response, as far as they do."""
     saturation, error = fit.saturation, fit.linearity_error
     if saturation.level_dn is not None:
@@ -114,8 +127,10 @@ def _inform_of_fit(fit: FitRecord) -> None:
         inform(f"  LE, linearity error: {error.value:.3%} (95 %: {low:.3%} to {high:.3%})")
 
 
-def _inform_of_comparison(found: NoiseComparison) -> None:
+def _inform_of_comparison(found: "NoiseComparison") -> None:
     """Print a table of the quantities, and what is known of pixels and maps."""
+    from faintfield.pipelines.calibration.noise_comparison import CHANCE
+
     inform(f"A: {found.first}")
     inform(f"B: {found.second}")
     names = [f"{it.plane}: {it.name}" if it.plane else it.name for it in found.quantities]
@@ -140,7 +155,7 @@ def _inform_of_comparison(found: NoiseComparison) -> None:
     )
 
 
-def _inform_of_map(found: MapChange) -> None:
+def _inform_of_map(found: "MapChange") -> None:
     """Print how the maps of a quantity differ."""
     label = f"{found.plane}: {found.name} map" if found.plane else f"{found.name} map"
     if found.rms_dn is None or found.expected_dn is None:

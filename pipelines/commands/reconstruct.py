@@ -4,34 +4,25 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 from cyclopts import Parameter
 
 from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
+from faintfield.pipelines.choices import Method, PriorName, SceneKind
 from faintfield.pipelines.console import inform, working
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.files import exclusive
-from faintfield.pipelines.formats.results.records import REPORT_FILE, Method
-from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set, with_measured_geometry
-from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, SceneKind, load_session
-from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.reconstruction.cluster import make_runner
-from faintfield.pipelines.reconstruction.request import (
-    Request,
-    chosen_prior,
-    resolve,
-    select_planes,
-    selected_methods,
-)
-from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
-from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
-from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
-from faintfield.recon.likelihood.images import LikelihoodName
-from faintfield.recon.solver.penalties import PenaltyName
-from faintfield.rig.session.session import has_session
+from faintfield.recon.names import LikelihoodName, PenaltyName
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+    from faintfield.pipelines.reconstruction.request import Request
+    from faintfield.pipelines.reconstruction.run import Outcome
+    from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
+    from faintfield.pipelines.reconstruction.sweep import Runner
+
+
+type Result = Outcome
 
 
 def reconstruct(
@@ -65,7 +56,7 @@ def reconstruct(
     scene: SceneKind = "dark_scene",
     workers: Count | None = None,
     scheduler: str | None = None,
-) -> Outcome:
+) -> Result:
     """Reconstruct planes of the scene at chosen depths, or one picture that is sharp everywhere, with its depth.
 
     Each plane becomes a float32 TIFF (expected electrons per detector pixel of the reference view), a preview, and an
@@ -149,6 +140,11 @@ def reconstruct(
     scheduler
         Address of a dask scheduler whose workers make the planes; they must see OUT under the same path.
     """
+    from faintfield.pipelines.reconstruction.cluster import make_runner
+    from faintfield.pipelines.reconstruction.request import chosen_prior, resolve, select_planes, selected_methods
+    from faintfield.pipelines.reconstruction.solutions import Settings
+    from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, select_surface
+
     weight = None if penalty_weight == "auto" else penalty_weight
     settings = Settings(weight, passes, likelihood, penalty, uncertainty, prior or "tv", proposal)
     if surface:
@@ -176,7 +172,9 @@ def reconstruct(
     return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
 
 
-def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
+def reconstruct_and_report(
+    loaded: "ElementalSet", out: Path, request: "Request", runner: "Runner | None" = None
+) -> "Outcome":
     """Reconstruct planes of a set into `out`, and write the report of them.
 
     Raises
@@ -184,9 +182,16 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     OutputBusy
         Another command is writing to `out`.
     """
+    import msgspec
+
+    from faintfield.pipelines.formats.files import exclusive
+    from faintfield.pipelines.pages.report import write_report
+    from faintfield.pipelines.reconstruction.run import reconstruct_set
+    from faintfield.pipelines.reconstruction.sweep import run_serially
+
     started = time.monotonic()
     with exclusive(out):
-        outcome = reconstruct_set(loaded, out, request, runner)
+        outcome = reconstruct_set(loaded, out, request, runner or run_serially)
         with working("writing the report"):
             report = write_report(out)
     planes = len({record.file for record in outcome.planes})
@@ -194,7 +199,7 @@ def reconstruct_and_report(loaded: ElementalSet, out: Path, request: Request, ru
     return msgspec.structs.replace(outcome, report=str(report))
 
 
-def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest, *, page_in: Path) -> Outcome:
+def surface_and_report(loaded: "ElementalSet", out: Path, request: "SurfaceRequest", *, page_in: Path) -> "Outcome":
     """Reconstruct the surface of a set into `out`, and write the report of all that is in `page_in`, the same or above.
 
     Raises
@@ -202,7 +207,10 @@ def surface_and_report(loaded: ElementalSet, out: Path, request: SurfaceRequest,
     OutputBusy
         Another command is writing to one of the two.
     """
-    # Here, because planes need none of it
+    from faintfield.pipelines.formats.files import exclusive
+    from faintfield.pipelines.formats.results.records import REPORT_FILE
+    from faintfield.pipelines.pages.report import write_report
+    from faintfield.pipelines.reconstruction.run import Outcome
     from faintfield.pipelines.reconstruction.surface import reconstruct_surface
 
     started = time.monotonic()
@@ -230,8 +238,12 @@ def _refuse_beside_surface(**options: object) -> None:
         )
 
 
-def _open(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> tuple[ElementalSet, Path]:
+def _open(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | None) -> "tuple[ElementalSet, Path]":
     """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene."""
+    from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
+    from faintfield.rig.session.session import has_session
+
     if has_session(folder):
         loaded = load_session(folder, scene, geometry)
         return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from faintfield.pipelines.console import inform, working
-from faintfield.pipelines.pages.report import write_report
 
 
 def report(directory: Path, /) -> dict[str, str]:
@@ -19,6 +18,8 @@ def report(directory: Path, /) -> dict[str, str]:
         Folder with reconstruction.json or surface.json, or whose folders have one: what `reconstruct` wrote,
         or a session.
     """
+    from faintfield.pipelines.pages.report import write_report
+
     with working("writing the report"):
         path = write_report(directory)
     inform(f"{path}")

@@ -2,31 +2,22 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from faintfield.pipelines.arguments import Count, LensName, NotNegative, Positive
+from faintfield.pipelines.arguments import Count, NotNegative, Positive
+from faintfield.pipelines.choices import LensName, Method, PriorName
+from faintfield.pipelines.commands.geometry import geometry
+from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report, surface_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
-from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
-from faintfield.pipelines.formats.results.noise import NOISE_FILE
-from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
-from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, REPORT_FILE, Method
-from faintfield.pipelines.formats.results.surface import SURFACE_FILE
-from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
-from faintfield.pipelines.pages.report import write_report
-from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
-from faintfield.pipelines.reconstruction.request import (
-    DEFAULT_METHOD,
-    Request,
-    check_prior,
-    chosen_prior,
-    distinct_depths,
-    folder_of_method,
-)
-from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
-from faintfield.pipelines.reconstruction.steps import RunOutcome, Step, run_steps
-from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER, SurfaceRequest, select_surface
-from faintfield.rig.session.changes import present_settings
-from faintfield.rig.session.session import PLAN, has_session, taken_frames
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.reconstruction.request import Request
+    from faintfield.pipelines.reconstruction.steps import RunOutcome, Step
+    from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
+
+
+type Result = RunOutcome
 
 
 def run(
@@ -44,7 +35,7 @@ def run(
     pitch_mm: Positive | None = None,
     lens: LensName = "opencv5",
     limit_px: Positive = 0.5,
-) -> RunOutcome:
+) -> Result:
     """Do everything after the capture: noise, geometry, reconstruction, report; skip what is up to date.
 
     A result is up to date while its input files (by hash), its options and the versions of the software are those that
@@ -78,6 +69,20 @@ def run(
     limit_px
         Largest accepted standard deviation of the transfer between views, as for `geometry`.
     """
+    from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
+    from faintfield.pipelines.reconstruction.request import (
+        DEFAULT_METHOD,
+        Request,
+        check_prior,
+        chosen_prior,
+        distinct_depths,
+    )
+    from faintfield.pipelines.reconstruction.solutions import Settings
+    from faintfield.pipelines.reconstruction.steps import run_steps
+    from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest, select_surface
+    from faintfield.rig.session.changes import present_settings
+    from faintfield.rig.session.session import has_session
+
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
     swept = swept_depths(sweep_mm) if sweep_mm else []
@@ -99,36 +104,34 @@ def run(
 
 def session_steps(
     session: Path,
-    planes: Request | None,
+    planes: "Request | None",
     lens: LensName = "opencv5",
     limit_px: float = 0.5,
-    surface: SurfaceRequest | None = None,
-) -> list[Step]:
+    surface: "SurfaceRequest | None" = None,
+) -> "list[Step]":
     """Return the steps from a captured session to the planes and the surface that are asked for, in order."""
+    from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
+    from faintfield.pipelines.formats.results.noise import NOISE_FILE
+    from faintfield.pipelines.formats.results.records import REPORT_FILE
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS
+    from faintfield.pipelines.pages.report import write_report
+    from faintfield.pipelines.reconstruction.steps import Step
+    from faintfield.rig.session.changes import present_settings
+
     # Depths of the rig, not of the request: the geometry stays the same for other planes
     gated_mm = list(present_settings(session).scene.depth_mm or DEFAULT_DEPTHS_MM)
-
-    def measure_noise() -> None:
-        from faintfield.pipelines.commands.noise import noise  # the fitting is heavy to load, and most runs need none
-
-        noise(session)
-
-    def measure_geometry() -> None:
-        from faintfield.pipelines.commands.geometry import geometry  # likewise
-
-        geometry(session, lens=lens, depth_mm=gated_mm, limit_px=limit_px)
 
     return [
         Step(
             "noise",
             results={NOISE_FILE: {}},
-            make=measure_noise,
+            make=lambda: noise(session),
             inputs=lambda: _frames(session, "dark", "flat"),
         ),
         Step(
             "geometry",
             results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
-            make=measure_geometry,
+            make=lambda: geometry(session, lens=lens, depth_mm=gated_mm, limit_px=limit_px),
             inputs=lambda: _frames(session, "charuco"),
         ),
         *(made := [*_steps_of_planes(session, planes), *_steps_of_surface(session, surface)]),
@@ -141,8 +144,14 @@ def session_steps(
     ]
 
 
-def _steps_of_planes(session: Path, request: Request | None) -> list[Step]:
+def _steps_of_planes(session: Path, request: "Request | None") -> "list[Step]":
     """Return the step from a calibrated session to its planes, if any are asked for."""
+    from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
+    from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
+    from faintfield.pipelines.reconstruction.request import folder_of_method
+    from faintfield.pipelines.reconstruction.steps import Step
+
     if request is None:
         return []
     folders = {name: folder_of_method(Path(RECONSTRUCTIONS), name, request.methods) for name in request.methods}
@@ -160,8 +169,13 @@ def _steps_of_planes(session: Path, request: Request | None) -> list[Step]:
     ]
 
 
-def _steps_of_surface(session: Path, request: SurfaceRequest | None) -> list[Step]:
+def _steps_of_surface(session: Path, request: "SurfaceRequest | None") -> "list[Step]":
     """Return the step from a calibrated session to its surface, if one is asked for."""
+    from faintfield.pipelines.formats.results.surface import SURFACE_FILE
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
+    from faintfield.pipelines.reconstruction.steps import Step
+    from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER
+
     if request is None:
         return []
     out = session / RECONSTRUCTIONS
@@ -179,4 +193,6 @@ def _steps_of_surface(session: Path, request: SurfaceRequest | None) -> list[Ste
 
 def _frames(session: Path, *kinds: str) -> list[str]:
     """Return the names of the plan and of the frames of some kinds that count."""
+    from faintfield.rig.session.session import PLAN, taken_frames
+
     return [PLAN, *(str(path.relative_to(session)) for it, _, path in taken_frames(session) if it.kind in kinds)]

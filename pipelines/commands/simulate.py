@@ -7,7 +7,7 @@ import msgspec
 
 from faintfield.pipelines.arguments import Count, NotNegative, Positive, Seed, SizePx
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.simulation.synthetic_set import SyntheticOptions, write_synthetic_set
+from faintfield.pipelines.simulation.options import SyntheticOptions
 
 _DEFAULT = SyntheticOptions()
 
@@ -80,6 +80,8 @@ def simulate(
         Replace an earlier set in OUT.
     """
     options = {name: value for name, value in locals().items() if name not in ("out", "overwrite")}
+    from faintfield.pipelines.simulation.synthetic_set import write_synthetic_set
+
     if objects == "toys":
         del options["objects"]
     truth = write_synthetic_set(out, SyntheticOptions(**options), overwrite=overwrite)

@@ -4,22 +4,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 from cyclopts import App, Parameter
-from rich.table import Table
-from rich.text import Text
 
 from faintfield.pipelines.console import console, inform, visible
 from faintfield.pipelines.errors import BadValue, WrongUsage
-from faintfield.pipelines.formats.rig_file import read_rig_tables
-from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE, open_stage
 from faintfield.rig.errors import StageUnfit
-from faintfield.rig.simulation.controller.firmware import serving
 from faintfield.rig.stages.conformance import Check, check_conformance
-from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Identity, Point, Position, StageSettings
+
+if TYPE_CHECKING:
+    from faintfield.rig.stages.gantry import Gantry
+
 
 app = App(name="stage", help_epilogue="Example: faintfield stage test --port simulated:grbl")
 
@@ -54,6 +52,9 @@ class Connection:
 
     def settings(self) -> StageSettings:
         """Return the settings of the stage."""
+        from faintfield.pipelines.formats.rig_file import read_rig_tables
+        from faintfield.rig.devices import SIMULATED, SIMULATED_FIRMWARE
+
         stated = [name for name in ("port", "protocol", "baud") if getattr(self, name) is not None]
         if self.rig is not None:
             if stated:
@@ -156,6 +157,9 @@ def conform(connection: Connection = Connection()) -> list[Check]:
     StageUnfit
         A check failed; the table shows which.
     """
+    from rich.table import Table
+    from rich.text import Text
+
     table, checks = Table("", "check", "measured", "limit"), []
     with _connected(connection) as stage:
         for check in check_conformance(stage):
@@ -184,6 +188,9 @@ def simulate(protocol: Literal["grbl", "grblhal", "marlin"] = "grbl", *, speed: 
     speed
         Simulated seconds per real second.
     """
+    from faintfield.rig.devices import SIMULATED_FIRMWARE
+    from faintfield.rig.simulation.controller.firmware import serving
+
     with serving(SIMULATED_FIRMWARE[protocol]) as server:
         inform(f"a simulated {protocol} stage is at {server.port}; Ctrl-C ends it")
         with suppress(KeyboardInterrupt):
@@ -191,8 +198,10 @@ def simulate(protocol: Literal["grbl", "grblhal", "marlin"] = "grbl", *, speed: 
 
 
 @contextmanager
-def _connected(connection: Connection) -> Iterator[Gantry]:
+def _connected(connection: Connection) -> "Iterator[Gantry]":
     """Connect to a stage, print its warnings, and close the port at the end."""
+    from faintfield.rig.devices import open_stage
+
     try:
         settings = connection.settings()
     except ValueError as failure:

@@ -2,24 +2,18 @@
 
 from collections.abc import Sized
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import MissingFile, ResultDamaged
-from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.results.verification import (
-    ResultVerdict,
-    inputs_around,
-    inputs_in,
-    records_below,
-    records_of,
-    verify_results,
-)
 from faintfield.rig.errors import SessionCorrupt
-from faintfield.rig.session.session import JOURNAL, has_session, taken_frames
-from faintfield.rig.session.verify import Verdict
-from faintfield.rig.session.verify import verify as verify_session
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.results.verification import ResultVerdict
+    from faintfield.rig.session.verify import Verdict
+
 
 # Problems printed one by one; the failure gives their number.
 _MAX_SHOWN = 10
@@ -29,8 +23,8 @@ class Verified(msgspec.Struct, frozen=True):
     """The result of `faintfield verify`: what was found of a session, and of results."""
 
     path: str
-    session: Verdict | None
-    results: ResultVerdict | None
+    session: "Verdict | None"
+    results: "ResultVerdict | None"
 
 
 def verify(path: Path, /, *, inputs: Path | None = None) -> Verified:
@@ -47,6 +41,17 @@ def verify(path: Path, /, *, inputs: Path | None = None) -> Verified:
         Folder of the session or set that the results were made from; searched for around them by default. Inputs that
         are not found are named as not checked, which is no failure.
     """
+    from faintfield.pipelines.formats.files import sha256
+    from faintfield.pipelines.formats.results.verification import (
+        inputs_around,
+        inputs_in,
+        records_below,
+        records_of,
+        verify_results,
+    )
+    from faintfield.rig.session.session import JOURNAL, has_session, taken_frames
+    from faintfield.rig.session.verify import verify as verify_session
+
     if inputs is not None and not inputs.is_dir():
         raise MissingFile(f"{inputs}: no such folder; name that of the session or set")
     session, known = None, {}
@@ -78,7 +83,7 @@ def verify(path: Path, /, *, inputs: Path | None = None) -> Verified:
     return Verified(str(path), session, results)
 
 
-def _report_session(folder: Path, verdict: Verdict) -> None:
+def _report_session(folder: Path, verdict: "Verdict") -> None:
     """Inform the user of what was found of a session."""
     _list("problem", verdict.problems)
     state = "complete"
@@ -97,7 +102,7 @@ def _report_session(folder: Path, verdict: Verdict) -> None:
             inform(f"  {count} {what}")
 
 
-def _report_results(path: Path, verdict: ResultVerdict) -> None:
+def _report_results(path: Path, verdict: "ResultVerdict") -> None:
     """Inform the user of what was found of results."""
     _list("not checked", verdict.unchecked)
     _list("problem", verdict.problems)

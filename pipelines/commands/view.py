@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from faintfield.pipelines.pages.napari_layers import show_planes
-
 
 def view(directory: Path, /) -> dict[str, list[str]]:
     """Open the planes of a folder in napari, if it is installed: in the units of the set, on one grey scale.
@@ -15,4 +13,6 @@ def view(directory: Path, /) -> dict[str, list[str]]:
     directory
         Folder with reconstruction.json, or whose folders have one: what `reconstruct` wrote, or a session.
     """
+    from faintfield.pipelines.pages.napari_layers import show_planes
+
     return {"layers": show_planes(directory)}

@@ -3,12 +3,13 @@
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.pipelines.choices import FigureNumber
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.formats.files import check_free, exclusive, remove, write_json, write_whole
 from faintfield.pipelines.formats.frames import read_frame
@@ -36,10 +37,9 @@ from faintfield.pipelines.paper.figure_records import (
 from faintfield.pipelines.reconstruction.overview import INTEGRAL_IMAGE, grey_scale_dn
 from faintfield.pipelines.reconstruction.request import Request
 from faintfield.pipelines.reconstruction.run import Outcome, reconstruct_set
-from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, SyntheticOptions, write_synthetic_set
+from faintfield.pipelines.simulation.options import SyntheticOptions
+from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE, write_synthetic_set
 from faintfield.recon.smoothing import blurred
-
-type FigureNumber = Literal[2, 3, 4]
 
 PAGE_FILE = "figures.html"
 _CURVES_FILE = "figure4_curves.json"

@@ -5,11 +5,10 @@ from typing import Literal
 
 import numpy as np
 
+from faintfield.pipelines.choices import PriorName as PriorName
 from faintfield.pipelines.formats.results.records import SolveRecord
 from faintfield.recon.likelihood.images import Image, LikelihoodName
 from faintfield.recon.solver.penalties import PenaltyName
-
-type PriorName = Literal["tv", "patches", "learned", "auto"]
 
 
 @dataclass(frozen=True)

@@ -17,41 +17,15 @@ from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, write_se
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE, ElementalSet, load_set
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, checked_frame, lattice_noise
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness
+from faintfield.pipelines.simulation.options import DarkeningOptions
 from faintfield.pipelines.simulation.synthetic_set import stated_noise, write_exposures
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, signal_scale_for_snr
 from faintfield.rig.simulation.sensor import SimulatedSensor
-
-_PAPER = SimulatedSensor()
 
 _FLAT = "flat.tiff"
 
 # Stems of files that stand beside the views: no view may have one.
 _TAKEN_STEMS = {Path(NOISE_REFERENCE).stem, Path(_FLAT).stem}
-
-
-class DarkeningOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Options of `faintfield darken`, as its help explains them and provenance.json records them."""
-
-    snr: float = 0.16
-    seed: int = 1
-    exposure_s: float = 0.1
-    read_noise_e: float = _PAPER.read_noise_e
-    dark_current_e_per_s: float = _PAPER.dark_current_e_per_s
-    quantum_efficiency: float = _PAPER.quantum_efficiency
-
-    @property
-    def sensor(self) -> SimulatedSensor:
-        """The dark camera's sensor."""
-        return SimulatedSensor(
-            read_noise_e=self.read_noise_e,
-            dark_current_e_per_s=self.dark_current_e_per_s,
-            quantum_efficiency=self.quantum_efficiency,
-        )
-
-    @property
-    def dark_e(self) -> float:
-        """Expected dark electrons per pixel and view."""
-        return self.dark_current_e_per_s * self.exposure_s
 
 
 class Darkened(msgspec.Struct, frozen=True):
@@ -142,7 +116,12 @@ def _write_dark_views(
 
     A dark view has the name of its bright view, unless two files would then have the same name.
     """
-    sensor, generator = options.sensor, np.random.default_rng(options.seed)
+    sensor = SimulatedSensor(
+        read_noise_e=options.read_noise_e,
+        dark_current_e_per_s=options.dark_current_e_per_s,
+        quantum_efficiency=options.quantum_efficiency,
+    )
+    generator = np.random.default_rng(options.seed)
     stems = [Path(view.image).stem for view in bright.settings.view]
     if len({*stems, *_TAKEN_STEMS}) < len(stems) + len(_TAKEN_STEMS):
         stems = [f"view_{index:03d}" for index in range(len(stems))]

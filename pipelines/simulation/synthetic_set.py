@@ -4,9 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +25,7 @@ from faintfield.pipelines.formats.sets.elemental_file import FILE_NAME, Camera, 
 from faintfield.pipelines.formats.sets.elemental_set import NOISE_REFERENCE
 from faintfield.pipelines.formats.sets.ground_truth import TRUTH_FILE, TruePlane, TrueSurface, Truth
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION
+from faintfield.pipelines.simulation.options import SyntheticOptions
 from faintfield.recon.metrics import (
     expected_snr_from_powers,
     photons_from_linear_snr,
@@ -45,24 +44,6 @@ _FLAT = "flat.tiff"
 
 # The brightest pixel of the noise-free set, of 65535: rounding stays below a ten-thousandth of it.
 _NOISE_FREE_PEAK_DN = 60000.0
-
-
-class SyntheticOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """Options of `faintfield simulate`, as its help explains them and provenance.json records them."""
-
-    snr: float = 0.16
-    seed: int = 1
-    rows: int = 7
-    columns: int = 7
-    pitch_mm: float = 50.0
-    size_px: tuple[int, int] = (640, 480)
-    exposure_s: float = 0.1
-    position_error_mm: float = 0.3
-    rotation_error_mrad: float = 3.5
-    poses: Literal["true", "nominal"] = "true"
-    colour: Literal["grey", "bayer"] = "grey"
-    # Sets of toys, which were the only ones once, do not record it
-    objects: Literal["toys", "surfaces"] | msgspec.UnsetType = msgspec.UNSET
 
 
 def write_synthetic_set(out: Path, options: SyntheticOptions, *, overwrite: bool = False) -> Truth:

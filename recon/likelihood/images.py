@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood import pixel_models
+from faintfield.recon.names import LikelihoodName as LikelihoodName
 
 type Image = NDArray[np.floating]
-type LikelihoodName = Literal["poisson", "shifted-poisson", "poisson-gaussian", "least-squares"]
 
 _MODELS = {
     "poisson": pixel_models.SHIFTED_POISSON,

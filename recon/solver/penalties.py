@@ -2,13 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from faintfield.recon.likelihood.images import Image
-
-type PenaltyName = Literal["tv", "huber-tv", "quadratic", "none"]
+from faintfield.recon.names import PenaltyName as PenaltyName
 
 
 @dataclass(frozen=True)

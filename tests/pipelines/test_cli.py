@@ -13,7 +13,7 @@ import pytest
 from cyclopts import App
 from rich.console import Console
 
-from faintfield.pipelines import cli, console
+from faintfield.pipelines import cli, console, launcher
 from faintfield.pipelines.errors import BadValue
 from faintfield.recon.errors import NotConverged
 
@@ -28,7 +28,7 @@ def _commands(app: App, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...
             yield from _commands(app[name], (*before, name))
 
 
-COMMANDS = list(_commands(cli.app))
+COMMANDS = list(_commands(launcher.app))
 
 
 def test_the_commands_of_the_design_are_there() -> None:
@@ -53,8 +53,9 @@ def test_the_help_names_every_command(faintfield: Command) -> None:
         assert f" {name} " in said
 
 
-def test_the_version_is_printed(faintfield: Command) -> None:
-    ended = faintfield("--version")
+@pytest.mark.parametrize("words", [("--version",), ("--json", "--version"), ("report", "--version")])
+def test_the_version_is_printed(words: tuple[str, ...], faintfield: Command) -> None:
+    ended = faintfield(*words)
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     assert (ended.returncode, ended.stdout) == (0, f"{project['version']}\n")
 
@@ -170,7 +171,7 @@ def test_named_failures_are_one_line_as_it_is_and_exit_code_1(
     def fail(*_: object, **__: object) -> None:
         raise failure
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     ended = faintfield("report", "folder")
     assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", line)
 
@@ -184,7 +185,7 @@ def test_what_a_name_holds_is_escaped_in_a_failure(monkeypatch: pytest.MonkeyPat
     def fail(*_: object, **__: object) -> None:
         raise BadValue(f"{HOSTILE}é…[red]: 1 plane(s) in 3.0 s")
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     said = faintfield("report", "folder").stderr
     assert said == f"faintfield: BadValue: {ESCAPED}é…[red]: 1 plane(s) in 3.0 s\n"
 
@@ -217,7 +218,7 @@ def test_a_path_that_is_not_utf_8_is_printed(
     json_wanted: bool, monkeypatch: pytest.MonkeyPatch, capfdbinary: pytest.CaptureFixture[bytes]
 ) -> None:
     report = os.fsdecode(b"out \xff/report.html")
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", lambda folder: Path(report))
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", lambda folder: Path(report))
     assert cli.run(["report", "folder", *(["--json"] if json_wanted else [])]) == 0
     said = capfdbinary.readouterr().out
     assert json.loads(said)["report"] == report if json_wanted else said == b"out \xff/report.html\n"
@@ -227,7 +228,7 @@ def test_an_interrupt_is_one_line_and_exit_code_1(monkeypatch: pytest.MonkeyPatc
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", interrupt)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", interrupt)
     ended = faintfield("report", "folder")
     assert (ended.returncode, ended.stdout) == (1, "")
     assert ended.stderr.startswith("faintfield: Interrupted: ")
@@ -251,7 +252,7 @@ def test_what_the_system_refuses_is_a_named_failure(
     def fail(*_: object) -> None:
         raise failure
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     assert cli.run(["report", "x"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"faintfield: {named}")
@@ -261,7 +262,7 @@ def test_a_bug_is_not_reported_as_a_named_failure(monkeypatch: pytest.MonkeyPatc
     def fail(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     with pytest.raises(ZeroDivisionError):
         cli.run(["report", "folder"])
 

@@ -7,7 +7,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from faintfield.pipelines import cli
+from faintfield.pipelines import cli, launcher
 from faintfield.pipelines.registry import COMMANDS, EXPORTS, IMPORTS
 
 EXAMPLES = [*(example for examples in COMMANDS.values() for example in examples), *IMPORTS, *EXPORTS]
@@ -21,7 +21,7 @@ def _path(example: str) -> list[str]:
 
 @pytest.mark.parametrize("example", EXAMPLES)
 def test_every_example_is_a_call_of_its_command(example: str) -> None:
-    function, bound, _ = cli.app.parse_args(shlex.split(example), print_error=False, exit_on_error=False)
+    function, bound, _ = launcher.app.parse_args(shlex.split(example), print_error=False, exit_on_error=False)
     path = _path(example)
     module = path[0] if len(path) == 1 else f"{path[0]}s.{path[1]}"
     assert function.__module__ == f"faintfield.pipelines.commands.{module}"

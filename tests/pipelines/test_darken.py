@@ -16,6 +16,8 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.simulation.options import DarkeningOptions
+from faintfield.rig.simulation.sensor import SimulatedSensor
 
 type Command = Callable[..., CompletedProcess[str]]
 type SetMaker = Callable[..., Path]
@@ -213,3 +215,9 @@ def test_a_set_is_never_replaced_by_what_is_made_from_it(source: str, scene: Pat
     assert ended.returncode == 1
     assert "OutputExists" in ended.stderr
     assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before
+
+
+def test_by_default_the_dark_camera_is_the_paper_s() -> None:
+    options, paper = DarkeningOptions(), SimulatedSensor()
+    for name in ("read_noise_e", "dark_current_e_per_s", "quantum_efficiency"):
+        assert getattr(options, name) == getattr(paper, name)

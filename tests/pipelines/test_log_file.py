@@ -49,7 +49,7 @@ def test_a_bug_leaves_its_traceback_and_a_warning_its_words(tmp_path: Path, monk
         logging.getLogger("some.library").warning("the wind has turned")
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     log = tmp_path / "day.log"
     with pytest.raises(ZeroDivisionError):
         cli.run(["report", "folder", "--log", str(log)])
@@ -66,7 +66,7 @@ def test_no_name_can_forge_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         logging.getLogger("some.library").warning(forged)
         raise ZeroDivisionError(forged)
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     # pytest keeps what is logged, and its workers cannot send what is not UTF-8
     monkeypatch.setattr(logging.getLogger(), "handlers", [])
     log = tmp_path / "day.log"
@@ -87,7 +87,7 @@ def test_a_secret_is_in_no_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         inform("the word is sesame")
         raise ZeroDivisionError("sesame")
 
-    monkeypatch.setattr("faintfield.pipelines.commands.report.write_report", fail)
+    monkeypatch.setattr("faintfield.pipelines.pages.report.write_report", fail)
     log = tmp_path / "day.log"
     with pytest.raises(ZeroDivisionError):
         cli.run(["report", "folder", "--log", str(log)])

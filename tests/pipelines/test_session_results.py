@@ -185,7 +185,7 @@ class TestRun:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr("faintfield.pipelines.commands.reconstruct.write_report", interrupted)
+            patch.setattr("faintfield.pipelines.pages.report.write_report", interrupted)
             with pytest.raises(KeyboardInterrupt):
                 run(copy, depth_mm=[700.0], passes=4)
         assert [step.step for step in run(copy, depth_mm=[700.0], passes=4).steps if step.ran] == ["report"]

@@ -90,7 +90,7 @@ def test_an_interrupt_leaves_no_page_of_an_earlier_surface(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("faintfield.pipelines.commands.reconstruct.write_report", interrupted)
+        patch.setattr("faintfield.pipelines.pages.report.write_report", interrupted)
         with pytest.raises(KeyboardInterrupt):
             _ran(session, depth_range_mm="400:1000")
     assert not (session / "reconstructions" / "report.html").exists()

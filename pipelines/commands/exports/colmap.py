@@ -5,12 +5,6 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.formats.exchange.colmap import MODEL_FILES, ColmapImage, ColmapModel, write_model
-from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
-from faintfield.pipelines.formats.files import writing_folder
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
-
 
 def export_colmap(
     elemental_set: Annotated[Path, Parameter(name="SESSION|SET")],
@@ -37,6 +31,12 @@ def export_colmap(
     overwrite
         Replace an earlier model in OUT, a folder that holds nothing else.
     """
+    from faintfield.pipelines.formats.exchange.colmap import MODEL_FILES, ColmapImage, ColmapModel, write_model
+    from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
+    from faintfield.pipelines.formats.files import writing_folder
+    from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+    from faintfield.pipelines.formats.sets.stated import stated_length
+
     loaded = load_set_or_session(elemental_set)
     lenses = lens_of_each_view(loaded)
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}

@@ -2,20 +2,18 @@
 
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
-import numpy as np
 from cyclopts import Parameter
 
-from faintfield.calib.noise import Conditions
 from faintfield.pipelines.console import inform, progress
 from faintfield.pipelines.errors import BadValue, MissingFile
-from faintfield.pipelines.formats.exchange.emva1288 import DESCRIPTOR, descriptor_text
-from faintfield.pipelines.formats.files import write_whole, writing_folder
-from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, read_frame
-from faintfield.pipelines.formats.image_files import write_frame
-from faintfield.pipelines.formats.sets.noise_set import NoiseSet, group_frames, load_noise_set
+
+if TYPE_CHECKING:
+    from faintfield.calib.noise import Conditions
+    from faintfield.pipelines.formats.frames import Frame
+    from faintfield.pipelines.formats.sets.noise_set import NoiseSet
 
 
 class ExportedData(msgspec.Struct, frozen=True):
@@ -44,6 +42,11 @@ def export_emva1288(
     overwrite
         Replace earlier data in OUT.
     """
+    from faintfield.pipelines.formats.exchange.emva1288 import DESCRIPTOR, descriptor_text
+    from faintfield.pipelines.formats.files import write_whole, writing_folder
+    from faintfield.pipelines.formats.frames import read_frame
+    from faintfield.pipelines.formats.sets.noise_set import load_noise_set
+
     if not folder.exists():
         raise MissingFile(f"{folder}: no such folder; name a noise set or a session")
     folder, settings = load_noise_set(folder)
@@ -64,8 +67,10 @@ def export_emva1288(
     return ExportedData(str(out), len(sources), bits, (width, height))
 
 
-def _ordered(folder: Path, settings: NoiseSet) -> list[tuple[Conditions, list[Path]]]:
+def _ordered(folder: Path, settings: "NoiseSet") -> "list[tuple[Conditions, list[Path]]]":
     """Return the series with their frames, flats by their level and then darks, as the standard's data have them."""
+    from faintfield.pipelines.formats.sets.noise_set import group_frames
+
     series = list(group_frames(folder, settings).items())
     for conditions, paths in series:
         if conditions.kind == "flat" and not conditions.photons:
@@ -76,8 +81,10 @@ def _ordered(folder: Path, settings: NoiseSet) -> list[tuple[Conditions, list[Pa
     return sorted(series, key=lambda one: (one[0].kind != "flat", one[0].level, one[0].exposure_s))
 
 
-def _bits(settings: NoiseSet, first: Frame) -> int:
+def _bits(settings: "NoiseSet", first: "Frame") -> int:
     """Return the bits per pixel; the format takes saturation for the last value of these."""
+    import numpy as np
+
     end_dn = settings.saturation_dn or first.saturation_dn or float(np.iinfo(first.pixels_dn.dtype).max)
     bits = int(np.ceil(np.log2(end_dn + 1)))
     if end_dn != 2**bits - 1:
@@ -85,14 +92,17 @@ def _bits(settings: NoiseSet, first: Frame) -> int:
     return bits
 
 
-def _region(settings: NoiseSet) -> tuple[slice, slice]:
+def _region(settings: "NoiseSet") -> tuple[slice, slice]:
     """Return the rows and columns in use."""
     region = settings.region
     return (slice(*region.rows), slice(*region.columns)) if region else (slice(None), slice(None))
 
 
-def _write_image(source: Path, folder: Path, index: int, settings: NoiseSet, first: Frame) -> str:
+def _write_image(source: Path, folder: Path, index: int, settings: "NoiseSet", first: "Frame") -> str:
     """Write one image, and return its path within the folder."""
+    from faintfield.pipelines.formats.frames import RAW_SUFFIXES, read_frame
+    from faintfield.pipelines.formats.image_files import write_frame
+
     height, width = first.pixels_dn.shape[:2]
     pixels = read_frame(source, (width, height), of="the first frame").pixels_dn
     as_it_is = settings.region is None and source.suffix.lower() not in RAW_SUFFIXES

@@ -6,11 +6,6 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
-from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
-from faintfield.pipelines.formats.files import write_whole, writing_folder
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-from faintfield.pipelines.formats.sets.stated import stated_length
 
 
 def export_mrcal(
@@ -29,6 +24,12 @@ def export_mrcal(
     overwrite
         Replace earlier models in OUT, a folder that holds nothing else.
     """
+    from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
+    from faintfield.pipelines.formats.exchange.mrcal import SUFFIX, camera_model_text, lens_model_of
+    from faintfield.pipelines.formats.files import write_whole, writing_folder
+    from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+    from faintfield.pipelines.formats.sets.stated import stated_length
+
     loaded = load_set_or_session(elemental_set)
     models: dict[str, str] = {}
     for view, lens, pose in zip(loaded.settings.view, lens_of_each_view(loaded), loaded.poses_rt_cam_ref, strict=True):

@@ -5,11 +5,6 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
-from faintfield.pipelines.formats.exchange.nerfstudio import FILE_NAME, write_transforms
-from faintfield.pipelines.formats.files import writing_folder
-from faintfield.pipelines.formats.sets.session_set import load_set_or_session
-
 
 def export_nerfstudio(
     elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
@@ -29,6 +24,11 @@ def export_nerfstudio(
     overwrite
         Replace an earlier transforms.json in OUT, a folder that holds nothing else.
     """
+    from faintfield.pipelines.formats.exchange.imported_set import lens_of_each_view
+    from faintfield.pipelines.formats.exchange.nerfstudio import FILE_NAME, write_transforms
+    from faintfield.pipelines.formats.files import writing_folder
+    from faintfield.pipelines.formats.sets.session_set import load_set_or_session
+
     loaded = load_set_or_session(elemental_set)
     names = [view.image for view in loaded.settings.view]
     with writing_folder(out, replace_only=[FILE_NAME] if overwrite else ()) as folder:

@@ -5,9 +5,6 @@ from pathlib import Path
 import msgspec
 
 from faintfield.pipelines.errors import BadValue
-from faintfield.pipelines.formats.exchange.zarr import plane_stack, require_zarr, write_zarr
-from faintfield.pipelines.formats.results.surface import planes_below
-from faintfield.pipelines.formats.units import units_of
 
 
 class ZarrExport(msgspec.Struct, frozen=True):
@@ -36,6 +33,10 @@ def export_zarr(directory: Path, out: Path, /, *, overwrite: bool = False) -> Za
     overwrite
         Replace an earlier export in OUT.
     """
+    from faintfield.pipelines.formats.exchange.zarr import plane_stack, require_zarr, write_zarr
+    from faintfield.pipelines.formats.results.surface import planes_below
+    from faintfield.pipelines.formats.units import units_of
+
     require_zarr()
     results = planes_below(directory)
     if len(results) > 1:

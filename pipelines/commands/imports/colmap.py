@@ -1,11 +1,15 @@
 """`faintfield import colmap`: lens and poses from COLMAP's sparse models."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.colmap import read_posed_images
-from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
-from faintfield.pipelines.formats.exchange.tone import asked_tone
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+
+
+type Result = ImportedSet
 
 
 def import_colmap(
@@ -20,7 +24,7 @@ def import_colmap(
     linear: bool = False,
     srgb: bool = False,
     overwrite: bool = False,
-) -> ImportedSet:
+) -> Result:
     """Make an elemental set from a COLMAP model, text or binary, and its images.
 
     Parameters
@@ -44,6 +48,10 @@ def import_colmap(
     overwrite
         Replace an earlier set in OUT.
     """
+    from faintfield.pipelines.formats.exchange.colmap import read_posed_images
+    from faintfield.pipelines.formats.exchange.imported_set import import_posed
+    from faintfield.pipelines.formats.exchange.tone import asked_tone
+
     return import_posed(
         out,
         read_posed_images(src, images or src),

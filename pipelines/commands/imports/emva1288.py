@@ -3,13 +3,7 @@
 import shutil
 from pathlib import Path
 
-import msgspec
-
 from faintfield.pipelines.console import inform, progress
-from faintfield.pipelines.formats.exchange.emva1288 import image_path, read_descriptor
-from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
-from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, write_noise_set
 
 
 def import_emva1288(descriptor: Path, out: Path, /, *, overwrite: bool = False) -> dict[str, str | float]:
@@ -24,6 +18,13 @@ def import_emva1288(descriptor: Path, out: Path, /, *, overwrite: bool = False) 
     overwrite
         Replace an earlier set in OUT.
     """
+    import msgspec
+
+    from faintfield.pipelines.formats.exchange.emva1288 import image_path, read_descriptor
+    from faintfield.pipelines.formats.files import sha256, write_json, writing_folder
+    from faintfield.pipelines.formats.provenance import provenance
+    from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, NoiseSet, write_noise_set
+
     read = read_descriptor(descriptor)
     sources = [image_path(descriptor, frame.file) for frame in read.frames]
     names = [f"frames/{index:05d}_{source.name}" for index, source in enumerate(sources)]

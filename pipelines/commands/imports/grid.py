@@ -2,23 +2,16 @@
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 
-from faintfield.calib.arrangement.orientation import Orientation
-from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import Count, Fraction, NotNegative, Positive
 from faintfield.pipelines.console import inform
-from faintfield.pipelines.formats.exchange.arranged_grid import arranged, grey_picture
-from faintfield.pipelines.formats.exchange.arrangement_words import show_arrangement
-from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
-from faintfield.pipelines.formats.exchange.imported_noise import StatedNoise
-from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
-from faintfield.pipelines.formats.exchange.packed_views import found_views
-from faintfield.pipelines.formats.exchange.tone import asked_tone
-from faintfield.pipelines.formats.sets.elemental_file import Arrangement
-from faintfield.pipelines.formats.units import Units
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.sets.elemental_file import Arrangement
+
 
 # Without a pitch the unit of length is free: the plane on which the pictures are aligned gets this depth.
 _FREE_REFERENCE_DEPTH_MM = 1000.0
@@ -35,7 +28,7 @@ class ImportedGrid(msgspec.Struct, frozen=True):
     columns: int
     size_px: tuple[int, int]
     views: int
-    arrangement: Arrangement
+    arrangement: "Arrangement"
 
 
 def import_grid(
@@ -124,6 +117,19 @@ def import_grid(
         Replace an earlier set in OUT.
     """
     options = {name: value for name, value in locals().items() if name not in ("src", "out", "overwrite")}
+    import numpy as np
+
+    from faintfield.calib.arrangement.orientation import Orientation
+    from faintfield.calib.lens import Lens
+    from faintfield.pipelines.formats.exchange.arranged_grid import arranged, grey_picture
+    from faintfield.pipelines.formats.exchange.arrangement_words import show_arrangement
+    from faintfield.pipelines.formats.exchange.hci import described_grid, write_true_depth
+    from faintfield.pipelines.formats.exchange.imported_noise import StatedNoise
+    from faintfield.pipelines.formats.exchange.imported_set import read_picture, write_imported_set
+    from faintfield.pipelines.formats.exchange.packed_views import found_views
+    from faintfield.pipelines.formats.exchange.tone import asked_tone
+    from faintfield.pipelines.formats.units import Units
+
     described = described_grid(src)
     own_scale = pitch_mm is None and fx_px is None and disparity_px is None
     if described is not None:
@@ -174,7 +180,7 @@ class _Gauge(msgspec.Struct, frozen=True):
 
 
 def _gauge(
-    arrangement: Arrangement, width_px: float, pitch_mm: float | None, fx_px: float | None, disparity_px: float
+    arrangement: "Arrangement", width_px: float, pitch_mm: float | None, fx_px: float | None, disparity_px: float
 ) -> _Gauge:
     """Return the scale of a set: as given, or a nominal one in which all that was found is in front of the cameras."""
     focal_px = fx_px or width_px

@@ -1,11 +1,15 @@
 """`faintfield import mrcal`: lens and poses from .cameramodel files."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
-from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
-from faintfield.pipelines.formats.exchange.tone import asked_tone
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+
+
+type Result = ImportedSet
 
 
 def import_mrcal(
@@ -20,7 +24,7 @@ def import_mrcal(
     linear: bool = False,
     srgb: bool = False,
     overwrite: bool = False,
-) -> ImportedSet:
+) -> Result:
     """Make an elemental set from a folder of .cameramodel files and images of the same names.
 
     Parameters
@@ -44,6 +48,10 @@ def import_mrcal(
     overwrite
         Replace an earlier set in OUT.
     """
+    from faintfield.pipelines.formats.exchange.imported_set import import_posed
+    from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
+    from faintfield.pipelines.formats.exchange.tone import asked_tone
+
     posed = read_camera_models(src, images or src)
     return import_posed(
         out,

@@ -1,11 +1,15 @@
 """`faintfield import nerfstudio`: lens and poses from a transforms.json."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from faintfield.pipelines.arguments import Positive
-from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed
-from faintfield.pipelines.formats.exchange.nerfstudio import read_transforms
-from faintfield.pipelines.formats.exchange.tone import asked_tone
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+
+
+type Result = ImportedSet
 
 
 def import_nerfstudio(
@@ -20,7 +24,7 @@ def import_nerfstudio(
     linear: bool = False,
     srgb: bool = False,
     overwrite: bool = False,
-) -> ImportedSet:
+) -> Result:
     """Make an elemental set from the transforms.json of nerfstudio or instant-ngp and its images.
 
     Parameters
@@ -44,6 +48,10 @@ def import_nerfstudio(
     overwrite
         Replace an earlier set in OUT.
     """
+    from faintfield.pipelines.formats.exchange.imported_set import import_posed
+    from faintfield.pipelines.formats.exchange.nerfstudio import read_transforms
+    from faintfield.pipelines.formats.exchange.tone import asked_tone
+
     return import_posed(
         out,
         read_transforms(src, images),

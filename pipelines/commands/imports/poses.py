@@ -1,13 +1,16 @@
 """`faintfield import poses`: poses from a table, the lens from options."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from faintfield.calib.lens import Lens
 from faintfield.pipelines.arguments import Positive
 from faintfield.pipelines.errors import WrongUsage
-from faintfield.pipelines.formats.exchange.imported_set import ImportedSet, import_posed, read_picture
-from faintfield.pipelines.formats.exchange.pose_table import PoseTable
-from faintfield.pipelines.formats.exchange.tone import asked_tone
+
+if TYPE_CHECKING:
+    from faintfield.pipelines.formats.exchange.imported_set import ImportedSet
+
+
+type Result = ImportedSet
 
 
 def import_poses(
@@ -27,7 +30,7 @@ def import_poses(
     linear: bool = False,
     srgb: bool = False,
     overwrite: bool = False,
-) -> ImportedSet:
+) -> Result:
     """Make an elemental set from a table of camera positions and its images.
 
     The first line of the table names its columns: name, x, y, z or x_mm, y_mm, z_mm, and qw, qx, qy, qz if cameras are
@@ -65,6 +68,11 @@ def import_poses(
     overwrite
         Replace an earlier set in OUT.
     """
+    from faintfield.calib.lens import Lens
+    from faintfield.pipelines.formats.exchange.imported_set import import_posed, read_picture
+    from faintfield.pipelines.formats.exchange.pose_table import PoseTable
+    from faintfield.pipelines.formats.exchange.tone import asked_tone
+
     table, folder = PoseTable(src), images or src.parent
     if mm_per_unit is not None and table.mm_per_unit is not None:
         raise WrongUsage(f"{src}: its header states the unit of positions; leave --mm-per-unit out")

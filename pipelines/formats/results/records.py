@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 
 from msgspec import UNSET, Meta, Struct, UnsetType
 
+from faintfield.pipelines.choices import Method as Method
 from faintfield.pipelines.formats.provenance import Provenance
 from faintfield.pipelines.formats.units import StatedUnits
 
@@ -21,8 +22,6 @@ RECONSTRUCTION_FILE = "reconstruction.json"
 DEPTH_MAP_FILE = "depth_map.json"
 METRICS_FILE = "metrics.json"
 REPORT_FILE = "report.html"
-
-type Method = Literal["pmlem", "backprojection", "mlem", "pmlem-osl", "joint", "occlusion"]
 
 # A file beside a record: one name, which cannot lead elsewhere or act on a terminal.
 type FileName = Annotated[str, Meta(pattern=r"^(?!\.{1,2}\Z)[^/\\\x00-\x1f\x7f]+\Z", max_length=200)]

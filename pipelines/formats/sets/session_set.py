@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.lens import Lens
+from faintfield.pipelines.choices import SceneKind as SceneKind
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue, MissingFile
 from faintfield.pipelines.formats.files import sha256
@@ -21,8 +21,6 @@ from faintfield.rig.session.homings import read_homing_groups
 from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_frames
 
 RECONSTRUCTIONS = "reconstructions"
-
-type SceneKind = Literal["dark_scene", "bright"]
 
 _NAMES: dict[SceneKind, str] = {"dark_scene": "dark-scene", "bright": "bright"}
 
