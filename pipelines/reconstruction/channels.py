@@ -1,8 +1,9 @@
 """The images of an elemental set in electrons, one stack per colour: what the solvers take."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period, r
 from faintfield.pipelines.formats.large_arrays import Allocate
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.threads import map_in_threads
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
@@ -48,7 +50,7 @@ class ChannelLayout:
 def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
     """Return the colours of a set, as its first frame has them."""
     width, height = loaded.settings.camera.size_px
-    frame = read_frame(loaded.image_paths[0], (width, height))
+    frame = loaded.read_frame(loaded.image_paths[0], (width, height))
     mosaic = loaded.settings.camera.mosaic or frame.mosaic
     everything = Lattice((0, 0), (1, 1), (height, width))
     if frame.pixels_dn.ndim == 3:
@@ -66,7 +68,7 @@ def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
 
 
 def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
-    """Read one colour of all views in electrons, one frame at a time, directly into the stack.
+    """Read one colour of all views in electrons, each frame by one thread, directly into the stack.
 
     Parameters
     ----------
@@ -87,15 +89,22 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
     shape = layout.lattices[0].shape
     electrons = allocate((views * phases, *shape), np.float32)
     valid: NDArray[np.bool_] | None = None
-    for view in range(views):
-        for phase, (sum_e, over) in enumerate(view_electrons(loaded, layout, loaded.frame_paths(view))):
-            electrons[view * phases + phase] = sum_e
-            if over.any():
+    allocating = Lock()
+    noise_of = _noise_by_frame(loaded, layout)
+
+    def load(view: int) -> None:
+        nonlocal valid
+        part = slice(view * phases, (view + 1) * phases)
+        over = _add_up(loaded, layout, noise_of, loaded.frame_paths(view), electrons[part])
+        if over.any():
+            with allocating:
                 if valid is None:
                     valid = allocate(electrons.shape, np.bool_)
                     valid.fill(True)
-                valid[view * phases + phase] = ~over
-    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
+            np.logical_not(over, out=valid[part])
+
+    map_in_threads(load, range(views))
+    noises = [noise_of(phase, None) for phase in range(phases)]
     return ElementalImages(
         electrons,
         background_e=_stacked([loaded.background_e(noise) for noise in noises], shape),
@@ -112,25 +121,36 @@ def view_electrons(
     The sum has all the information that the single frames have, except for the shape of the read noise: the sum of
     Poisson counts is a Poisson count, and variances add.
     """
-    sums: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
-    for path in paths:
+    sums = np.zeros((len(layout.lattices), *layout.lattices[0].shape), np.float32)
+    over = _add_up(loaded, layout, _noise_by_frame(loaded, layout), paths, sums)
+    return list(zip(sums, over, strict=True))
+
+
+def _add_up(
+    loaded: ElementalSet,
+    layout: ChannelLayout,
+    noise_of: Callable[[int, Frame | None], NoiseModel],
+    paths: Sequence[Path],
+    sums: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Write the electrons of all frames of a view to `sums` (lattice, row, column); return where any is saturated."""
+    over = np.zeros(sums.shape, bool)
+    for number, path in enumerate(paths):
         frame = checked_frame(loaded, path, layout)
         pixels = layout.of(frame.pixels_dn)
         for index, lattice in enumerate(layout.lattices):
-            noise = lattice_noise(loaded, lattice, frame)
-            pixels_dn = lattice.of(pixels)
-            electrons, over = noise.electrons(pixels_dn), noise.saturated(pixels_dn)
-            if path is paths[0]:
-                sums.append((electrons, over))
+            noise, pixels_dn = noise_of(index, frame), lattice.of(pixels)
+            if number == 0:
+                noise.electrons(pixels_dn, sums[index])
             else:
-                before_e, before_over = sums[index]
-                sums[index] = (before_e + electrons, before_over | over)
-    return sums
+                sums[index] += noise.electrons(pixels_dn)
+            over[index] |= noise.saturated(pixels_dn)
+    return over
 
 
 def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
     """Read a frame, and check that it fits the camera and the noise model of the set."""
-    frame = read_frame(path, loaded.settings.camera.size_px)
+    frame = loaded.read_frame(path, loaded.settings.camera.size_px)
     found = frame.pixels_dn
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
@@ -158,15 +178,34 @@ def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
     if loaded.noise.response is not None:
         maps["response"] = loaded.noise.response.part(lattice.of)
-    noise = replace(loaded.noise, **maps)
-    if frame is None:
-        return noise
+    return replace(loaded.noise, **maps, **({} if frame is None else _of_file(loaded, lattice, frame)))
+
+
+def _of_file(loaded: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, float]:
+    """Return what a frame's own file says of the noise of a lattice and the set does not, by name."""
+    own = {}
     if loaded.offset_from_files and frame.black_dn is not None:
         black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
-        noise = replace(noise, offset_dn=float(black_dn))
-    if not np.isfinite(noise.saturation_dn) and frame.saturation_dn is not None:
-        noise = replace(noise, saturation_dn=frame.saturation_dn)
-    return noise
+        own["offset_dn"] = float(black_dn)
+    if not np.isfinite(loaded.noise.saturation_dn) and frame.saturation_dn is not None:
+        own["saturation_dn"] = frame.saturation_dn
+    return own
+
+
+def _noise_by_frame(loaded: ElementalSet, layout: ChannelLayout) -> Callable[[int, Frame | None], NoiseModel]:
+    """Return a function that gives the noise model of a lattice, by its index, in a frame."""
+    # Checking the maps of a model takes longer than converting a frame by it, so frames that say the same share one
+    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
+    known: dict[tuple[int, tuple[tuple[str, float], ...]], NoiseModel] = {}
+
+    def noise_of(index: int, frame: Frame | None) -> NoiseModel:
+        own = {} if frame is None else _of_file(loaded, layout.lattices[index], frame)
+        key = (index, tuple(own.items()))
+        if key not in known:
+            known[key] = replace(noises[index], **own)
+        return known[key]
+
+    return noise_of
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:

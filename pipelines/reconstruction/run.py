@@ -163,7 +163,7 @@ def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) 
     }
     for plane in request.tilted:
         grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
-    inputs = dict(loaded.input_hashes())
+    inputs = loaded.input_hashes()
     units = loaded.units
     all_planes = {
         name: provenance("reconstruct", in_units(loaded, request.options(name, loaded.poses)), inputs, units)

@@ -92,7 +92,7 @@ def reconstruct_surface(
     _check(loaded, out)
     unit = unit_of_maps(loaded.units, as_px=request.unit == "px")
     options = in_units(loaded, request.options(loaded.poses))
-    origin = provenance("reconstruct", options, dict(loaded.input_hashes()), loaded.units)
+    origin = provenance("reconstruct", options, loaded.input_hashes(), loaded.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface
