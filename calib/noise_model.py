@@ -43,7 +43,8 @@ class BentResponse:
         _require("up_to_dn", self.up_to_dn, at_least=1 / _MAX_NUMBER)
         for bend in self.bends_per_dn:
             _require("bends_per_dn", bend, at_least=-_MAX_NUMBER)
-        if not min(float(np.min(_slope(self.bends_per_dn, share * self.up_to_dn))) for share in np.linspace(0, 1, 33)) > 0:
+        within = (share * self.up_to_dn for share in np.linspace(0, 1, 33))
+        if not min(float(np.min(_slope(self.bends_per_dn, signal_dn))) for signal_dn in within) > 0:
             raise ValueError(f"bends_per_dn {self.bends_per_dn}: the charge must grow with the signal")
 
     def charge_dn(self, signal_dn: NDArray[np.floating], rows: slice = slice(None)) -> NDArray[np.float64]:

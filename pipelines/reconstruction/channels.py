@@ -1,8 +1,11 @@
 """The images of an elemental set in electrons, one stack per colour: what the solvers take."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import disk_usage
+from tempfile import TemporaryFile
 from threading import Lock
 from typing import Any
 
@@ -11,14 +14,17 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth
-from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period, read_frame
-from faintfield.pipelines.formats.large_arrays import Allocate
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, Lattice, mosaic_period, read_frame
+from faintfield.pipelines.formats.large_arrays import Allocate, mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.threads import map_in_threads
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
+
+# Share of the free disk that decoded frames may take; the rest is for results, and for electrons if memory is short.
+_SHARE_OF_DISK = 0.25
 
 # Maps of the noise model, a value per pixel or one for all.
 _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
@@ -65,6 +71,38 @@ def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
         lattices = tuple(Lattice(phase, period, shape) for phase in phases)
         layouts.append(ChannelLayout(_COLOUR_NAMES.get(letter, letter), None, lattices))
     return layouts
+
+
+def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
+    """Return a set that decodes each frame once: what took decoding is kept in files in a folder.
+
+    The files have no name, so they disappear with the set, however the process ends. They take at most a quarter of
+    the free disk; frames beyond that are decoded each time.
+    """
+    # A set is read once per colour, and again by searches and priors. Pixels are kept rather than electrons, as they
+    # take half the room and serve all of these, and in files, as memory is for the solvers
+    if loaded.read_frame is not read_frame:
+        return loaded
+    kept: dict[Path, Frame] = {}
+
+    def read(path: Path, size_px: tuple[int, int]) -> Frame:
+        if path in kept:
+            return kept[path]
+        frame = read_frame(path, size_px)
+        pixels = frame.pixels_dn
+        if path.suffix.lower() not in RAW_SUFFIXES and path.stat().st_size >= pixels.nbytes:
+            return frame  # uncompressed: it is read as fast from its own file
+        kept_bytes = sum(one.pixels_dn.nbytes for one in list(kept.values()))
+        with suppress(OSError):  # without room it is decoded again
+            folder.mkdir(parents=True, exist_ok=True)
+            if kept_bytes + pixels.nbytes <= _SHARE_OF_DISK * (kept_bytes + disk_usage(folder).free):
+                with TemporaryFile(dir=folder) as file:
+                    stored = mapped(file, pixels.shape, pixels.dtype)
+                stored[:] = pixels
+                kept[path] = replace(frame, pixels_dn=stored)
+        return frame
+
+    return replace(loaded, read_frame=read)
 
 
 def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
@@ -178,12 +216,12 @@ def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
     if loaded.noise.response is not None:
         maps["response"] = loaded.noise.response.part(lattice.of)
-    return replace(loaded.noise, **maps, **({} if frame is None else _of_file(loaded, lattice, frame)))
+    return replace(loaded.noise, **maps | ({} if frame is None else _of_file(loaded, lattice, frame)))
 
 
-def _of_file(loaded: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, float]:
+def _of_file(loaded: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, Any]:
     """Return what a frame's own file says of the noise of a lattice and the set does not, by name."""
-    own = {}
+    own: dict[str, Any] = {}
     if loaded.offset_from_files and frame.black_dn is not None:
         black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
         own["offset_dn"] = float(black_dn)
