@@ -146,18 +146,19 @@ class Lens:
         """
         if not any(self.distortion):
             return None
-        from scipy.interpolate import make_interp_spline  # slow to load
+        from scipy.interpolate import BSpline, make_interp_spline  # slow to load
 
         width, height = self.size_px
         for distance_px in _NODES_PX:
             x, y = (np.linspace(0, size - 1, (size - 2) // distance_px + 2) for size in (width, height))
             if min(len(x), len(y)) < 4:
                 continue
-            along_rows = make_interp_spline(x, self._undistorted(_grid(y, x)), axis=1)
+            down = make_interp_spline(y, self._undistorted(_grid(y, x)))
+            right = make_interp_spline(x, down.c, axis=1)
             middle_x, middle_y = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
-            between = make_interp_spline(y, along_rows(middle_x))(middle_y)
+            between = BSpline(down.t, right(middle_x), down.k)(middle_y)
             if self._miss_px(between, _grid(middle_y, middle_x)) <= _INTERPOLATION_PX:
-                return make_interp_spline(y, along_rows(columns))
+                return BSpline(down.t, right(columns), down.k)
         return None
 
     def _undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from faintfield.calib.noise_model import BentResponse, NoiseModel
 from faintfield.pipelines.errors import UnreadableImage
 from faintfield.pipelines.formats import frames
+from faintfield.pipelines.formats.decoders import decode_tiff
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.frames import Frame, read_frame
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
@@ -207,11 +208,11 @@ def _compressed(folder: Path) -> None:
 
 def _decoded(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The files that are decoded from now on."""
-    decoded, decode = [], frames.decode_tiff
+    decoded = []
 
     def counted(file: Any, path: Path, *arguments: Any) -> Any:
         decoded.append(path)
-        return decode(file, path, *arguments)
+        return decode_tiff(file, path, *arguments)
 
     monkeypatch.setattr(frames, "decode_tiff", counted)
     return decoded
