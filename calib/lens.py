@@ -29,7 +29,7 @@ _STRIP_ROWS = 32
 _NODES_PX = (32, 16, 8, 4)
 
 # Largest distance in pixels between a point in the middle of four nodes and the image of its interpolated ray. Of all
-# points, none was found to be off by more than 1.2 times as much.
+# points of 83 lenses and distances of nodes, none was off by more than 1.3 times as much as the worst of these.
 _INTERPOLATION_PX = 5e-5
 
 # Returns the rays (row, column, 2) of some rows.
