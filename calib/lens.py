@@ -1,5 +1,6 @@
 """The lens: where each detector pixel looks."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
@@ -21,8 +22,18 @@ MAX_SIDE_PX, MAX_PIXELS = 65_535, 250_000_000
 # Largest focal length, principal point and distortion coefficient; computing with numbers up to it does not overflow.
 _MAX_NUMBER = 1e9
 
-# Rows that are undistorted at a time: OpenCV returns a Jacobian with every point, and strips keep it small.
+# Rows that are computed at a time: they are float64, and OpenCV returns a Jacobian with every point that it undistorts.
 _STRIP_ROWS = 32
+
+# Distances in pixels of the nodes between which undistorted rays are interpolated: the next if one is too wide.
+_NODES_PX = (32, 16, 8, 4)
+
+# Largest distance in pixels between a point in the middle of four nodes and the image of its interpolated ray. Of all
+# points of 83 lenses and distances of nodes, none was off by more than 1.3 times as much as the worst of these.
+_INTERPOLATION_PX = 5e-5
+
+# Returns the rays (row, column, 2) of some rows.
+type RaysOfRows = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -81,8 +92,11 @@ class Lens:
         """Return the 3 x 3 matrix from undistorted rays (x, y, 1) to pixels (column, row, 1)."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1]])
 
-    def rays(self, first: tuple[int, int] = (0, 0), step: tuple[int, int] = (1, 1)) -> NDArray[np.float64]:
+    def rays(self, first: tuple[int, int] = (0, 0), step: tuple[int, int] = (1, 1)) -> NDArray[np.float32]:
         """Return the undistorted rays (row, column, 2) of a lattice of pixels: x, y at unit depth.
+
+        Distortion is undone at nodes some pixels apart. Between them, a cubic spline is within 1e-4 px of the ray
+        before rounding; where it is not, the nodes are taken closer, at last at every pixel.
 
         Parameters
         ----------
@@ -98,10 +112,11 @@ class Lens:
         width, height = self.size_px
         columns = np.arange(first[1], width, step[1], dtype=float)
         rows = np.arange(first[0], height, step[0], dtype=float)
-        rays = np.empty((len(rows), len(columns), 2))
+        of_rows = self._interpolated(columns) or (lambda some_rows: self._undistorted(_grid(some_rows, columns)))
+        rays = np.empty((len(rows), len(columns), 2), np.float32)
         for top in range(0, len(rows), _STRIP_ROWS):
             strip = slice(top, top + _STRIP_ROWS)
-            rays[strip] = self._undistorted(np.stack(np.meshgrid(columns, rows[strip]), axis=-1))
+            rays[strip] = of_rows(rows[strip])
         return rays
 
     def rays_at(self, pixels: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -124,6 +139,28 @@ class Lens:
             pixels[in_front] = cv2.projectPoints(points[in_front], *arguments)[0][:, 0]
         return pixels
 
+    def _interpolated(self, columns: NDArray[np.float64]) -> RaysOfRows | None:
+        """Return what interpolates the rays (row, column, 2) of the columns in given rows, None if nothing does well.
+
+        The nodes are those of the whole detector, so that a lattice has the rays of all pixels.
+        """
+        if not any(self.distortion):
+            return None
+        from scipy.interpolate import BSpline, make_interp_spline  # slow to load
+
+        width, height = self.size_px
+        for distance_px in _NODES_PX:
+            x, y = (np.linspace(0, size - 1, (size - 2) // distance_px + 2) for size in (width, height))
+            if min(len(x), len(y)) < 4:
+                continue
+            down = make_interp_spline(y, self._undistorted(_grid(y, x)))
+            right = make_interp_spline(x, down.c, axis=1)
+            middle_x, middle_y = (x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2
+            between = BSpline(down.t, right(middle_x), down.k)(middle_y)
+            if self._miss_px(between, _grid(middle_y, middle_x)) <= _INTERPOLATION_PX:
+                return BSpline(down.t, right(columns), down.k)
+        return None
+
     def _undistorted(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rays of pixels (row, column, 2), and check that they project back onto the pixels."""
         if not any(self.distortion):
@@ -131,18 +168,28 @@ class Lens:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, _UNDISTORTION_TOLERANCE_PX)
         matrix, distortion = self.camera_matrix(), self._coefficients()
         rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion, criteria=criteria)
-        homogeneous = cv2.convertPointsToHomogeneous(rays)
-        again, _ = cv2.projectPoints(homogeneous, np.zeros(3), np.zeros(3), matrix, distortion)
-        miss_px = float(np.abs(again.reshape(pixels.shape) - pixels).max())
+        rays = np.asarray(rays.reshape(pixels.shape), np.float64)
+        miss_px = self._miss_px(rays, pixels)
         if not miss_px <= _ROUND_TRIP_PX:
             raise LensNotInvertible(
                 f"distortion {self.distortion} cannot be undone over the {self.size_px[0]} x {self.size_px[1]} px "
                 f"detector: off by {miss_px:.3g} px, limit {_ROUND_TRIP_PX} px; calibrate with boards that reach the "
                 "corners, or crop"
             )
-        return np.asarray(rays.reshape(pixels.shape), np.float64)
+        return rays
+
+    def _miss_px(self, rays: NDArray[np.float64], pixels: NDArray[np.float64]) -> float:
+        """Return the largest distance in x or y between pixels (…, 2) and the images of rays (…, 2)."""
+        homogeneous = cv2.convertPointsToHomogeneous(np.ascontiguousarray(rays).reshape(-1, 1, 2))
+        arguments = (np.zeros(3), np.zeros(3), self.camera_matrix(), self._coefficients())
+        return float(np.abs(cv2.projectPoints(homogeneous, *arguments)[0].reshape(pixels.shape) - pixels).max())
 
     def _coefficients(self) -> NDArray[np.float64]:
         """Return the distortion, padded with zeros to a length that OpenCV accepts: 4, 5 or 8."""
         length = next(length for length in (4, 5, 8) if length >= len(self.distortion))
         return np.array([*self.distortion, *[0.0] * (length - len(self.distortion))])
+
+
+def _grid(rows: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return all pixels (row, column, 2) of some rows and columns, as column, row."""
+    return np.stack(np.meshgrid(columns, rows), axis=-1)

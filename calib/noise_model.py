@@ -1,11 +1,14 @@
 """Noise model of a sensor, which converts digital numbers to electrons with known statistics."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+# Rows that are converted at a time, so that one pass finds in the cache what the pass before it wrote.
+_STRIP_ROWS = 64
 
 # Largest number of a sensor; the squares of what is computed from such numbers do not overflow single precision.
 _MAX_NUMBER = 1e6
@@ -40,22 +43,20 @@ class BentResponse:
         _require("up_to_dn", self.up_to_dn, at_least=1 / _MAX_NUMBER)
         for bend in self.bends_per_dn:
             _require("bends_per_dn", bend, at_least=-_MAX_NUMBER)
-        if not min(float(np.min(self._slope(share * self.up_to_dn))) for share in np.linspace(0, 1, 33)) > 0:
+        within = (share * self.up_to_dn for share in np.linspace(0, 1, 33))
+        if not min(float(np.min(_slope(self.bends_per_dn, signal_dn))) for signal_dn in within) > 0:
             raise ValueError(f"bends_per_dn {self.bends_per_dn}: the charge must grow with the signal")
 
-    def charge_dn(self, signal_dn: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the charge behind a signal (row, column), times the gain at zero signal."""
-        within = np.clip(np.asarray(signal_dn, float), 0.0, self.up_to_dn)
-        factor = 1.0 + sum(bend * within**power for power, bend in enumerate(self.bends_per_dn, 1))
-        return np.asarray(within * factor + (signal_dn - within) * self._slope(within))
+    def charge_dn(self, signal_dn: NDArray[np.floating], rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return the charge behind a signal (row, column) of some rows, times the gain at zero signal."""
+        within = np.clip(np.asarray(signal_dn, float), 0.0, _of_rows(self.up_to_dn, rows))
+        bends = [_of_rows(bend, rows) for bend in self.bends_per_dn]
+        factor = 1.0 + sum(bend * within**power for power, bend in enumerate(bends, 1))
+        return np.asarray(within * factor + (signal_dn - within) * _slope(bends, within))
 
     def slope(self, signal_dn: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return the gain at zero signal over that at the signals (row, column)."""
-        return np.asarray(self._slope(np.clip(np.asarray(signal_dn, float), 0.0, self.up_to_dn)))
-
-    def _slope(self, within: Any) -> Any:
-        """Return the derivative of the charge within the range."""
-        return 1.0 + sum((power + 1) * bend * within**power for power, bend in enumerate(self.bends_per_dn, 1))
+        return np.asarray(_slope(self.bends_per_dn, np.clip(np.asarray(signal_dn, float), 0.0, self.up_to_dn)))
 
     def part(self, of: Callable[[NDArray[Any]], NDArray[Any]]) -> "BentResponse":
         """Return the response of a part of the pixels, which `of` takes from a map."""
@@ -112,12 +113,17 @@ class NoiseModel:
         if not self.saturation_dn > 0:
             raise ValueError(f"saturation_dn must be positive, got {self.saturation_dn}")
 
-    def electrons(self, frame_dn: NDArray[Any]) -> NDArray[np.float32]:
-        """Return a frame (row, column) in electrons; read noise can make them negative."""
-        electrons: NDArray[np.float32] = np.subtract(frame_dn, self.offset_dn, dtype=np.float32)
-        if self.response is not None:
-            electrons = self.response.charge_dn(electrons).astype(np.float32)
-        electrons /= np.asarray(self.gain_dn_per_e, np.float32)
+    def electrons(self, frame_dn: NDArray[Any], out: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
+        """Return a frame (row, column) in electrons, in `out` if given; read noise can make them negative."""
+        electrons = np.empty(np.shape(frame_dn), np.float32) if out is None else out
+        gain_dn_per_e = np.asarray(self.gain_dn_per_e, np.float32)
+        for top in range(0, len(electrons), _STRIP_ROWS):
+            rows = slice(top, top + _STRIP_ROWS)
+            strip = electrons[rows]
+            np.subtract(frame_dn[rows], _of_rows(self.offset_dn, rows), out=strip, dtype=np.float32)
+            if self.response is not None:
+                strip[:] = self.response.charge_dn(strip, rows)
+            strip /= _of_rows(gain_dn_per_e, rows)
         return electrons
 
     def local_gain_dn_per_e(self, frame_dn: NDArray[Any]) -> NDArray[np.float64]:
@@ -132,6 +138,10 @@ class NoiseModel:
 
     def saturated(self, frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
         """Return the saturated pixels of a frame (row, column)."""
+        if frame_dn.dtype.kind in "iu":  # compared as whole numbers, which takes no array of floats
+            if self.saturation_dn > np.iinfo(frame_dn.dtype).max:
+                return np.zeros(frame_dn.shape, bool)
+            return np.asarray(frame_dn >= int(np.ceil(self.saturation_dn)))
         return np.asarray(frame_dn >= self.saturation_dn)
 
     def background_e(self, exposure_s: float) -> Map:
@@ -141,6 +151,16 @@ class NoiseModel:
     def read_variance_e2(self) -> Map:
         """Return the variance that does not depend on light: read noise, and rounding to whole DN (1/12 DN²)."""
         return self.read_noise_e**2 + 1.0 / (12.0 * self.gain_dn_per_e**2)
+
+
+def _slope(bends_per_dn: Sequence[Map], within: Any) -> Any:
+    """Return the derivative of the charge within the range of the bends."""
+    return 1.0 + sum((power + 1) * bend * within**power for power, bend in enumerate(bends_per_dn, 1))
+
+
+def _of_rows(value: Map, rows: slice) -> Map:
+    """Return some rows of a map; one number, or one row, is that of all."""
+    return value if np.ndim(value) < 2 or len(np.asarray(value)) == 1 else np.asarray(value)[rows]
 
 
 def _require(name: str, value: Map, *, at_least: float, at_most: float = _MAX_NUMBER) -> None:

@@ -1,5 +1,6 @@
 """Threads that are kept between calls: starting one takes as long as a step on a small plane."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from functools import cache
@@ -28,3 +29,43 @@ def run_in_threads[Part, Result](work: Callable[[Part], Result], parts: Sequence
     finally:
         wait(others)  # no thread may still be writing when an interrupt is handled
     return [first, *(other.result() for other in others)]
+
+
+def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
+    """Call `work` on each item, in as many threads as numba takes; return the results in order.
+
+    A thread begins its next item when it is done with one, so no more items than threads are worked on at a time.
+    After a failure or an interrupt no further item is begun, and no thread is left working. Of several failures, that
+    of the first item is raised.
+
+    `work` must not call the functions of this module: it would wait for threads that wait for it.
+    """
+    from numba import config  # slow to load
+
+    results: dict[int, Result] = {}
+    failures: dict[int, Exception] = {}
+    left = deque(enumerate(items))
+
+    def take() -> None:
+        while left and not failures:
+            try:
+                index, item = left.popleft()
+            except IndexError:  # another thread took the last
+                return
+            try:
+                results[index] = work(item)
+            except Exception as failure:
+                failures[index] = failure
+
+    count = min(int(config.NUMBA_NUM_THREADS), len(items)) - 1
+    others = [_pool(count).submit(take) for _ in range(count)]
+    try:
+        take()
+        wait(others)
+    except BaseException:
+        left.clear()
+        wait(others)  # no thread may still be writing when an interrupt is handled
+        raise
+    if failures:
+        raise failures[min(failures)]
+    return [results[index] for index in range(len(items))]

@@ -242,12 +242,15 @@ def _open(folder: Path, out: Path | None, scene: SceneKind, geometry: Path | Non
     """Return a set, or that of a session, and the folder of its results: for a session by default that of the scene."""
     from faintfield.pipelines.formats.sets.elemental_set import load_set, with_measured_geometry
     from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, load_session
+    from faintfield.pipelines.reconstruction.channels import keeping_frames
     from faintfield.rig.session.session import has_session
 
     if has_session(folder):
         loaded = load_session(folder, scene, geometry)
-        return loaded, out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
-    if out is None:
+        out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
+    elif out is None:
         raise WrongUsage("no folder for the results is named; give --out")
-    loaded = load_set(folder)
-    return loaded if geometry is None else with_measured_geometry(loaded, geometry), out
+    else:
+        loaded = load_set(folder)
+        loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
+    return keeping_frames(loaded, out), out

@@ -78,7 +78,7 @@ def decode_tiff(file: BufferedReader, path: Path, accept: Accept, number: int | 
             if number is None:
                 _require_one_page(tiff, path)
             _require_honest_strips(page, file)
-            return np.asarray(page.asarray())
+            return np.asarray(page.asarray(maxworkers=1))  # several frames are decoded at a time
     file.seek(0)
     if number is None:
         return decode_with_opencv(read_all(file, page.nbytes + OVERHEAD_BYTES))

@@ -18,15 +18,10 @@ type Picture = NDArray[np.uint8]
 _FILM_QUALITY = 80
 
 
-def write_frame(path: Path, pixels: NDArray[Any], *, few_values: bool = False) -> None:
-    """Write a frame (row, column[, colour]) as TIFF of its own data type, losslessly compressed.
-
-    Frames of few different values, such as those that had 8 bits, compress best as they are, and fast.
-    """
-    how: dict[str, Any] = {"compressionargs": {"level": 1}} if few_values else {"predictor": True}
+def write_frame(path: Path, pixels: NDArray[Any]) -> None:
+    """Write a frame (row, column[, colour]) as TIFF of its own data type, uncompressed: decision 029."""
     with writing(path) as file:
-        photometric = "rgb" if pixels.ndim == 3 else "minisblack"
-        tifffile.imwrite(file, pixels, compression="zlib", photometric=photometric, **how)
+        tifffile.imwrite(file, pixels, photometric="rgb" if pixels.ndim == 3 else "minisblack")
 
 
 @dataclass(frozen=True)

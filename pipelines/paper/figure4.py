@@ -157,7 +157,7 @@ def stage_object(shown: TexturedPlane, size_px: tuple[int, int]) -> StagedObject
     window = _window(region)
     operator = PlaneOperator(
         plane_from_ray(poses, fronto_parallel_rt_ref_plane(shown.depth_mm)),
-        lens.rays().astype(np.float32),
+        lens.rays(),
         _grid(experiment, window),
         flat=optics.relative_illumination(),
     )

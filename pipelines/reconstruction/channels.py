@@ -1,8 +1,12 @@
 """The images of an elemental set in electrons, one stack per colour: what the solvers take."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shutil import disk_usage
+from tempfile import TemporaryFile
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -10,13 +14,17 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth
-from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period, read_frame
-from faintfield.pipelines.formats.large_arrays import Allocate
+from faintfield.pipelines.formats.frames import RAW_SUFFIXES, Frame, Lattice, mosaic_period, read_frame
+from faintfield.pipelines.formats.large_arrays import Allocate, mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.threads import map_in_threads
 
 _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
+
+# Share of the free disk that decoded frames may take; the rest is for results, and for electrons if memory is short.
+_SHARE_OF_DISK = 0.25
 
 # Maps of the noise model, a value per pixel or one for all.
 _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
@@ -48,7 +56,7 @@ class ChannelLayout:
 def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
     """Return the colours of a set, as its first frame has them."""
     width, height = loaded.settings.camera.size_px
-    frame = read_frame(loaded.image_paths[0], (width, height))
+    frame = loaded.read_frame(loaded.image_paths[0], (width, height))
     mosaic = loaded.settings.camera.mosaic or frame.mosaic
     everything = Lattice((0, 0), (1, 1), (height, width))
     if frame.pixels_dn.ndim == 3:
@@ -65,8 +73,40 @@ def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
     return layouts
 
 
+def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
+    """Return a set that decodes each frame once: what took decoding is kept in files in a folder.
+
+    The files have no name, so they disappear with the set, however the process ends. They take at most a quarter of
+    the free disk; frames beyond that are decoded each time.
+    """
+    # A set is read once per colour, and again by searches and priors. Pixels are kept rather than electrons, as they
+    # take half the room and serve all of these, and in files, as memory is for the solvers
+    if loaded.read_frame is not read_frame:
+        return loaded
+    kept: dict[Path, Frame] = {}
+
+    def read(path: Path, size_px: tuple[int, int]) -> Frame:
+        if path in kept:
+            return kept[path]
+        frame = read_frame(path, size_px)
+        pixels = frame.pixels_dn
+        if path.suffix.lower() not in RAW_SUFFIXES and path.stat().st_size >= pixels.nbytes:
+            return frame  # uncompressed: it is read as fast from its own file
+        kept_bytes = sum(one.pixels_dn.nbytes for one in list(kept.values()))
+        with suppress(OSError):  # without room it is decoded again
+            folder.mkdir(parents=True, exist_ok=True)
+            if kept_bytes + pixels.nbytes <= _SHARE_OF_DISK * (kept_bytes + disk_usage(folder).free):
+                with TemporaryFile(dir=folder) as file:
+                    stored = mapped(file, pixels.shape, pixels.dtype)
+                stored[:] = pixels
+                kept[path] = replace(frame, pixels_dn=stored)
+        return frame
+
+    return replace(loaded, read_frame=read)
+
+
 def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
-    """Read one colour of all views in electrons, one frame at a time, directly into the stack.
+    """Read one colour of all views in electrons, each frame by one thread, directly into the stack.
 
     Parameters
     ----------
@@ -87,15 +127,22 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
     shape = layout.lattices[0].shape
     electrons = allocate((views * phases, *shape), np.float32)
     valid: NDArray[np.bool_] | None = None
-    for view in range(views):
-        for phase, (sum_e, over) in enumerate(view_electrons(loaded, layout, loaded.frame_paths(view))):
-            electrons[view * phases + phase] = sum_e
-            if over.any():
+    allocating = Lock()
+    noise_of = _noise_by_frame(loaded, layout)
+
+    def load(view: int) -> None:
+        nonlocal valid
+        part = slice(view * phases, (view + 1) * phases)
+        over = _add_up(loaded, layout, noise_of, loaded.frame_paths(view), electrons[part])
+        if over.any():
+            with allocating:
                 if valid is None:
                     valid = allocate(electrons.shape, np.bool_)
                     valid.fill(True)
-                valid[view * phases + phase] = ~over
-    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
+            np.logical_not(over, out=valid[part])
+
+    map_in_threads(load, range(views))
+    noises = [noise_of(phase, None) for phase in range(phases)]
     return ElementalImages(
         electrons,
         background_e=_stacked([loaded.background_e(noise) for noise in noises], shape),
@@ -112,25 +159,36 @@ def view_electrons(
     The sum has all the information that the single frames have, except for the shape of the read noise: the sum of
     Poisson counts is a Poisson count, and variances add.
     """
-    sums: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
-    for path in paths:
+    sums = np.zeros((len(layout.lattices), *layout.lattices[0].shape), np.float32)
+    over = _add_up(loaded, layout, _noise_by_frame(loaded, layout), paths, sums)
+    return list(zip(sums, over, strict=True))
+
+
+def _add_up(
+    loaded: ElementalSet,
+    layout: ChannelLayout,
+    noise_of: Callable[[int, Frame | None], NoiseModel],
+    paths: Sequence[Path],
+    sums: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Write the electrons of all frames of a view to `sums` (lattice, row, column); return where any is saturated."""
+    over = np.zeros(sums.shape, bool)
+    for number, path in enumerate(paths):
         frame = checked_frame(loaded, path, layout)
         pixels = layout.of(frame.pixels_dn)
         for index, lattice in enumerate(layout.lattices):
-            noise = lattice_noise(loaded, lattice, frame)
-            pixels_dn = lattice.of(pixels)
-            electrons, over = noise.electrons(pixels_dn), noise.saturated(pixels_dn)
-            if path is paths[0]:
-                sums.append((electrons, over))
+            noise, pixels_dn = noise_of(index, frame), lattice.of(pixels)
+            if number == 0:
+                noise.electrons(pixels_dn, sums[index])
             else:
-                before_e, before_over = sums[index]
-                sums[index] = (before_e + electrons, before_over | over)
-    return sums
+                sums[index] += noise.electrons(pixels_dn)
+            over[index] |= noise.saturated(pixels_dn)
+    return over
 
 
 def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
     """Read a frame, and check that it fits the camera and the noise model of the set."""
-    frame = read_frame(path, loaded.settings.camera.size_px)
+    frame = loaded.read_frame(path, loaded.settings.camera.size_px)
     found = frame.pixels_dn
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
@@ -158,15 +216,34 @@ def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
     if loaded.noise.response is not None:
         maps["response"] = loaded.noise.response.part(lattice.of)
-    noise = replace(loaded.noise, **maps)
-    if frame is None:
-        return noise
+    return replace(loaded.noise, **maps | ({} if frame is None else _of_file(loaded, lattice, frame)))
+
+
+def _of_file(loaded: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, Any]:
+    """Return what a frame's own file says of the noise of a lattice and the set does not, by name."""
+    own: dict[str, Any] = {}
     if loaded.offset_from_files and frame.black_dn is not None:
         black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
-        noise = replace(noise, offset_dn=float(black_dn))
-    if not np.isfinite(noise.saturation_dn) and frame.saturation_dn is not None:
-        noise = replace(noise, saturation_dn=frame.saturation_dn)
-    return noise
+        own["offset_dn"] = float(black_dn)
+    if not np.isfinite(loaded.noise.saturation_dn) and frame.saturation_dn is not None:
+        own["saturation_dn"] = frame.saturation_dn
+    return own
+
+
+def _noise_by_frame(loaded: ElementalSet, layout: ChannelLayout) -> Callable[[int, Frame | None], NoiseModel]:
+    """Return a function that gives the noise model of a lattice, by its index, in a frame."""
+    # Checking the maps of a model takes longer than converting a frame by it, so frames that say the same share one
+    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
+    known: dict[tuple[int, tuple[tuple[str, float], ...]], NoiseModel] = {}
+
+    def noise_of(index: int, frame: Frame | None) -> NoiseModel:
+        own = {} if frame is None else _of_file(loaded, layout.lattices[index], frame)
+        key = (index, tuple(own.items()))
+        if key not in known:
+            known[key] = replace(noises[index], **own)
+        return known[key]
+
+    return noise_of
 
 
 def _stacked(parts: list[Any], shape: tuple[int, int]) -> Any:

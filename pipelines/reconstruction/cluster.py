@@ -16,6 +16,7 @@ from numpy.typing import DTypeLike, NDArray
 from faintfield.calib.noise_model import NoiseModel
 from faintfield.pipelines.errors import ClusterFailed, MissingPackage, WrongUsage
 from faintfield.pipelines.formats.files import UNFINISHED, translated_write_errors
+from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
@@ -166,7 +167,8 @@ class _Colour:
 
 def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
     """Read a colour into files that all workers map: its electrons, its valid pixels, and the maps of the detector."""
-    without_maps = replace(loaded, noise=NoiseModel(0.0, 1.0, 0.0), flat=None, unusable=np.zeros((0, 0), bool))
+    plain = replace(loaded, noise=NoiseModel(0.0, 1.0, 0.0), flat=None, unusable=np.zeros((0, 0), bool))
+    without_maps = replace(plain, read_frame=read_frame)
     shape = (len(loaded.settings.view) * len(layout.lattices), *layout.lattices[0].shape)
     colour = _Colour(shared / layout.name, shape, without_maps, layout)
 

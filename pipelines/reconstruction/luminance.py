@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.homography import ray_from_surface
-from faintfield.pipelines.console import progress
+from faintfield.pipelines.console import working
 from faintfield.pipelines.formats.frames import Lattice
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, lattice_noise, view_electrons
 from faintfield.pipelines.reconstruction.operators import plane_grid, principal_shift, response_of
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
+from faintfield.recon.threads import map_in_threads
 
 # Most pixels of a view, and the fewest pixels along a side that are still added up in twos.
 _MAX_PIXELS, _MIN_SIDE_PX = 80_000, 120
@@ -31,7 +32,7 @@ def default_bins(loaded: ElementalSet) -> int:
 def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
 
-    Views are read one at a time.
+    Each view is read by one thread.
 
     Raises
     ------
@@ -48,7 +49,8 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     shape = (height // bins, width // bins)
     light = np.empty((views, *shape), np.float32)
     undistorted = _undistorted_places(loaded, bins, shape)
-    for view in progress(range(views), "reading views"):
+
+    def read(view: int) -> None:
         total = np.zeros(shape, np.float32)
         for response, background, (lattice, sum_e, over) in zip(
             responses, backgrounds, _electrons(loaded, layouts, view), strict=True
@@ -57,6 +59,9 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
             light_e = _summed(sum_e - np.asarray(background, np.float32), lattice, bins)
             total += np.where(usable, light_e / np.where(response > 0, response, 1), UNKNOWN)
         light[view] = _resampled(total, undistorted)
+
+    with working("reading views"):
+        map_in_threads(read, range(views))
     camera = loaded.settings.camera
     return PinholeViews(
         light,

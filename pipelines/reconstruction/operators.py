@@ -122,9 +122,9 @@ class OperatorFactory:
         self._images = images
         self._phases = len(layout.lattices)
         lattices = layout.lattices
-        rays = np.stack(
-            [loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]].astype(np.float32) for at in lattices]
-        )
+        rays = np.empty((len(lattices), *lattices[0].shape, 2), np.float32)
+        for part, at in zip(rays, lattices, strict=True):  # one at a time: they are as large as two images each
+            part[:] = loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]]
         self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
         response = np.stack([response_of(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too

@@ -18,6 +18,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import in_units
 from faintfield.pipelines.reconstruction.channels import channel_layouts, lattice_noise, view_electrons
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments, snr_from_powers
+from faintfield.recon.threads import map_in_threads
 
 # Mask of the objects in the reference view, beside a set's images if it is known.
 OBJECT_REGION = "object_region.png"
@@ -160,14 +161,16 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
         A file cannot be used, or the light of the set is beyond all bounds.
     """
     size_px = loaded.settings.camera.size_px
-    reference = read_frame(loaded.image_paths[loaded.reference_view], size_px).pixels_dn
+    reference = loaded.read_frame(loaded.image_paths[loaded.reference_view], size_px).pixels_dn
     black, white = grey_scale_dn(reference)
     grid = _grid(loaded)
     columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
-    small = [
-        grey_levels(_every_nth(_pixels_like(reference, path), small_px), white, black) for path in loaded.image_paths
-    ]
+
+    def shrunk_view(path: Path) -> Picture:
+        return grey_levels(_every_nth(_pixels_like(loaded, reference, path), small_px), white, black)
+
+    small = map_in_threads(shrunk_view, loaded.image_paths)
     pictures = {
         INTEGRAL_IMAGE: contact_sheet(small, columns),
         REFERENCE_VIEW: grey_levels(reference, white, black),
@@ -204,10 +207,10 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
     return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
 
 
-def _pixels_like(reference: NDArray[Any], path: Path) -> NDArray[Any]:
+def _pixels_like(loaded: ElementalSet, reference: NDArray[Any], path: Path) -> NDArray[Any]:
     """Return the pixels of a view, which must have the shape of the reference view's."""
     height, width = reference.shape[:2]
-    pixels = read_frame(path, (width, height)).pixels_dn
+    pixels = loaded.read_frame(path, (width, height)).pixels_dn
     if pixels.shape != reference.shape:
         kind = "colour" if pixels.ndim == 3 else "grey"
         raise UnreadableImage(

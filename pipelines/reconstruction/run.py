@@ -34,7 +34,7 @@ from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess
-from faintfield.pipelines.reconstruction.channels import channel_layouts
+from faintfield.pipelines.reconstruction.channels import channel_layouts, keeping_frames
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth_map import check_light, check_sweep, kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
@@ -76,6 +76,7 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
     depths, methods = distinct_depths(request.depths_mm, loaded), list(dict.fromkeys(request.methods))
     found = in_units(loaded, request.found) if request.found else None
     request = replace(request, depths_mm=depths, methods=methods)
+    loaded = keeping_frames(loaded, out)
     _refuse_pitch(loaded, request)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     if request.with_depth_map:
@@ -163,7 +164,7 @@ def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) 
     }
     for plane in request.tilted:
         grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
-    inputs = dict(loaded.input_hashes())
+    inputs = loaded.input_hashes()
     units = loaded.units
     all_planes = {
         name: provenance("reconstruct", in_units(loaded, request.options(name, loaded.poses)), inputs, units)

@@ -28,7 +28,7 @@ from faintfield.pipelines.formats.results.surface import (
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.autofocus import imported_range_px
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, keeping_frames, load_channel
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
@@ -90,9 +90,10 @@ def reconstruct_surface(
     """
     started = time.monotonic()
     _check(loaded, out)
+    loaded = keeping_frames(loaded, out)
     unit = unit_of_maps(loaded.units, as_px=request.unit == "px")
     options = in_units(loaded, request.options(loaded.poses))
-    origin = provenance("reconstruct", options, dict(loaded.input_hashes()), loaded.units)
+    origin = provenance("reconstruct", options, loaded.input_hashes(), loaded.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface

@@ -58,7 +58,7 @@ def darken_set(bright: ElementalSet, out: Path, options: DarkeningOptions, *, ov
     with writing_folder(out, replace_if=FILE_NAME if overwrite else None, reads=[bright.folder]) as folder:
         _write_dark_views(bright, layouts, folder, options, scale_e)
         write_png(folder / OBJECT_REGION, mask_picture(region))
-        origin = provenance("darken", options, dict(bright.input_hashes()))
+        origin = provenance("darken", options, bright.input_hashes())
         record = origin.parts() | {"scale_e": scale_e, "photons_on_object": photons}
         write_json(folder / "provenance.json", record)
     known = {"quantum_efficiency": options.quantum_efficiency, "read_noise_e": options.read_noise_e}

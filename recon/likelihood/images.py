@@ -128,6 +128,8 @@ class ElementalImages:
 
 def binned(maps: NDArray[Any], bins: int) -> NDArray[Any]:
     """Return the means of bins of maps (…, row, column); a remainder at the far edges is dropped."""
+    if bins == 1:
+        return maps
     rows, columns = (size // bins for size in maps.shape[-2:])
     whole = maps[..., : rows * bins, : columns * bins]
     return np.asarray(whole.reshape(*maps.shape[:-2], rows, bins, columns, bins).mean(axis=(-3, -1)))

@@ -54,6 +54,23 @@ def test_pixels_at_or_above_the_saturation_level_are_saturated() -> None:
     assert not NoiseModel(**GOOD).saturated(np.array([[65535]], np.uint16)).any()
 
 
+@pytest.mark.parametrize("saturation_dn", [999.5, 1000.0, 1000.5, 70_000.0, np.inf])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.int32, np.float64])
+def test_levels_between_whole_numbers_saturate_the_next(saturation_dn: float, dtype: type[Any]) -> None:
+    frame_dn = np.array([[0, 3, 255], [999, 1000, 1001]]).astype(dtype)
+    expected = frame_dn.astype(float) >= saturation_dn
+    np.testing.assert_array_equal(NoiseModel(**GOOD, saturation_dn=saturation_dn).saturated(frame_dn), expected)
+
+
+def test_electrons_are_written_where_they_are_wanted() -> None:
+    """Also of a part of an array, and of more rows than are converted at a time."""
+    model, frame_dn = NoiseModel(**GOOD), np.arange(201 * 6).reshape(201, 6).astype(np.uint16)
+    stack = np.full((3, 201, 3), np.nan, np.float32)
+    assert model.electrons(frame_dn[:, ::2], stack[1]) is not None
+    np.testing.assert_array_equal(stack[1], (frame_dn[:, ::2].astype(np.float32) - 100) / 2)
+    assert np.isnan(stack[[0, 2]]).all()
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines.errors import MissingFile, UnreadableImage
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.formats.image_files import encoded, write_frame
 
 type Writer = Callable[[Path, NDArray[np.generic]], object]
 
@@ -59,6 +59,16 @@ def test_lossless_files_keep_every_pixel_and_its_type(
     assert frame.pixels_dn.dtype == dtype
     np.testing.assert_array_equal(frame.pixels_dn, pixels)
     assert [frame.mosaic, frame.black_dn, frame.saturation_dn, frame.exposure_s] == [None] * 4
+
+
+@pytest.mark.parametrize("shape", [(40, 50), (40, 50, 3)], ids=["grey", "RGB"])
+def test_frames_are_written_uncompressed_in_one_piece(shape: tuple[int, ...], tmp_path: Path) -> None:
+    pixels = _pixels(np.uint16, *shape)
+    write_frame(tmp_path / "frame.tiff", pixels)
+    content = (tmp_path / "frame.tiff").read_bytes()
+    assert pixels.tobytes() in content
+    assert len(content) < pixels.nbytes + 1000
+    np.testing.assert_array_equal(read_frame(tmp_path / "frame.tiff").pixels_dn, pixels)
 
 
 def test_a_photograph_is_read_in_the_order_red_green_blue(tmp_path: Path) -> None:

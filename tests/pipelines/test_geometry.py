@@ -124,7 +124,7 @@ def test_measured_poses_replace_the_sets_own(measured: tuple[Path, GeometrySumma
     loaded = with_measured_geometry(load_set(scene), measured[0])
     assert loaded.settings.view[0].rt_cam_ref == read_geometry(measured[0], GeometryRecord).nodes[0].rt_cam_ref
     assert loaded.lens.fx_px == read_geometry(measured[0], GeometryRecord).lens.fx_px
-    assert "geometry.json" in dict(loaded.input_hashes())
+    assert "geometry.json" in loaded.input_hashes()
 
 
 def test_a_geometry_written_by_hand_needs_lens_and_poses_only(scene: Path, tmp_path: Path) -> None:

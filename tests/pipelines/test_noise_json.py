@@ -124,7 +124,7 @@ class TestNoiseJson:
 
     def test_it_and_its_maps_count_among_the_inputs(self, folder: Path) -> None:
         np.savez(folder / "noise_maps.npz", offset_dn=np.zeros((12, 16)))
-        hashes = dict(load_set(folder).input_hashes())
+        hashes = load_set(folder).input_hashes()
         assert set(hashes) == {"elemental.toml", "noise.json", "noise_maps.npz", "view_0.tiff", "view_1.tiff"}
         for name, found in hashes.items():
             assert found == hashlib.sha256((folder / name).read_bytes()).hexdigest()

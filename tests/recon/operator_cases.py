@@ -24,7 +24,7 @@ FACING_AT_500_MM = fronto_parallel_rt_ref_plane(500.0)
 class Case:
     """A camera at several poses before a plane."""
 
-    rays: NDArray[np.float64]  # (lattice, row, column, 2)
+    rays: NDArray[np.floating]  # (lattice, row, column, 2)
     rt_cam_ref: NDArray[np.float64]
     rt_ref_plane: NDArray[np.float64]
     grid: PlaneGrid
@@ -81,7 +81,7 @@ def cases(draw: st.DrawFn, max_rows: int = 19, max_columns: int = 71) -> Case:
     )
 
 
-def mosaic_rays(lens: Lens) -> NDArray[np.float64]:
+def mosaic_rays(lens: Lens) -> NDArray[np.float32]:
     """The rays (lattice, row, column, 2) of the four phases of a mosaic, cut to a common size."""
     rows, columns = lens.size_px[1] // 2, lens.size_px[0] // 2
     return np.stack([lens.rays(first, (2, 2))[:rows, :columns] for first in MOSAIC_PHASES])

@@ -149,12 +149,13 @@ def test_opencv_images_the_point_that_a_pixel_sees_onto_that_pixel(distortion: t
     poses = np.array([[0.0, 0, 0, 0, 0, 0], [0.05, -0.1, 0.3, 20, -15, 10], [-0.2, 0.15, -0.1, -50, 30, -25]])
     rt_ref_plane = np.array([0.3, -0.2, 0.1, 5.0, -8.0, 400.0])
     grid = PlaneGrid((101, 141), 6.0, (-420.0, -300.0))
-    operator = PlaneOperator(plane_from_ray(poses, rt_ref_plane), lens.rays(), grid, dtype=np.float64)
+    u, v = np.meshgrid(np.arange(45), np.arange(33))
+    rays = lens.rays_at(np.column_stack([u.ravel(), v.ravel()])).reshape(33, 45, 2)
+    operator = PlaneOperator(plane_from_ray(poses, rt_ref_plane), rays, grid, dtype=np.float64)
     # Bilinear interpolation reproduces linear functions, so H of the coordinates is where each pixel looks
     column, row = np.meshgrid(np.arange(141.0), np.arange(101.0))
     x_mm, y_mm = operator.forward(grid.origin_mm[0] + 6.0 * column), operator.forward(grid.origin_mm[1] + 6.0 * row)
     sees = operator.forward(np.ones(grid.shape)) > 0.5
-    v, u = np.indices(sees.shape[1:])
     r_ref_plane = Rotation.from_rotvec(rt_ref_plane[:3]).as_matrix()
     for view, rt in enumerate(poses):
         on_plane = np.stack([x_mm[view], y_mm[view], 0 * x_mm[view]], axis=-1)[sees[view]]

@@ -294,7 +294,7 @@ def _copy(path: Path, folder: Path, first: Frame, tone: Tone) -> str:
         shutil.copyfile(path, folder / name)
     else:
         light = without_curve(pixels, first.saturation_dn) if tone == "srgb" else pixels.astype(np.uint16)
-        write_frame(folder / name, light, few_values=pixels.dtype == np.uint8)
+        write_frame(folder / name, light)
     return name
 
 

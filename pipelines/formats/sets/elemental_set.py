@@ -1,8 +1,8 @@
 """The elemental set: checked images and poses, whatever files they come from."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import msgspec
@@ -15,7 +15,7 @@ from faintfield.calib.noise_model import Map, NoiseModel
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256
-from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.frames import Frame, read_frame
 from faintfield.pipelines.formats.reading import is_file, is_folder
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, Pose, read_geometry
 from faintfield.pipelines.formats.results.noise import NOISE_MAPS, FittedNoise, read_fitted_noise
@@ -28,6 +28,7 @@ from faintfield.pipelines.formats.sets.elemental_file import (
     read_set_file,
 )
 from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.recon.threads import map_in_threads
 
 # Exposure without light, beside a set's images if there is one.
 NOISE_REFERENCE = "noise_reference.tiff"
@@ -66,6 +67,8 @@ class ElementalSet:
         Exposures without light, if there are any.
     bright_view : (Path, float), optional
         The reference view in plenty of light and its exposure in s, if there is one.
+    read_frame : callable
+        Reads a frame, given its path and its size in px; see `reconstruction.channels.keeping_frames`.
     """
 
     folder: Path
@@ -80,6 +83,7 @@ class ElementalSet:
     described_in: str = FILE_NAME
     noise_reference: tuple[Path, ...] = ()
     bright_view: tuple[Path, float] | None = None
+    read_frame: Callable[[Path, tuple[int, int]], Frame] = field(default=read_frame, compare=False, repr=False)
 
     @property
     def reference_view(self) -> int:
@@ -209,16 +213,16 @@ class ElementalSet:
         steps = (nodes - nodes[self.reference_view])[:, ::-1] / [1.0, ratio]
         return steps, centres - centres[self.reference_view]
 
-    def input_hashes(self) -> Iterator[tuple[str, str]]:
-        """Yield name and SHA-256 of every file that a reconstruction reads."""
-        for name in [self.described_in, *named_files(self.settings)]:
-            yield name, sha256(self.folder / name)
+    def input_hashes(self) -> dict[str, str]:
+        """Return the SHA-256 of every file that a reconstruction reads, by name."""
+        files = {name: self.folder / name for name in (self.described_in, *named_files(self.settings))}
         if isinstance(self.settings.noise, str):
             maps = (self.folder / self.settings.noise).with_name(NOISE_MAPS)
             if is_file(maps):
-                yield str(maps.relative_to(self.folder)), sha256(maps)
+                files[str(maps.relative_to(self.folder))] = maps
         if self.measured_in is not None:
-            yield self.measured_in.name, sha256(self.measured_in)
+            files[self.measured_in.name] = self.measured_in
+        return dict(zip(files, map_in_threads(sha256, list(files.values())), strict=True))
 
 
 def load_set(folder: Path) -> ElementalSet:

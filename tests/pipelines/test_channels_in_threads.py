@@ -1,0 +1,267 @@
+"""Channels read by several threads: what one thread reads, in bounded memory, and over when a frame fails."""
+
+import os
+import threading
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.calib.noise_model import BentResponse, NoiseModel
+from faintfield.pipelines.errors import UnreadableImage
+from faintfield.pipelines.formats import frames
+from faintfield.pipelines.formats.decoders import decode_tiff
+from faintfield.pipelines.formats.files import sha256
+from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, load_set
+from faintfield.pipelines.reconstruction import channels
+from faintfield.pipelines.reconstruction.channels import channel_layouts, keeping_frames, load_channel
+from tests.patience import HANG_S
+
+type SetMaker = Callable[..., Path]
+type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+
+BAYER = ["RG", "GB"]
+
+
+def _threads(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", count)
+
+
+def _pictures(views: int, shape: tuple[int, int] = (150, 34)) -> list[NDArray[np.uint16]]:
+    return list(np.random.default_rng(20110919).integers(80, 1100, (views, *shape)).astype(np.uint16))
+
+
+def _with_maps(loaded: ElementalSet) -> ElementalSet:
+    """The set with a map for each number of the sensor, and a response that bends."""
+    rng, shape = np.random.default_rng(7), loaded.settings.camera.size_px[::-1]
+    noise = NoiseModel(
+        offset_dn=rng.normal(100, 5, shape),
+        gain_dn_per_e=rng.uniform(1.9, 2.1, shape),
+        read_noise_e=rng.uniform(2, 4, shape),
+        saturation_dn=999.5,
+        response=BentResponse((rng.uniform(1e-5, 2e-5, shape), -1e-9), rng.uniform(500, 600, shape)),
+    )
+    return replace(loaded, noise=noise)
+
+
+def _plain(loaded: ElementalSet, phase: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """One phase of the mosaic of all views by whole arrays, one frame after the other."""
+    noise, electrons, valid = loaded.noise, [], []
+    assert noise.response is not None
+
+    def of(pixels: Any) -> Any:
+        return pixels[phase[0] :: 2, phase[1] :: 2]
+
+    for view in range(len(loaded.settings.view)):
+        parts, over = [], []
+        for path in loaded.frame_paths(view):
+            pixels = of(tifffile.imread(path))
+            signal = (pixels.astype(np.float32) - of(noise.offset_dn).astype(np.float32)).astype(float)
+            within = np.clip(signal, 0, of(noise.response.up_to_dn))
+            first, second = of(noise.response.bends_per_dn[0]), noise.response.bends_per_dn[1]
+            slope = 1 + 2 * first * within + 3 * second * within**2
+            charge = within * (1 + first * within + second * within**2) + (signal - within) * slope
+            parts.append(charge.astype(np.float32) / of(noise.gain_dn_per_e).astype(np.float32))
+            over.append(pixels >= 999.5)
+        electrons.append(sum(parts[1:], start=parts[0]))
+        valid.append(~np.any(over, axis=0))
+    return np.stack(electrons), np.stack(valid)
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_a_colour_is_that_of_plain_arithmetic(
+    threads: int, make_set: SetMaker, edit: Edit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two frames a view, a map of everything, and more rows than are converted at a time."""
+    _threads(threads, monkeypatch)
+    folder = make_set(_pictures(6), camera={"mosaic": BAYER})
+
+    def add_up_in_twos(settings: dict[str, Any]) -> None:
+        names = [view["image"] for view in settings["view"]]
+        settings["view"] = [
+            view | {"repeats": [second]} for view, second in zip(settings["view"][:3], names[3:], strict=True)
+        ]
+
+    edit(folder, add_up_in_twos)
+    loaded = _with_maps(load_set(folder))
+    green = next(layout for layout in channel_layouts(loaded) if layout.name == "green")
+    images = load_channel(loaded, green)
+    assert images.valid is not None
+    for index, phase in enumerate([(0, 1), (1, 0)]):
+        electrons, valid = _plain(loaded, phase)
+        np.testing.assert_allclose(images.electrons[index::2], electrons, rtol=3e-7, atol=1e-5)
+        np.testing.assert_array_equal(images.valid[index::2], valid)
+    assert not images.valid.all()
+
+
+class _Counted:
+    """Reads frames, counts those that are begun and at work, and does something with each by its number."""
+
+    def __init__(self, meanwhile: Callable[[int], object] = lambda _: None) -> None:
+        self.begun, self.at_work, self.most = 0, 0, 0
+        self._lock, self._meanwhile = threading.Lock(), meanwhile
+
+    def __call__(self, path: Path, size_px: tuple[int, int]) -> Frame:
+        with self._lock:
+            self.begun += 1
+            self.at_work += 1
+            self.most = max(self.most, self.at_work)
+        try:
+            self._meanwhile(int(path.stem.removeprefix("view_")))
+            return read_frame(path, size_px)
+        finally:
+            with self._lock:
+                self.at_work -= 1
+
+
+def _grey(make_set: SetMaker, views: int) -> tuple[ElementalSet, Any]:
+    loaded = load_set(make_set(_pictures(views)))
+    (layout,) = channel_layouts(loaded)
+    return loaded, layout
+
+
+def test_as_many_frames_are_at_work_as_there_are_threads(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    _threads(3, monkeypatch)
+    loaded, layout = _grey(make_set, 12)
+    together = threading.Barrier(3)
+    counted = _Counted(lambda _: together.wait(HANG_S))
+    images = load_channel(replace(loaded, read_frame=counted), layout)
+    assert (counted.begun, counted.most, counted.at_work) == (12, 3, 0)
+    np.testing.assert_array_equal(images.electrons, load_channel(loaded, layout).electrons)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_memory_is_that_of_the_frames_at_work(
+    threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _threads(threads, monkeypatch)
+    shape, views = (300, 400), 24
+    loaded = load_set(make_set(_pictures(views, shape)))
+    (layout,) = channel_layouts(loaded)
+    load_channel(loaded, layout)
+    tracemalloc.start()
+    try:
+        images = load_channel(loaded, layout)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    pixels = shape[0] * shape[1]
+    assert images.electrons.nbytes == 4 * views * pixels
+    # A frame of two bytes a pixel, where it is saturated, and strips of float64
+    assert peak - images.electrons.nbytes < threads * (5 * pixels + 300_000)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_first_damaged_frame_is_named_and_nothing_goes_on(
+    threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _threads(threads, monkeypatch)
+    loaded, layout = _grey(make_set, 40)
+    for view in (4, 5, 6):
+        os.truncate(loaded.image_paths[view], 3000)
+    later = threading.Event()
+
+    def fifth_fails_first(view: int) -> None:
+        if view == 4 and threads > 1:
+            assert later.wait(HANG_S)
+        if view in (5, 6):
+            later.set()
+
+    counted = _Counted(fifth_fails_first)
+    with pytest.raises(UnreadableImage, match=r"view_4\.tiff: cannot be decoded"):
+        load_channel(replace(loaded, read_frame=counted), layout)
+    assert counted.at_work == 0
+    assert counted.begun <= 4 + threads
+
+
+def test_an_interrupt_ends_all_threads(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    _threads(3, monkeypatch)
+    loaded, layout = _grey(make_set, 40)
+    together = threading.Barrier(3)
+
+    def interrupted(_: int) -> None:
+        together.wait(HANG_S)
+        if threading.current_thread() is threading.main_thread():
+            together.abort()  # nobody waits for the main thread any longer
+            raise KeyboardInterrupt
+
+    counted = _Counted(interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        load_channel(replace(loaded, read_frame=counted), layout)
+    assert counted.at_work == 0
+    assert counted.begun <= 6
+
+
+def _compressed(folder: Path) -> None:
+    for path in folder.glob("*.tiff"):
+        tifffile.imwrite(path, tifffile.imread(path), compression="zlib", predictor=True)
+
+
+def _decoded(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """The files that are decoded from now on."""
+    decoded = []
+
+    def counted(file: Any, path: Path, *arguments: Any) -> Any:
+        decoded.append(path)
+        return decode_tiff(file, path, *arguments)
+
+    monkeypatch.setattr(frames, "decode_tiff", counted)
+    return decoded
+
+
+@pytest.mark.parametrize(
+    ("free_bytes", "decoded_times"), [(10**9, 1), (0, 3)], ids=["with room", "without room on the disk"]
+)
+def test_compressed_frames_are_decoded_once_for_all_colours(
+    free_bytes: int, decoded_times: int, make_set: SetMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, out = make_set(_pictures(4), camera={"mosaic": BAYER}), tmp_path / "out"
+    _compressed(folder)
+    loaded = load_set(folder)
+    layouts = channel_layouts(loaded)
+    plain = [load_channel(loaded, layout).electrons for layout in layouts]
+    monkeypatch.setattr(channels, "disk_usage", lambda _: SimpleNamespace(free=free_bytes))
+    decoded = _decoded(monkeypatch)
+    keeping = keeping_frames(loaded, out)
+    for layout, electrons in zip(layouts, plain, strict=True):
+        np.testing.assert_array_equal(load_channel(keeping, layout).electrons, electrons)
+    assert sorted(decoded) == sorted(loaded.image_paths * decoded_times)
+    assert not list(out.iterdir())  # the files have no name
+    assert keeping_frames(keeping, out) is keeping
+
+
+def test_uncompressed_frames_take_no_room(make_set: SetMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    loaded = load_set(make_set(_pictures(4), camera={"mosaic": BAYER}))
+    decoded = _decoded(monkeypatch)
+    keeping = keeping_frames(loaded, tmp_path / "out")
+    for layout in channel_layouts(loaded):
+        load_channel(keeping, layout)
+    assert len(decoded) == 1 + 3 * 4
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_to_does_not_matter(make_set: SetMaker, tmp_path: Path) -> None:
+    folder = make_set(_pictures(2))
+    _compressed(folder)
+    loaded = load_set(folder)
+    (layout,) = channel_layouts(loaded)
+    (tmp_path / "file").write_text("no folder")
+    images = load_channel(keeping_frames(loaded, tmp_path / "file"), layout)
+    np.testing.assert_array_equal(images.electrons, load_channel(loaded, layout).electrons)
+
+
+def test_every_file_is_hashed_under_its_own_name(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    _threads(4, monkeypatch)
+    folder = make_set(_pictures(9))
+    hashes = load_set(folder).input_hashes()
+    assert list(hashes) == ["elemental.toml", *(f"view_{index}.tiff" for index in range(9))]
+    assert hashes == {name: sha256(folder / name) for name in hashes}
