@@ -242,7 +242,9 @@ def _population(
     ratio = ratio / factor
     grid = _grid(ratio, read_dn2, degrees, usable)
     pixel, member, count = _bins(ratio, usable, exact=freedom.size == 1)
-    scaled = (squares[usable] / factor[usable, None])[pixel]
+    chosen = np.flatnonzero(usable)[pixel]
+    chosen_factor = factor.ravel()[chosen]
+    scaled = squares.reshape(-1, freedom.size)[chosen] / chosen_factor[:, None]
     sums = [np.bincount(member, weights) for weights in scaled.T]
     log = _log_likelihood(np.stack(sums, axis=1) / count[:, None], grid, shot_dn2, freedom)
     peak = log.max(axis=1)
@@ -253,9 +255,7 @@ def _population(
     share = (1 - _TAIL) * share / share.sum() + _TAIL / grid.size
     for _ in range(_EM_STEPS):
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
-    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(
-        np.log(factor[usable][pixel]).sum()
-    )
+    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(np.log(chosen_factor).sum())
     return _Population(grid, share, total)
 
 
@@ -265,7 +265,9 @@ def _posterior(
     """Return mean and variance of each pixel's read noise, (row, column), from squares (row, column, series) over one."""
     grid = population.grid
     sigma = np.exp(0.5 * grid)
-    moments = population.share[:, None] * np.stack([np.ones_like(sigma), sigma, sigma**2], axis=1)
+    log_share = np.log(np.maximum(population.share, 1e-300))
+    middle = float(population.share @ sigma)  # about which little is lost in single precision
+    moments = np.power.outer(sigma - middle, np.arange(3)).astype(np.float32)
     finest = (0.5 * (grid[1] - grid[0])) ** 2 / 12  # of the mean squared: no finer than the grid tells
     mean, variance = np.empty(squares.shape[:2]), np.empty(squares.shape[:2])
 
@@ -273,12 +275,14 @@ def _posterior(
         flat = (squares[rows] / factor[rows, :, None]).reshape(-1, freedom.size)
         sums = np.empty((len(flat), 3))
         for start in range(0, len(flat), _CHUNK_PX):
-            likelihood = _log_likelihood(flat[start : start + _CHUNK_PX], grid, shot_dn2, freedom)
-            likelihood -= likelihood.max(axis=1, keepdims=True)
-            sums[start : start + _CHUNK_PX] = np.exp(likelihood, out=likelihood) @ moments
+            log = _log_likelihood(flat[start : start + _CHUNK_PX], grid, shot_dn2, freedom)
+            log += log_share
+            log -= log.max(axis=1, keepdims=True)
+            sums[start : start + _CHUNK_PX] = np.exp(log.astype(np.float32)) @ moments  # fast in single precision
         total, first, second = sums.T.reshape(3, *mean[rows].shape)
-        mean[rows] = first / total
-        variance[rows] = np.maximum(second / total - mean[rows] ** 2, finest * mean[rows] ** 2)
+        from_middle = first / total
+        mean[rows] = middle + from_middle
+        variance[rows] = np.maximum(second / total - from_middle**2, finest * mean[rows] ** 2)
 
     over_strips(work, mean.shape)
     return mean, variance

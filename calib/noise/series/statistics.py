@@ -141,7 +141,14 @@ class Series:
     @property
     def mean_dn(self) -> NDArray[np.float64]:
         """Mean over the frames (row, column), with level and profiles."""
-        return self.pattern_dn + self.row_dn[:, None] + self.column_dn[None, :] + self.levels_dn.mean()
+        mean, rows_dn = np.empty(self.pattern_dn.shape), self.row_dn + self.levels_dn.mean()
+
+        def work(rows: slice) -> None:
+            np.add(self.pattern_dn[rows], rows_dn[rows, None], out=mean[rows])
+            mean[rows] += self.column_dn
+
+        over_strips(work, mean.shape)
+        return mean
 
     def clipped_share(self, ceiling_dn: float) -> float:
         """Return the share of the regular pixels' values at the end of the range."""
@@ -318,7 +325,8 @@ def _subtract_medians(values: NDArray[Any]) -> None:
 
 def robust_sigma(values: NDArray[Any]) -> float:
     """Return the standard deviation of a normal distribution with the same median absolute deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    deviations = values - np.median(values)
+    return float(1.4826 * np.median(np.abs(deviations, out=deviations), overwrite_input=True))
 
 
 def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:
