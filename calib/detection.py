@@ -26,11 +26,14 @@ _MIN_CONTRAST_OVER_NOISE = 14.0
 # Range of the smoothing, σ in pixels.
 _MIN_SMOOTHING_PX, _MAX_SMOOTHING_PX = 0.6, 2.5
 
-# Pixels of the image in which markers are looked for, at least; a larger one is reduced by whole numbers.
-_MAX_SEARCHED_PX = 3_000_000
-
 # Smallest perimeter of a marker over the longer side of the image, as OpenCV has it.
 _MIN_PERIMETER = 0.03
+
+# Side in pixels down to which a large image may reduce the smallest marker: images wider than 4266 px are reduced.
+_MIN_MARKER_PX = 16.0
+
+# Fewest markers that tell where the rest of a board is.
+_MIN_TELLING = 4
 
 # Width of a bit of the smallest marker that a second look may find, in pixels.
 _MIN_BIT_PX = 3.0
@@ -83,7 +86,7 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
         Boards to detect, which share no marker.
     """
     light = np.asarray(image, np.float32)
-    step = max(int(np.sqrt(light.size / _MAX_SEARCHED_PX)), 1)
+    step = max(int(_MIN_PERIMETER * max(light.shape) / 4 / _MIN_MARKER_PX), 1)
     looks = [_look(light, boards, step)]
     if step > 1:
         looks += _second_looks(light, boards, looks[0])
@@ -120,7 +123,9 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     stretched = np.empty(light.shape, np.uint8)
     for first in range(0, len(light), _STRIP_ROWS):
         rows = slice(first, first + _STRIP_ROWS)
-        stretched[rows] = cv2.convertScaleAbs(np.clip(light[rows] - black, 0, None) * (255.0 / max(white - black, 1e-12)))
+        stretched[rows] = cv2.convertScaleAbs(
+            np.clip(light[rows] - black, 0, None) * (255.0 / max(white - black, 1e-12))
+        )
     return stretched
 
 
@@ -193,7 +198,7 @@ def _look(light: NDArray[np.float32], boards: Sequence[Board], step: int, window
         min_perimeter = _MIN_PERIMETER
         if window:
             bits = predefined_dictionary(dictionary).markerSize + 2
-            min_perimeter = 4 * bits * _MIN_BIT_PX / max(part.shape)
+            min_perimeter = min(4 * bits * _MIN_BIT_PX, _MIN_PERIMETER * max(light.shape)) / max(part.shape)
         corners, indices, others = _marker_detector(dictionary, ids, min_perimeter).detectMarkers(stretched)
         numbers = np.empty(0, int) if indices is None else np.ravel(indices)
         found[dictionary] = _Markers(corners, np.array(ids, np.int32)[numbers].reshape(-1, 1))
@@ -203,17 +208,21 @@ def _look(light: NDArray[np.float32], boards: Sequence[Board], step: int, window
 
 def _second_looks(light: NDArray[np.float32], boards: Sequence[Board], first: _Look) -> list[_Look]:
     """Look again at full size: at boards of which markers are missing, and for all others where anything may be one."""
+    whole = slice(0, light.shape[0]), slice(0, light.shape[1])
     looks, unseen, hulls = [], [], []
     for board in boards:
         markers = first.markers(board)
         if not markers.ids.size:
             unseen.append(board)
-            continue
-        outlines, hull = _places(first, markers, board)
-        hulls.append(hull)
-        inside = ((outlines >= _BORDER_PX) & (outlines <= np.array(light.shape[::-1]) - 1 - _BORDER_PX)).all(axis=(1, 2))
-        if markers.ids.size < inside.sum():
-            looks.append(_look(light, [board], 1, _window(hull, light.shape)))
+        elif markers.ids.size < min(_MIN_TELLING, board.marker_count):
+            looks.append(_look(light, [board], 1, whole))
+        else:
+            outlines, hull = _places(first, markers, board)
+            hulls.append(hull)
+            low, high = outlines.min(axis=(1, 2)), (outlines - light.shape[::-1]).max(axis=(1, 2)) + 1
+            inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
+            if markers.ids.size < inside.sum():
+                looks.append(_look(light, [board], 1, _window(hull, light.shape)))
     quads = [first.in_image(quad) for quad in first.unknown]
     odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
     if unseen and odd:

@@ -1,4 +1,4 @@
-"""Work on large arrays by strips of rows, in threads: each strip stays in the cache, and no copy of the whole is made."""
+"""Work on large arrays by strips of rows, in threads: a strip stays in the cache, and no copy of the whole is made."""
 
 import os
 from collections.abc import Callable

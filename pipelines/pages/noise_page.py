@@ -165,7 +165,9 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
         step = max(max(height, width) // _MAX_SHOWN_PX, 1)  # more pixels than the page has take seconds to draw
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
         shown = values[::step, ::step]
-        image = axes.imshow(shown, extent=extent, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
+        image = axes.imshow(
+            shown, extent=extent, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest"
+        )
         axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 

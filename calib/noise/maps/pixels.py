@@ -204,7 +204,10 @@ def pixel_levels(
     offset_dn = signal * of_offset - both * of_signal
     signal_dn = offset * of_signal - both * of_offset
     del both, of_offset, of_signal
-    for posterior, prior in ((offset_dn, values["offset_dn"] + pattern.offset_dn), (signal_dn, values.get("dark_signal_dn_per_s", 0.0))):
+    for posterior, prior in (
+        (offset_dn, values["offset_dn"] + pattern.offset_dn),
+        (signal_dn, values.get("dark_signal_dn_per_s", 0.0)),
+    ):
         posterior /= determinant
         posterior += prior
     signal /= determinant

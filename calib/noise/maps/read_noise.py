@@ -262,7 +262,7 @@ def _population(
 def _posterior(
     squares: Array, factor: Array, population: _Population, shot_dn2: Array, freedom: Array
 ) -> tuple[Array, Array]:
-    """Return mean and variance of each pixel's read noise, (row, column), from squares (row, column, series) over one."""
+    """Return mean and variance of each pixel's read noise, (row, column), from squares (row, column, series)."""
     grid = population.grid
     sigma = np.exp(0.5 * grid)
     log_share = np.log(np.maximum(population.share, 1e-300))

@@ -81,7 +81,9 @@ def _block_sums(values: NDArray[Any], used: NDArray[np.bool_], rows: int, column
         return np.asarray(np.add.reduceat(parts, begins, axis=0))
 
     blocks = np.zeros((rows, columns))
-    for block, part in zip(over_strips(lambda strip: np.unique(row[strip]), used.shape), over_strips(work, used.shape), strict=True):
+    for block, part in zip(
+        over_strips(lambda strip: np.unique(row[strip]), used.shape), over_strips(work, used.shape), strict=True
+    ):
         blocks[block] += part
     return blocks.ravel()
 
@@ -94,7 +96,11 @@ def _dispersion(series: Sequence[Series], noise_dn2: Iterable[Array | float], us
     if sum(one.frames > 1 for one in series) < 2:
         return 1.0
     ratios, freedoms = zip(
-        *(block_scatter(one, v, used, BLOCKS, BLOCKS) for one, v in zip(series, noise_dn2, strict=True) if one.frames > 1),
+        *(
+            block_scatter(one, v, used, BLOCKS, BLOCKS)
+            for one, v in zip(series, noise_dn2, strict=True)
+            if one.frames > 1
+        ),
         strict=True,
     )
     ratio, weight = np.array(ratios), np.array(freedoms) / 2

@@ -230,13 +230,12 @@ class SeriesSums:
         return level, rows, (columns - taken) / np.maximum(self._column_count, 1)
 
     def _count_top(self, frame_dn: NDArray[Any]) -> None:
-        """Count the regular values at the highest one so far, and one below it; the stated end counts as the highest."""
+        """Count the regular values at the highest so far, the stated end of the range at most, and one below it."""
         highest = frame_dn.max(where=self._regular, initial=frame_dn.min())
         top = max(self._top_dn, min(float(highest), self.saturation_dn))
-        at, below = (
-            np.count_nonzero(is_it(frame_dn)) - np.count_nonzero(is_it(frame_dn[self._suspect_at]))
-            for is_it in (lambda values: values >= top, lambda values: values == top - 1)
-        )
+        suspect_dn = frame_dn[self._suspect_at]
+        at = int(np.count_nonzero(frame_dn >= top) - np.count_nonzero(suspect_dn >= top))
+        below = int(np.count_nonzero(frame_dn == top - 1) - np.count_nonzero(suspect_dn == top - 1))
         if top == self._top_dn:
             at, below = at + self._at_top, below + self._below_top
         elif top == self._top_dn + 1:
