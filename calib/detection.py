@@ -17,11 +17,29 @@ from faintfield.calib.corner_fit import refine_corners
 _STRETCH_QUANTILES = (0.002, 0.998)
 _STRETCH_SAMPLES = 60_000
 
+# Rows that are stretched at once, so that they stay in the cache.
+_STRIP_ROWS = 64
+
 # Contrast over noise that the marker detector needs; images with less are smoothed until they have it.
 _MIN_CONTRAST_OVER_NOISE = 14.0
 
 # Range of the smoothing, σ in pixels.
 _MIN_SMOOTHING_PX, _MAX_SMOOTHING_PX = 0.6, 2.5
+
+# Smallest perimeter of a marker over the longer side of the image, as OpenCV has it.
+_MIN_PERIMETER = 0.03
+
+# Side in pixels down to which a large image may reduce the smallest marker: images wider than 4266 px are reduced.
+_MIN_MARKER_PX = 16.0
+
+# Fewest markers that tell where the rest of a board is.
+_MIN_TELLING = 4
+
+# Width of a bit of the smallest marker that a second look may find, in pixels.
+_MIN_BIT_PX = 3.0
+
+# Distance from the edges of the image within which OpenCV takes no marker.
+_BORDER_PX = 3
 
 # Largest distance in pixels of a marker from its place by the homography of the others; the lens moves it by less.
 _MAX_MARKER_ERROR_PX = 10.0
@@ -58,6 +76,8 @@ class BoardCorners:
 def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCorners]:
     """Return the corners of every board whose markers are seen.
 
+    In large images, markers are first looked for at a reduced size, then at full size where some are missing.
+
     Parameters
     ----------
     image : array (row, column)
@@ -66,12 +86,11 @@ def detect_boards(image: NDArray[Any], boards: Sequence[Board]) -> list[BoardCor
         Boards to detect, which share no marker.
     """
     light = np.asarray(image, np.float32)
-    stretched = stretch(light)
-    markers = {}
-    for dictionary in {board.dictionary for board in boards}:
-        ids = tuple(sorted({i for board in boards if board.dictionary == dictionary for i in board.marker_ids}))
-        markers[dictionary] = _markers(stretched, dictionary, ids)
-    found = (_detect_board(light, stretched, markers[board.dictionary], board) for board in boards)
+    step = max(int(_MIN_PERIMETER * max(light.shape) / 4 / _MIN_MARKER_PX), 1)
+    looks = [_look(light, boards, step)]
+    if step > 1:
+        looks += _second_looks(light, boards, looks[0])
+    found = (_detect_board(light, max(looks, key=lambda look: look.markers(board).ids.size), board) for board in boards)
     return [corners for corners in found if corners is not None]
 
 
@@ -93,8 +112,7 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return an image of any depth in the 8 bits that the marker detector needs, smoothed if it is noisy."""
     step = max(int(np.sqrt(light.size / _STRETCH_SAMPLES)), 1)
     black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
-    kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
-    noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(light, cv2.CV_32F, kernel)[::step, ::step]))) / 6
+    noise = _noise(light, step)
     sigma_px = _MIN_SMOOTHING_PX
     ratio = (white - black - 4 * noise) / max(noise, 1e-12)
     if ratio < _MIN_CONTRAST_OVER_NOISE:
@@ -102,61 +120,173 @@ def stretch(light: NDArray[np.float32]) -> NDArray[np.uint8]:
         sigma_px = _MIN_CONTRAST_OVER_NOISE / (max(ratio, 1e-3) * 2 * np.sqrt(np.pi))
     light = cv2.GaussianBlur(light, (0, 0), float(np.clip(sigma_px, _MIN_SMOOTHING_PX, _MAX_SMOOTHING_PX)))
     black, white = np.quantile(light[::step, ::step], _STRETCH_QUANTILES)
-    return np.asarray(cv2.convertScaleAbs(np.clip(light - black, 0, None) * (255.0 / max(white - black, 1e-12))))
+    stretched = np.empty(light.shape, np.uint8)
+    for first in range(0, len(light), _STRIP_ROWS):
+        rows = slice(first, first + _STRIP_ROWS)
+        stretched[rows] = cv2.convertScaleAbs(
+            np.clip(light[rows] - black, 0, None) * (255.0 / max(white - black, 1e-12))
+        )
+    return stretched
 
 
-def _detect_board(
-    light: NDArray[np.float32], stretched: NDArray[np.uint8], markers: "_Markers", board: Board
-) -> BoardCorners | None:
-    """Return the corners of one board; None if none of its markers is seen."""
-    marker_corners, marker_ids = markers.of(board)
-    if not marker_ids.size:
-        return None
-    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
-        detector = _detector(board, legacy)
-        found, ids, _, _ = detector.detectBoard(stretched, markerCorners=marker_corners, markerIds=marker_ids)
-        if found is not None and len(found):  # the wrong layout gives no corners
-            break
-    else:
-        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), len(marker_ids), legacy=False)
-    guesses, ids = np.reshape(found, (-1, 2)).astype(float), np.ravel(ids).astype(int)
-    squares_px = _squares_px(board.opencv_board(legacy=legacy), marker_corners, marker_ids, ids)
-    pixels, sigma_px = refine_corners(light, guesses, squares_px, (1 - board.marker_mm / board.square_mm) / 2)
-    kept = np.isfinite(sigma_px)
-    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], len(marker_ids), legacy)
+def _noise(light: NDArray[np.float32], step: int) -> float:
+    """Return the standard deviation of the noise, from second differences at every `step`-th row and column."""
+    kernel = np.array([[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32)
+    rough = [
+        cv2.filter2D(light[max(row - 1, 0) : row + 2], cv2.CV_32F, kernel)[min(row, 1), ::step]
+        for row in range(0, len(light), step)
+    ]
+    return 1.4826 * float(np.median(np.abs(rough))) / 6
 
 
 @dataclass(frozen=True)
 class _Markers:
-    """The markers of one dictionary in an image: their outlines, and their numbers (marker, 1)."""
+    """Markers in an image: their outlines, and their numbers (marker, 1)."""
 
     corners: Sequence[NDArray[np.float32]]
     ids: NDArray[np.int32]
 
-    def of(self, board: Board) -> tuple[list[NDArray[np.float32]], NDArray[np.int32]]:
+
+@dataclass(frozen=True)
+class _Look:
+    """A part of the image, perhaps reduced, and the markers in it.
+
+    Attributes
+    ----------
+    stretched : array (row, column)
+        The part in 8 bits.
+    step : int
+        Pixels of the image per pixel of the part.
+    origin : (int, int)
+        Column and row of the part's first pixel.
+    found : dict of str to _Markers
+        The markers in the part by dictionary.
+    unknown : list of array (4, 2)
+        Outlines in the part that look like markers but are none.
+    """
+
+    stretched: NDArray[np.uint8]
+    step: int
+    origin: tuple[int, int]
+    found: dict[str, _Markers]
+    unknown: list[NDArray[np.float32]]
+
+    def markers(self, board: Board) -> _Markers:
         """Return the markers of one board."""
-        own = [index for index, marker in enumerate(np.ravel(self.ids)) if int(marker) in board.marker_ids]
-        return [self.corners[index] for index in own], self.ids[own]
+        found = self.found.get(board.dictionary, _Markers([], np.empty((0, 1), np.int32)))
+        own = [index for index, marker in enumerate(np.ravel(found.ids)) if int(marker) in board.marker_ids]
+        return _Markers([found.corners[index] for index in own], found.ids[own])
+
+    def in_image(self, places: NDArray[Any]) -> NDArray[np.float64]:
+        """Return where places (…, 2) of the part are in the image."""
+        return np.asarray((places + 0.5) * self.step - 0.5 + np.array(self.origin))
 
 
-def _markers(stretched: NDArray[np.uint8], dictionary: str, wanted: tuple[int, ...]) -> _Markers:
-    """Return the wanted markers of a dictionary that are in the image."""
-    corners, found, _ = _marker_detector(dictionary, wanted).detectMarkers(stretched)
-    indices = np.empty(0, int) if found is None else np.ravel(found)
-    return _Markers(corners, np.array(wanted, np.int32)[indices].reshape(-1, 1))
+type _Window = tuple[slice, slice]
 
 
-def _squares_px(
-    printed: Any,
-    marker_corners: Sequence[NDArray[np.float32]],
-    marker_ids: NDArray[np.int32],
-    corners: NDArray[np.intp],
-) -> NDArray[np.float64]:
+def _look(light: NDArray[np.float32], boards: Sequence[Board], step: int, window: _Window | None = None) -> _Look:
+    """Look for the markers of boards in an image or in a window of it, reduced by `step`."""
+    rows, columns = window or (slice(0, light.shape[0]), slice(0, light.shape[1]))
+    part = light[rows, columns]
+    if step > 1:
+        height, width = (length // step for length in part.shape)
+        part = cv2.resize(part[: height * step, : width * step], (width, height), interpolation=cv2.INTER_AREA)
+    stretched, found, unknown = stretch(part), {}, []
+    for dictionary in {board.dictionary for board in boards}:
+        ids = tuple(sorted({i for board in boards if board.dictionary == dictionary for i in board.marker_ids}))
+        min_perimeter = _MIN_PERIMETER
+        if window:
+            bits = predefined_dictionary(dictionary).markerSize + 2
+            min_perimeter = min(4 * bits * _MIN_BIT_PX, _MIN_PERIMETER * max(light.shape)) / max(part.shape)
+        corners, indices, others = _marker_detector(dictionary, ids, min_perimeter).detectMarkers(stretched)
+        numbers = np.empty(0, int) if indices is None else np.ravel(indices)
+        found[dictionary] = _Markers(corners, np.array(ids, np.int32)[numbers].reshape(-1, 1))
+        unknown += [outline.reshape(4, 2) for outline in others]
+    return _Look(stretched, step, (columns.start, rows.start), found, unknown)
+
+
+def _second_looks(light: NDArray[np.float32], boards: Sequence[Board], first: _Look) -> list[_Look]:
+    """Look again at full size: at boards of which markers are missing, and for all others where anything may be one."""
+    whole = slice(0, light.shape[0]), slice(0, light.shape[1])
+    looks, unseen, hulls = [], [], []
+    for board in boards:
+        markers = first.markers(board)
+        if not markers.ids.size:
+            unseen.append(board)
+        elif markers.ids.size < min(_MIN_TELLING, board.marker_count):
+            looks.append(_look(light, [board], 1, whole))
+        else:
+            outlines, hull = _places(first, markers, board)
+            hulls.append(hull)
+            low, high = outlines.min(axis=(1, 2)), (outlines - light.shape[::-1]).max(axis=(1, 2)) + 1
+            inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
+            if markers.ids.size < inside.sum():
+                looks.append(_look(light, [board], 1, _window(hull, light.shape)))
+    quads = [first.in_image(quad) for quad in first.unknown]
+    odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
+    if unseen and odd:
+        looks.append(_look(light, unseen, 1, _window(np.concatenate(odd), light.shape)))
+    return looks
+
+
+def _places(look: _Look, markers: _Markers, board: Board) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where all markers of a board (marker, 4, 2) and its outline (4, 2) should be in the image."""
+    printed = board.opencv_board()
+    squares = np.array(printed.getObjPoints())[..., :2] / printed.getSquareLength()
+    flat = squares[np.ravel(markers.ids) - board.first_marker_id].reshape(-1, 2)
+    homography = _homography(flat, look.in_image(np.reshape(markers.corners, (-1, 2))))
+    ends = np.array([[[0, 0], [board.columns, 0], [board.columns, board.rows], [0, board.rows]]], float)
+    placed = cv2.perspectiveTransform(np.concatenate([squares, ends]).astype(float), homography)
+    return placed[:-1], placed[-1]
+
+
+def _holds(outline: NDArray[np.float64], place: NDArray[np.float64]) -> bool:
+    """Return whether a place (2,) is within an outline (4, 2)."""
+    return bool(cv2.pointPolygonTest(outline.astype(np.float32), place.tolist(), measureDist=False) >= 0)
+
+
+def _window(places: NDArray[np.float64], shape: tuple[int, ...]) -> _Window:
+    """Return the part of an image around places (place, 2), larger by an eighth on each side."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    margin = (high - low).max() / 8
+    left, top = np.clip(low - margin, 0, None).astype(int).tolist()
+    right, bottom = np.ceil(high + margin).astype(int).tolist()
+    return slice(top, min(bottom, shape[0])), slice(left, min(right, shape[1]))
+
+
+def _detect_board(light: NDArray[np.float32], look: _Look, board: Board) -> BoardCorners | None:
+    """Return the corners of one board; None if none of its markers is seen."""
+    markers = look.markers(board)
+    count = markers.ids.size
+    if not count:
+        return None
+    for legacy in (False, True) if board.rows % 2 == 0 else (False,):
+        detector = _detector(board, legacy)
+        found, ids, _, _ = detector.detectBoard(look.stretched, markerCorners=markers.corners, markerIds=markers.ids)
+        if found is not None and len(found):  # the wrong layout gives no corners
+            break
+    else:
+        return BoardCorners(board.name, np.empty(0, int), np.empty((0, 2)), np.empty(0), count, legacy=False)
+    guesses, ids = look.in_image(np.reshape(found, (-1, 2)).astype(float)), np.ravel(ids).astype(int)
+    squares_px = look.step * _squares_px(board.opencv_board(legacy=legacy), markers, ids)
+    pixels, sigma_px = refine_corners(light, guesses, squares_px, (1 - board.marker_mm / board.square_mm) / 2)
+    kept = np.isfinite(sigma_px)
+    return BoardCorners(board.name, ids[kept], pixels[kept], sigma_px[kept], count, legacy)
+
+
+def _homography(flat: NDArray[np.float64], seen: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the homography from points of a board (point, 2) in squares to their images (point, 2)."""
+    homography, _ = cv2.findHomography(flat, seen, cv2.RANSAC, _MAX_MARKER_ERROR_PX)
+    return np.asarray(homography)
+
+
+def _squares_px(printed: Any, markers: _Markers, corners: NDArray[np.intp]) -> NDArray[np.float64]:
     """Return the images (corner, 2, 2) of one square's step along rows and along columns at each corner."""
     known = list(np.ravel(printed.getIds()))
-    flat = np.concatenate([printed.getObjPoints()[known.index(marker)][:, :2] for marker in np.ravel(marker_ids)])
-    seen = np.concatenate([np.reshape(outline, (4, 2)) for outline in marker_corners])
-    homography, _ = cv2.findHomography(flat / printed.getSquareLength(), seen, cv2.RANSAC, _MAX_MARKER_ERROR_PX)
+    flat = np.concatenate([printed.getObjPoints()[known.index(marker)][:, :2] for marker in np.ravel(markers.ids)])
+    seen = np.concatenate([np.reshape(outline, (4, 2)) for outline in markers.corners])
+    homography = _homography(flat / printed.getSquareLength(), seen)
     row, column = np.divmod(corners, printed.getChessboardSize()[0] - 1)
     x, y, depth = homography @ np.stack([column + 1, row + 1, np.ones(len(row))])
     by_column, by_row = homography[:, 0], homography[:, 1]
@@ -165,11 +295,13 @@ def _squares_px(
 
 
 @cache
-def _marker_detector(dictionary: str, wanted: tuple[int, ...]) -> Any:
+def _marker_detector(dictionary: str, wanted: tuple[int, ...], min_perimeter: float) -> Any:
     """Return a detector of the wanted markers only, since each candidate is compared with all markers that it knows."""
     whole = predefined_dictionary(dictionary)
     few = cv2.aruco.Dictionary(whole.bytesList[list(wanted)], whole.markerSize, whole.maxCorrectionBits)
-    return cv2.aruco.ArucoDetector(few, cv2.aruco.DetectorParameters())
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = min_perimeter
+    return cv2.aruco.ArucoDetector(few, parameters)
 
 
 @cache

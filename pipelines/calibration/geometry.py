@@ -2,16 +2,15 @@
 
 import io
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import msgspec
 import numpy as np
 from msgspec import UNSET
-from numpy.typing import NDArray
 
-from faintfield.calib.detection import BoardCorners, detect_all
+from faintfield.calib.detection import BoardCorners, detect_boards
 from faintfield.calib.errors import TooFewViews
 from faintfield.calib.geometry import (
     BoardObservation,
@@ -25,6 +24,7 @@ from faintfield.calib.geometry import (
 from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
+from faintfield.pipelines.calibration.reading_ahead import read_ahead
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
 from faintfield.pipelines.formats.provenance import provenance
@@ -159,10 +159,14 @@ def files_beside(measured: MeasuredGeometry) -> dict[str, bytes | str]:
 def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, int]]:
     """Find the boards in all views; return their corners and the size of the images."""
     boards, views = list(board_set.boards.values()), board_set.views
-    sizes_px: list[tuple[int, int]] = []
-    images = _images(views, sizes_px)
-    found = progress(detect_all(images, boards, os.cpu_count() or 1), "looking for boards", len(views))
-    per_view = list(zip(views, found, strict=True))
+    first = views[0].image()
+    size_px = first.shape[1], first.shape[0]
+
+    def seen_in(view: BoardView) -> list[BoardCorners]:
+        return detect_boards(first if view is views[0] else view.image(size_px), boards)
+
+    found = read_ahead(views, seen_in, os.cpu_count() or 1)
+    per_view = list(progress(found, "looking for boards", len(views)))
     _inform_of_found(per_view)
     observations = [
         BoardObservation(
@@ -179,16 +183,7 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
             f"views; compare [[board]] ({'columns, rows' if markers else 'dictionary'}, first_marker_id) with the print"
             ", or expose longer"
         )
-    return observations, sizes_px[0]
-
-
-def _images(views: Sequence[BoardView], sizes_px: list[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
-    """Yield the image of each view, its size added to `sizes_px`; one of another size than the first is refused."""
-    for view in views:
-        image = view.image(sizes_px[0] if sizes_px else None)
-        height, width = image.shape
-        sizes_px.append((width, height))
-        yield image
+    return observations, size_px
 
 
 def _inform_of_found(per_view: list[tuple[BoardView, list[BoardCorners]]]) -> None:

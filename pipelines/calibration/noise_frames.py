@@ -1,4 +1,4 @@
-"""Series of statistics from the frames of a noise set; each frame is read once, one at a time."""
+"""Series of statistics from the frames of a noise set; each frame is read once, a few ahead of its turn."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Series, SeriesSums
+from faintfield.pipelines.calibration.reading_ahead import read_ahead
 from faintfield.pipelines.console import progress
 from faintfield.pipelines.errors import BadValue, UnreadableImage, WrongBitDepth, WrongSize
 from faintfield.pipelines.formats.frames import Frame, at_phase, mosaic_period, read_frame
@@ -84,10 +85,10 @@ def read_series(folder: Path, settings: NoiseSet) -> Readout:
     readout = _layout(next(iter(groups.values()))[0], settings)
     frames = [(conditions, path) for conditions, paths in groups.items() for path in paths]
     sums: list[SeriesSums] = []
-    for index, (conditions, path) in enumerate(progress(frames, "reading frames")):
+    read = read_ahead(frames, lambda it: read_frame(it[1], readout.size_px, of="the other frames"))
+    for index, ((conditions, path), frame) in enumerate(progress(read, "reading frames", len(frames))):
         if index == 0 or conditions != frames[index - 1][0]:
             sums = [SeriesSums(conditions, readout.saturation_dn) for _ in readout.phases]
-        frame = read_frame(path, readout.size_px, of="the other frames")
         pixels = _check_frame(frame, path, readout)[readout.rows, readout.columns]
         for phase, phase_sums in zip(readout.phases, sums, strict=True):
             phase_sums.add(str(path), phase.of(pixels))

@@ -32,6 +32,9 @@ _ROWS = (
 
 _PLOTS_PER_ROW = 3
 
+# Pixels along the longer side of a map that is drawn.
+_MAX_SHOWN_PX = 2000
+
 
 @dataclass(frozen=True)
 class Plot:
@@ -158,7 +161,13 @@ def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.b
     def draw(axes: Axes, _: NoiseCalibration) -> None:
         assert values is not None
         low, high = np.quantile(values[~unusable], [0.005, 0.995])
-        image = axes.imshow(values, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest")
+        height, width = values.shape
+        step = max(max(height, width) // _MAX_SHOWN_PX, 1)  # more pixels than the page has take seconds to draw
+        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        shown = values[::step, ::step]
+        image = axes.imshow(
+            shown, extent=extent, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest"
+        )
         axes.set(xlabel="column [px]", ylabel="row [px]")
         axes.figure.colorbar(image, ax=axes, shrink=0.8)
 

@@ -160,3 +160,42 @@ def test_images_of_any_depth_are_stretched_from_black_to_white(scale: float) -> 
     assert found.dtype == np.uint8
     assert found[200, [100, 300, 500]] == pytest.approx([0, 127.5, 255], abs=1)
     assert (found[15, 15], found[385, 585]) == (0, 255)
+
+
+def both_ways(
+    light: NDArray[np.floating], boards: list[Board], monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, BoardCorners], dict[str, BoardCorners]]:
+    """Return what is found in the image at full size, and with the first look at a half."""
+    whole = {one.board: one for one in detect_boards(light, boards)}
+    monkeypatch.setattr("faintfield.calib.detection._MIN_MARKER_PX", 4.0)
+    return whole, {one.board: one for one in detect_boards(light, boards)}
+
+
+@pytest.mark.parametrize("depth_mm", [1000.0, 1600.0, 2000.0])
+def test_boards_are_found_as_well_in_a_reduced_image(depth_mm: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    places = [
+        SimulatedBoard(5, 7, 40.0, np.array([0.2, 0.1, 0.05, -0.32 * depth_mm, -0.08 * depth_mm, depth_mm])),
+        SimulatedBoard(5, 7, 40.0, np.array([-0.2, 0.5, 1.5, 230.0, -60.0, 1020.0])),
+    ]
+    planes = [standing_board(board, place, EXPERIMENT) for board, place in zip((BOARD, OTHER), places, strict=True)]
+    light = exposed(next(render(planes, EXPERIMENT.optics, np.zeros((1, 6)))).light, 9000.0, np.random.default_rng(3))
+    whole, reduced = both_ways(light, [BOARD, OTHER], monkeypatch)
+    assert len(whole["b"].corners) == 35
+    assert whole.keys() <= reduced.keys()
+    for name, one in whole.items():
+        again = reduced[name]
+        assert set(one.corners) <= set(again.corners)
+        assert again.markers >= one.markers
+        apart = one.pixels - again.pixels[np.isin(again.corners, one.corners)]
+        assert np.sqrt(np.square(apart).mean()) < 0.002
+
+
+def test_what_a_reduced_image_hides_is_looked_for_at_full_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = SimulatedBoard(5, 7, 40.0, np.array([0.1, 0.2, 0.0, -80.0, -60.0, 1600.0]))
+    plane = standing_board(BOARD, small, EXPERIMENT)
+    light = next(render([plane], EXPERIMENT.optics, np.zeros((1, 6)))).light
+    whole, reduced = both_ways(light, [BOARD], monkeypatch)
+    assert len(whole["a"].corners) == len(reduced["a"].corners) == 35
+    monkeypatch.setattr("faintfield.calib.detection._second_looks", lambda *_: [])
+    alone = detect_boards(light, [BOARD])
+    assert alone[0].markers < reduced["a"].markers == 24

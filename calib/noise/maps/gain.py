@@ -87,7 +87,7 @@ def photon_transfer(
 
 
 def measure_gain(
-    transfer: tuple[Array, Array], usable: NDArray[np.bool_], response: Callable[[Array | float], Response]
+    transfer: tuple[Array, Array], usable: NDArray[np.bool_], even: Response, response: Callable[[Array], Response]
 ) -> tuple[PixelGain | None, str]:
     """Return the gain of every pixel, or None and the reason why the frames do not determine it.
 
@@ -97,16 +97,18 @@ def measure_gain(
         ε and its inverse variance, see `photon_transfer`.
     usable : array (row, column), bool
         Pixels in use.
+    even : Response
+        The response to light.
     response : callable
-        Returns the response to light, given relative gains (row, column) by which the signals are divided first.
+        Returns it given relative gains (row, column) by which the signals are divided first.
     """
     epsilon, information = transfer
     weight = np.where(usable, information, 0.0)
     limit = _CLIP_SIGMA / np.sqrt(np.maximum(information, 1e-12))
     epsilon = np.clip(epsilon - np.average(epsilon, weights=weight), -limit, limit)
-    seams = _gain_seams(epsilon, weight, response(1.0))
+    seams = _gain_seams(epsilon, weight, even)
     region = _of_regions(seams, epsilon.shape)
-    known = response(1 + region)
+    known = response(1 + region) if seams else even
     seams = tuple(_refined(seam, known, weight) for seam in seams)
     region = _of_regions(seams, epsilon.shape)
     part = np.where(usable, known.relative / np.maximum(known.vignetting, 1e-6) - 1, 0.0)

@@ -99,9 +99,12 @@ def measure_pixels(fitted: SeriesFit, hot: NDArray[np.bool_], outlying: NDArray[
         response = response_e = _response(fitted, levels, usable, 1.0)
         transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn**2, fitted.fit.values)
         bright = usable & ~response.dead
-        gain, why = measure_gain(transfer, bright, lambda relative: _response(fitted, levels, usable, relative))
+        gain, why = measure_gain(
+            transfer, bright, response, lambda relative: _response(fitted, levels, usable, relative)
+        )
         if gain is not None:
             response_e = _response(fitted, levels, usable, gain.relative)
+        if gain is not None and gain.seams:
             # A step of the gain is no spread of the pixels, and no smooth part of the response takes it out
             even = _response(fitted, levels, usable, gain.of_regions)
             response = replace(response, prnu=even.prnu, prnu_se=even.prnu_se, why_no_prnu=even.why_no_prnu)

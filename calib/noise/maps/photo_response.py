@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -174,9 +175,14 @@ def _surface(response: Array, usable: Mask) -> Array:
 
 def _running_mean(response: Array, usable: Mask, window: int) -> Array:
     """Return the mean over the usable pixels of a window around each pixel (row, column)."""
-    weight = ndimage.uniform_filter(usable.astype(float), window, mode="nearest")
-    mean = ndimage.uniform_filter(np.where(usable, response, 0.0), window, mode="nearest")
-    return np.asarray(mean / np.maximum(weight, 1e-6))
+    mean = _box(np.where(usable, response, 0.0), window)
+    mean /= np.maximum(_box(usable.astype(float), window), 1e-6)
+    return mean
+
+
+def _box(values: Array, window: int) -> Array:
+    """Return the mean over a window around each value, beyond an edge of the values at the edge (row, column)."""
+    return np.asarray(cv2.blur(values, (window, window), borderType=cv2.BORDER_REPLICATE))
 
 
 def _kept_share(usable: Mask) -> Array:
@@ -187,7 +193,7 @@ def _kept_share(usable: Mask) -> Array:
     """
     window = _width(usable.shape)
     own, squares = zip(*(_line_weights(size, window) for size in usable.shape), strict=True)
-    weight = np.maximum(ndimage.uniform_filter(usable.astype(float), window, mode="nearest"), 1e-6)
+    weight = np.maximum(_box(usable.astype(float), window), 1e-6)
     share = 1 - (2 * np.outer(*own) - np.outer(*squares)) / weight
     return np.asarray(np.maximum(share, 0.05))
 

@@ -189,16 +189,30 @@ def pixel_levels(
     for series, variance in zip(darks, noise_dn2, strict=True):
         t, weight = series.conditions.dark_time_s, series.frames / np.asarray(variance)
         # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
-        deviation = series.mean_dn - series.mean_dn.mean(where=~hot) - pattern.offset_dn
-        offset, both, signal = offset + weight, both + weight * t, signal + weight * t**2
-        of_offset, of_signal = of_offset + weight * deviation, of_signal + weight * t * deviation
+        deviation = series.mean_dn
+        deviation -= deviation.mean(where=~hot)
+        deviation -= pattern.offset_dn
+        deviation *= weight
+        offset += weight
+        of_offset += deviation
+        if t:
+            both += weight * t
+            signal += weight * t**2
+            deviation *= t
+            of_signal += deviation
     determinant = offset * signal - both**2
-    return PixelLevels(
-        values["offset_dn"] + pattern.offset_dn + (signal * of_offset - both * of_signal) / determinant,
-        values.get("dark_signal_dn_per_s", 0.0) + (offset * of_signal - both * of_offset) / determinant,
-        np.asarray(signal / determinant),
-        np.asarray(offset / determinant),
-    )
+    offset_dn = signal * of_offset - both * of_signal
+    signal_dn = offset * of_signal - both * of_offset
+    del both, of_offset, of_signal
+    for posterior, prior in (
+        (offset_dn, values["offset_dn"] + pattern.offset_dn),
+        (signal_dn, values.get("dark_signal_dn_per_s", 0.0)),
+    ):
+        posterior /= determinant
+        posterior += prior
+    signal /= determinant
+    offset /= determinant
+    return PixelLevels(offset_dn, signal_dn, signal, offset)
 
 
 def quantum_efficiency(

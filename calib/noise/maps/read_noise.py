@@ -21,6 +21,7 @@ from scipy import stats
 
 from faintfield.calib.noise.maps.seams import find_seams
 from faintfield.calib.noise.series.statistics import Series, robust_sigma
+from faintfield.calib.noise.strips import over_strips
 
 type Array = NDArray[np.float64]
 
@@ -33,8 +34,8 @@ _TAIL = 0.01
 # Pixels whose variances differ by less than this share a bin while the population is learnt, by so many EM steps.
 _BIN, _EM_STEPS = 0.01, 200
 
-# Pixels without bins from which the population is learnt, and pixels that are worked on at once.
-_SAMPLE_PX, _CHUNK_PX = 6000, 1 << 15
+# Pixels without bins from which the population is learnt, and pixels that are worked on at once, within the cache.
+_SAMPLE_PX, _CHUNK_PX = 6000, 1 << 10
 
 # Most numbers that regions of rows and of columns may take.
 _MAX_REGIONS = 6
@@ -133,7 +134,7 @@ def _measure(
     fits = [_population(squares, ratio, factor, read_dn2, shot_dn2, freedom, usable) for factor, _ in ways]
     best = int(np.argmax([fit.log_likelihood - number for fit, (_, number) in zip(fits, ways, strict=True)]))
     factor = ways[best][0]
-    mean, variance = _posterior(squares / factor[..., None], fits[best], shot_dn2, freedom)
+    mean, variance = _posterior(squares, factor, fits[best], shot_dn2, freedom)
     read = _scaled(mean, factor, shot, read_dn2)
     return PixelReadNoise(read, np.sqrt(variance) * mean * factor / read, resolved=True)
 
@@ -199,7 +200,9 @@ def _grid(ratio: Array, read_dn2: float, degrees: float, usable: NDArray[np.bool
 def _log_likelihood(squares: Array, grid: Array, shot_dn2: Array, freedom: Array) -> Array:
     """Return ln L (pixel, step) up to a constant, from squares (pixel, series)."""
     variance = np.exp(grid) + shot_dn2[:, None]
-    return np.asarray(squares @ (-0.5 / variance) - 0.5 * freedom @ np.log(variance))
+    log = squares @ (-0.5 / variance)
+    log -= 0.5 * freedom @ np.log(variance)
+    return np.asarray(log)
 
 
 def _bins(ratio: Array, usable: NDArray[np.bool_], *, exact: bool) -> tuple[slice, NDArray[np.intp], Array]:
@@ -239,7 +242,9 @@ def _population(
     ratio = ratio / factor
     grid = _grid(ratio, read_dn2, degrees, usable)
     pixel, member, count = _bins(ratio, usable, exact=freedom.size == 1)
-    scaled = (squares[usable] / factor[usable, None])[pixel]
+    chosen = np.flatnonzero(usable)[pixel]
+    chosen_factor = factor.ravel()[chosen]
+    scaled = squares.reshape(-1, freedom.size)[chosen] / chosen_factor[:, None]
     sums = [np.bincount(member, weights) for weights in scaled.T]
     log = _log_likelihood(np.stack(sums, axis=1) / count[:, None], grid, shot_dn2, freedom)
     peak = log.max(axis=1)
@@ -250,23 +255,34 @@ def _population(
     share = (1 - _TAIL) * share / share.sum() + _TAIL / grid.size
     for _ in range(_EM_STEPS):
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
-    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(
-        np.log(factor[usable][pixel]).sum()
-    )
+    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(np.log(chosen_factor).sum())
     return _Population(grid, share, total)
 
 
-def _posterior(squares: Array, population: _Population, shot_dn2: Array, freedom: Array) -> tuple[Array, Array]:
+def _posterior(
+    squares: Array, factor: Array, population: _Population, shot_dn2: Array, freedom: Array
+) -> tuple[Array, Array]:
     """Return mean and variance of each pixel's read noise, (row, column), from squares (row, column, series)."""
     grid = population.grid
     sigma = np.exp(0.5 * grid)
-    moments = population.share[:, None] * np.stack([np.ones_like(sigma), sigma, sigma**2], axis=1)
-    flat, sums = squares.reshape(-1, freedom.size), []
-    for start in range(0, len(flat), _CHUNK_PX):
-        log = _log_likelihood(flat[start : start + _CHUNK_PX], grid, shot_dn2, freedom)
-        sums.append(np.exp(log - log.max(axis=1, keepdims=True)) @ moments)
-    total, first, second = np.concatenate(sums).T.reshape(3, *squares.shape[:2])
-    mean = first / total
-    # No finer than the grid tells
-    floor = (mean * 0.5 * (grid[1] - grid[0])) ** 2 / 12
-    return mean, np.maximum(second / total - mean**2, floor)
+    log_share = np.log(np.maximum(population.share, 1e-300))
+    middle = float(population.share @ sigma)  # about which little is lost in single precision
+    moments = np.power.outer(sigma - middle, np.arange(3)).astype(np.float32)
+    finest = (0.5 * (grid[1] - grid[0])) ** 2 / 12  # of the mean squared: no finer than the grid tells
+    mean, variance = np.empty(squares.shape[:2]), np.empty(squares.shape[:2])
+
+    def work(rows: slice) -> None:
+        flat = (squares[rows] / factor[rows, :, None]).reshape(-1, freedom.size)
+        sums = np.empty((len(flat), 3))
+        for start in range(0, len(flat), _CHUNK_PX):
+            log = _log_likelihood(flat[start : start + _CHUNK_PX], grid, shot_dn2, freedom)
+            log += log_share
+            log -= log.max(axis=1, keepdims=True)
+            sums[start : start + _CHUNK_PX] = np.exp(log.astype(np.float32)) @ moments  # fast in single precision
+        total, first, second = sums.T.reshape(3, *mean[rows].shape)
+        from_middle = first / total
+        mean[rows] = middle + from_middle
+        variance[rows] = np.maximum(second / total - from_middle**2, finest * mean[rows] ** 2)
+
+    over_strips(work, mean.shape)
+    return mean, variance

@@ -58,9 +58,7 @@ def series_goodness(
     line = fit.values["offset_dn"] + fit.values.get("dark_signal_dn_per_s", 0.0) * t
     residuals: list[float | None] = [float(x) for x in moments.darks.mean_dn - line]
     residuals += _light_residuals(fit, moments)
-    models: list[float | Array] = [*dark_variances_dn2(fit.values, t)]
-    noise = [*models, *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
-    maps = [*models, *(flat_noise_map(fit, one) for one in flats)]
+    noise = [*dark_variances_dn2(fit.values, t), *flat_variances_dn2(fit.values, moments.flats.mean_dn)]
     freedom = np.concatenate(noise_freedom(moments))
     within = np.concatenate([moments.darks.within_dn2, moments.flats.within_dn2])
     found = []
@@ -70,8 +68,9 @@ def series_goodness(
             continue
         excess = float(within[j] / ((one.frames - 1) * moments.freedom * noise[j])) - 1
         rows, columns = used.shape
+        expected = noise[j] if one.conditions.kind == "dark" else flat_noise_map(fit, one)
         blocks, by_row, by_column = (
-            _scatter(one, maps[j], used, *shape) for shape in ((BLOCKS, BLOCKS), (rows, 1), (1, columns))
+            _scatter(one, expected, used, *shape) for shape in ((BLOCKS, BLOCKS), (rows, 1), (1, columns))
         )
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
         found.append(

@@ -6,8 +6,9 @@ series' noise about the model, of the darks' levels about their straight line, a
 response. A fourth is that of the noise over blocks of pixels, which is wider than χ² where noise has long tails.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope, grown_variance, scatter_of_levels
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import over_strips
 
 type Array = NDArray[np.float64]
 
@@ -56,28 +58,51 @@ def block_scatter(
 
     Both are arrays (block,); blocks with fewer than two pixels in use are left out.
     """
-    row = np.arange(used.shape[0]) * rows // used.shape[0]
-    column = np.arange(used.shape[1]) * columns // used.shape[1]
-    block = (row[:, None] * columns + column)[used]
-    size = rows * columns
-    count = np.bincount(block, minlength=size)
-    measured = np.bincount(block, series.within_dn2[used], size)
-    expected = np.bincount(block, np.broadcast_to(expected_dn2, used.shape)[used], size)
+    count, measured = (_block_sums(values, used, rows, columns) for values in (used, series.within_dn2))
+    if isinstance(expected_dn2, np.ndarray):
+        expected = _block_sums(expected_dn2, used, rows, columns)
+    else:
+        expected = expected_dn2 * count
     share = max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
     enough = count > 1
     freedom = (series.frames - 1) * count[enough] * share
     return measured[enough] / (expected[enough] * (series.frames - 1) * share), np.asarray(freedom, float)
 
 
-def _dispersion(series: Sequence[Series], noise_dn2: Sequence[Array | float], used: NDArray[np.bool_]) -> float:
+def _block_sums(values: NDArray[Any], used: NDArray[np.bool_], rows: int, columns: int) -> Array:
+    """Return the sums (block,) of values (row, column) of the pixels in use over rows × columns blocks."""
+    row = np.arange(used.shape[0]) * rows // used.shape[0]
+    first = np.searchsorted(np.arange(used.shape[1]) * columns // used.shape[1], np.arange(columns))
+
+    def work(strip: slice) -> Array:
+        own = np.where(used[strip], values[strip], 0.0)
+        parts = own if columns == used.shape[1] else np.add.reduceat(own, first, axis=1)
+        begins = np.flatnonzero(np.diff(row[strip], prepend=-1))
+        return np.asarray(np.add.reduceat(parts, begins, axis=0))
+
+    blocks = np.zeros((rows, columns))
+    for block, part in zip(
+        over_strips(lambda strip: np.unique(row[strip]), used.shape), over_strips(work, used.shape), strict=True
+    ):
+        blocks[block] += part
+    return blocks.ravel()
+
+
+def _dispersion(series: Sequence[Series], noise_dn2: Iterable[Array | float], used: NDArray[np.bool_]) -> float:
     """Return how much wider than χ² the noise of blocks scatters, at least 1.
 
     What the blocks of all series have in common is a difference between pixels, not chance, and is taken out.
     """
-    several = [(one, v) for one, v in zip(series, noise_dn2, strict=True) if one.frames > 1]
-    if len(several) < 2:
+    if sum(one.frames > 1 for one in series) < 2:
         return 1.0
-    ratios, freedoms = zip(*(block_scatter(one, v, used, BLOCKS, BLOCKS) for one, v in several), strict=True)
+    ratios, freedoms = zip(
+        *(
+            block_scatter(one, v, used, BLOCKS, BLOCKS)
+            for one, v in zip(series, noise_dn2, strict=True)
+            if one.frames > 1
+        ),
+        strict=True,
+    )
     ratio, weight = np.array(ratios), np.array(freedoms) / 2
     ratio = ratio / np.average(ratio, axis=1, weights=weight[0])[:, None]
     rest = ratio - np.average(ratio, axis=0, weights=weight[:, 0])
@@ -90,7 +115,13 @@ def flat_noise_map(fit: NoiseFit, one: Series) -> Array:
     """Return the noise that the model expects of each pixel (row, column) of a flat, from its own mean."""
     mean = np.maximum(one.mean_dn, fit.values["offset_dn"])
     grid = np.linspace(float(mean.min()), float(mean.max()) + 1e-6, 64)
-    return np.asarray(np.interp(mean, grid, flat_variances_dn2(fit.values, grid)))
+    variances = flat_variances_dn2(fit.values, grid)
+
+    def work(rows: slice) -> None:
+        mean[rows] = np.interp(mean[rows], grid, variances)
+
+    over_strips(work, mean.shape)
+    return np.asarray(mean)
 
 
 def measure_excess(
@@ -100,7 +131,7 @@ def measure_excess(
     dark_noise = dark_variances_dn2(fit.values, moments.darks.exposure_s)
     excess = Excess(
         darks=_dispersion(darks, dark_noise, used),
-        flats=_dispersion(flats, [flat_noise_map(fit, one) for one in flats], used),
+        flats=_dispersion(flats, (flat_noise_map(fit, one) for one in flats), used),
     )
     variance2, noise_known = _noise_scatter(fit, moments, excess)
     drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise.series.outliers import outlier
 from faintfield.calib.noise.series.powers import PowerSums
+from faintfield.calib.noise.strips import over_strips
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
@@ -140,7 +141,14 @@ class Series:
     @property
     def mean_dn(self) -> NDArray[np.float64]:
         """Mean over the frames (row, column), with level and profiles."""
-        return self.pattern_dn + self.row_dn[:, None] + self.column_dn[None, :] + self.levels_dn.mean()
+        mean, rows_dn = np.empty(self.pattern_dn.shape), self.row_dn + self.levels_dn.mean()
+
+        def work(rows: slice) -> None:
+            np.add(self.pattern_dn[rows], rows_dn[rows, None], out=mean[rows])
+            mean[rows] += self.column_dn
+
+        over_strips(work, mean.shape)
+        return mean
 
     def clipped_share(self, ceiling_dn: float) -> float:
         """Return the share of the regular pixels' values at the end of the range."""
@@ -184,36 +192,50 @@ class SeriesSums:
         sample = frame_dn.ravel()[self._sampled].astype(np.int32)
         self._floor_dn = min(self._floor_dn, int(frame_dn.min()))
         if self.conditions.kind == "flat":
-            self._count_top(frame_dn[self._regular])
-        self._frames.append((name, digest, sample, *self._add_residual(frame_dn.astype(np.float64))))
+            self._count_top(frame_dn)
+        self._frames.append((name, digest, sample, *self._add_residual(frame_dn)))
 
     def _begin(self, first_dn: NDArray[Any]) -> None:
         """Allocate the sums for frames like the first."""
         self._suspect = _suspects(first_dn)
         self._regular = ~self._suspect
-        self._row_count = np.maximum(self._regular.sum(1), 1)
-        self._column_count = np.maximum(self._regular.sum(0), 1)
+        self._suspect_at = np.nonzero(self._suspect)
+        self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
         self._sampled = sample_index(first_dn.shape)
         self._powers = PowerSums(first_dn.shape, higher=self.conditions.kind == "dark")
 
-    def _add_residual(self, residual_dn: NDArray[np.float64]) -> tuple[Any, ...]:
-        """Subtract level, row and column means from a frame, in place, and add the rest to the sums.
+    def _add_residual(self, frame_dn: NDArray[Any]) -> tuple[Any, ...]:
+        """Add a frame without its level, row and column means to the sums; return them and the spread of the rest."""
+        level, rows, columns = self._means(frame_dn)
 
-        Return the means and the spread of the rest.
-        """
-        level = residual_dn.mean(where=self._regular)
-        residual_dn -= level
-        rows = residual_dn.sum(1, where=self._regular) / self._row_count
-        residual_dn -= rows[:, None]
-        columns = residual_dn.sum(0, where=self._regular) / self._column_count
-        residual_dn -= columns
-        self._powers.add(residual_dn)
-        return level, rows, columns, np.square(residual_dn).mean(where=self._regular)
+        def work(strip: slice) -> float:
+            rest = frame_dn[strip] - (level + rows[strip])[:, None]
+            rest -= columns
+            self._powers.add(strip, rest)
+            return float(np.square(rest)[self._regular[strip]].sum())
 
-    def _count_top(self, values_dn: NDArray[Any]) -> None:
-        """Count the values at the highest one so far, and one below it; the stated end of the range is the highest."""
-        top = max(self._top_dn, min(float(values_dn.max()), self.saturation_dn))
-        at, below = int((values_dn >= top).sum()), int((values_dn == top - 1).sum())
+        squares = sum(over_strips(work, frame_dn.shape))
+        return level, rows, columns, squares / self._row_count.sum()
+
+    def _means(self, frame_dn: NDArray[Any]) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Return the mean level of the regular pixels, and the means of rows and columns about it and each other."""
+        (row, column), (height, width) = self._suspect_at, frame_dn.shape
+        suspect_dn = frame_dn[row, column].astype(np.float64)
+        rows, columns = (frame_dn.sum(axis, dtype=np.float64) for axis in (1, 0))
+        rows -= np.bincount(row, suspect_dn, height)
+        columns -= np.bincount(column, suspect_dn, width)
+        level = float(rows.sum() / self._row_count.sum())
+        rows = (rows - level * self._row_count) / np.maximum(self._row_count, 1)
+        taken = (level + rows).sum() - np.bincount(column, (level + rows)[row], width)
+        return level, rows, (columns - taken) / np.maximum(self._column_count, 1)
+
+    def _count_top(self, frame_dn: NDArray[Any]) -> None:
+        """Count the regular values at the highest so far, the stated end of the range at most, and one below it."""
+        highest = frame_dn.max(where=self._regular, initial=frame_dn.min())
+        top = max(self._top_dn, min(float(highest), self.saturation_dn))
+        suspect_dn = frame_dn[self._suspect_at]
+        at = int(np.count_nonzero(frame_dn >= top) - np.count_nonzero(suspect_dn >= top))
+        below = int(np.count_nonzero(frame_dn == top - 1) - np.count_nonzero(suspect_dn == top - 1))
         if top == self._top_dn:
             at, below = at + self._at_top, below + self._below_top
         elif top == self._top_dn + 1:
@@ -244,10 +266,10 @@ class SeriesSums:
             column_dn=columns.mean(0),
             row_noise_dn2=float(rows.var(0, ddof=1).mean()) if frames > 1 else 0.0,
             column_noise_dn2=float(columns.var(0, ddof=1).mean()) if frames > 1 else 0.0,
-            pattern_dn=mean.astype(np.float32),
-            within_dn2=within.astype(np.float32),
-            cubes_dn3=cubes.astype(np.float32),
-            fourths_dn4=fourths.astype(np.float32),
+            pattern_dn=mean,
+            within_dn2=within,
+            cubes_dn3=cubes,
+            fourths_dn4=fourths,
             suspect=self._suspect,
             sample_dn=np.array(samples),
             floor_dn=self._floor_dn,
@@ -281,14 +303,29 @@ def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:
 
 def _suspects(frame_dn: NDArray[Any]) -> NDArray[np.bool_]:
     """Return the pixels that differ much from their row and column."""
-    residual = frame_dn - np.median(frame_dn, axis=1, keepdims=True)
-    residual -= np.median(residual, axis=0)
-    return np.asarray(np.abs(residual) > _SUSPECT_SIGMA * max(robust_sigma(residual), _COARSE_DN))
+    # Medians of whole numbers, and of what is left, are multiples of a quarter, which single precision holds
+    residual = frame_dn.astype(np.result_type(frame_dn, np.float32))
+
+    _subtract_medians(residual)
+    residual = np.ascontiguousarray(residual.T)
+    _subtract_medians(residual)
+    limit = _SUSPECT_SIGMA * max(robust_sigma(residual), _COARSE_DN)
+    return np.ascontiguousarray((np.abs(residual) > limit).T)
+
+
+def _subtract_medians(values: NDArray[Any]) -> None:
+    """Subtract the median of each row, in place."""
+
+    def work(rows: slice) -> None:
+        values[rows] -= np.median(values[rows], axis=1, keepdims=True)
+
+    over_strips(work, values.shape)
 
 
 def robust_sigma(values: NDArray[Any]) -> float:
     """Return the standard deviation of a normal distribution with the same median absolute deviation."""
-    return float(1.4826 * np.median(np.abs(values - np.median(values))))
+    deviations = values - np.median(values)
+    return float(1.4826 * np.median(np.abs(deviations, out=deviations), overwrite_input=True))
 
 
 def _check_alike(series: Series, spreads_dn2: NDArray[np.float64]) -> None:

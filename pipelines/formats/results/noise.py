@@ -160,7 +160,7 @@ def write_noise(
     with exclusive(out):
         remove(out / NOISE_FILE)
         with writing(out / NOISE_MAPS) as file:
-            np.savez_compressed(file, allow_pickle=False, **dict(maps))
+            np.savez(file, allow_pickle=False, **dict(maps))  # noise hardly shrinks, and compression would take minutes
         for name, page in pages.items():
             write_whole(out / name, page)
         record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))

@@ -23,6 +23,9 @@ from faintfield.rig.session.session import PLAN, has_session, read_plan, taken_f
 
 FILE_NAME = "charuco.toml"
 
+# Pixels of a frame from which its black and white are taken; of larger ones, some in even distances.
+_QUANTILE_PX = 4_000_000
+
 
 class BoardEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One `[[board]]`."""
@@ -190,12 +193,16 @@ def _without_filters(pixels: NDArray[np.float32], mosaic: tuple[str, ...] | None
     if mosaic is None:
         return pixels
     period, ends = mosaic_period(mosaic), (0.05, 0.95)
-    black, white = np.quantile(pixels, ends)
+    step = max(int(np.sqrt(pixels.size / _QUANTILE_PX)), 1)
+    phases = {phase: at_phase(pixels, phase, period)[::step, ::step].ravel() for phase in np.ndindex(period)}
+    black, white = np.quantile(np.concatenate(list(phases.values())), ends)
     grey = np.empty_like(pixels)
-    for phase in np.ndindex(period):
-        filtered = at_phase(pixels, phase, period)
-        low, high = np.quantile(filtered, ends)
-        at_phase(grey, phase, period)[...] = black + (filtered - low) * ((white - black) / max(high - low, 1.0))
+    for phase, sample in phases.items():
+        low, high = np.quantile(sample, ends)
+        scaled = at_phase(pixels, phase, period) - low
+        scaled *= (white - black) / max(high - low, 1.0)
+        scaled += black
+        at_phase(grey, phase, period)[...] = scaled
     return grey
 
 

@@ -145,3 +145,23 @@ def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
     # Means of columns are subtracted, which carries a little noise from one half to the other.
     assert ratio == pytest.approx([9.0, 1.0], rel=0.15)
     assert freedom == pytest.approx([29 * 512 * (1024 - 63) / 1024] * 2)
+
+
+@pytest.mark.parametrize("blocks", [(8, 8), (41, 1), (1, 30), (3, 7)])
+def test_blocks_are_those_of_single_pixels(blocks: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    frames = [(str(k), np.rint(rng.normal(100, 5, (41, 30)))) for k in range(4)]
+    series, used = measure_series(frames, Conditions("dark", 1.0)), rng.random((41, 30)) < 0.8
+    monkeypatch.setattr("faintfield.calib.noise.strips._STRIP_PX", 100)
+    expected = rng.uniform(20, 30, used.shape)
+    ratio, freedom = block_scatter(series, expected, used, *blocks)
+    of_row, of_column = (np.arange(size) * count // size for size, count in zip(used.shape, blocks, strict=True))
+    share = (used.sum() - sum(used.shape) + 1) / used.sum()
+    found = []
+    for row, column in np.ndindex(blocks):
+        inside = used & np.outer(of_row == row, of_column == column)
+        if inside.sum() > 1:
+            found.append(
+                (series.within_dn2[inside].sum() / expected[inside].sum() / 3 / share, 3 * inside.sum() * share)
+            )
+    np.testing.assert_allclose(np.stack([ratio, freedom], axis=1), found, rtol=1e-5)

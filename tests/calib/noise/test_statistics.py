@@ -108,3 +108,30 @@ def test_a_value_is_odd_whose_distance_from_the_others_is_no_chance_by_students_
     assert outlier(np.insert(others, 0, 1.02 * just), 1.03 * just, 1e9) == (0, 0.0), "too little to matter"
     assert outlier(np.insert(others, 0, 0.9 * just), 0.1, 0.8 * just)[1] == pytest.approx(0.9 * just), "certain"
     assert outlier(np.array([0.0, 5.0]), 0.1, 10.0) == (1, 0.0), "one other value has no scatter"
+
+
+@pytest.mark.parametrize("conditions", [DARK, FLAT])
+def test_strips_give_what_whole_frames_give(conditions: Conditions, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(8)
+    stack = np.rint(rng.normal(100, 5, (12, 41, 30))).astype(np.uint16)
+    stack[:, 7, 3], stack[:, 20, 3] = 4000, 3000
+    monkeypatch.setattr("faintfield.calib.noise.strips._STRIP_PX", 100)
+    series = measure_series(((str(k), frame) for k, frame in enumerate(stack)), conditions)
+    assert series.suspect[[7, 20], 3].all()
+    regular, values = ~series.suspect, stack.astype(float)
+    level = values.mean((1, 2), where=regular, keepdims=True)
+    rest = values - level
+    rows = np.nan_to_num(rest.mean(2, where=regular, keepdims=True))
+    rest -= rows
+    columns = np.nan_to_num(rest.mean(1, where=regular, keepdims=True))
+    rest -= columns
+    deviations = rest - rest.mean(0)
+    np.testing.assert_allclose(series.levels_dn, level.ravel())
+    np.testing.assert_allclose(series.row_dn, rows.mean(0).ravel(), atol=1e-9)
+    np.testing.assert_allclose(series.column_dn, columns.mean(0).ravel(), atol=1e-9)
+    np.testing.assert_allclose(series.mean_dn, rest.mean(0) + (rows + columns).mean(0) + level.mean(), rtol=1e-5)
+    np.testing.assert_allclose(series.within_dn2, (deviations**2).sum(0), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(series.spreads_dn2, [(it[regular] ** 2).mean() for it in rest])
+    if conditions is DARK:
+        np.testing.assert_allclose(series.cubes_dn3[regular], (deviations**3).sum(0)[regular], rtol=1e-4, atol=0.1)
+        np.testing.assert_allclose(series.fourths_dn4[regular], (deviations**4).sum(0)[regular], rtol=1e-4)
