@@ -27,7 +27,7 @@ _CHECK_SHARE = 0.1
 
 # Length of the first step on the plane in the metric, and the strong convexity that the acceleration relies on; the
 # metric's own is 1, and less converges faster.
-_FIRST_LENGTH, _CONVEXITY = 1.0, 0.7
+_FIRST_LENGTH, _CONVEXITY = 1.0, 0.6
 
 
 @dataclass(frozen=True)

@@ -118,7 +118,7 @@ def test_steps_follow_the_textbook_iteration() -> None:
         y = (root * x - length * adjoint_differences(p) / root + length * root * v) / (1 + length)
         y = np.maximum(y, 0)
         p /= weight
-        momentum = 1 / np.sqrt(1 + 1.4 * length)
+        momentum = 1 / np.sqrt(1 + 1.2 * length)
         ahead, x, length = y + momentum * (y - root * x), y / root, length * momentum
     dual = DualField([np.zeros((2, 7, 6))], proposal)
     found = dual.prox(v, w, weight, TV, lambda _: 0.0, 40)

@@ -21,9 +21,9 @@ ALMOST_REGULAR_MM = NODE_MM * (NODES[:, ::-1] - 2) + np.random.default_rng(4).un
 type Light = NDArray[np.float64]
 
 
-def _estimate(light: Light, matrices: NDArray[np.float64] | None = None) -> SurfaceEstimate:
+def _estimate(light: Light, matrices: NDArray[np.float64] | None = None, seed: int = 7) -> SurfaceEstimate:
     """The surface of the given light (view, row, column), with noise."""
-    generator = np.random.default_rng(7)
+    generator = np.random.default_rng(seed)
     known = generator.poisson(np.maximum(light, 0)) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
     counted = np.where(light == UNKNOWN, UNKNOWN, known).astype(np.float32)
     rays = surface_scene.matrices() if matrices is None else matrices
@@ -57,7 +57,7 @@ def test_nothing_of_an_even_wall_is_sure() -> None:
     assert (found.confidence >= SURE).mean() < 0.01
 
 
-def _wall(pair_px: float, *, alike: bool) -> SurfaceEstimate:
+def _wall(pair_px: float, *, alike: bool, seed: int = 7) -> SurfaceEstimate:
     """What is found of a wall at 600 mm, seen from almost regular nodes: squares, all alike or each drawn by lot."""
     centres = ALMOST_REGULAR_MM - ALMOST_REGULAR_MM[12]
     lot = np.random.default_rng(3).integers(0, 2, (200, 200))
@@ -71,7 +71,7 @@ def _wall(pair_px: float, *, alike: bool) -> SurfaceEstimate:
         views.append(0.4 + 1.2 * white.reshape(SHAPE[0], 4, SHAPE[1], 4).mean(axis=(1, 3)))
     rays = surface_scene.matrices()
     rays[:, :2, 3], rays[:, :2, 2] = -centres, UNMOVED * centres
-    return _estimate(LEVEL_E * np.array(views), rays)
+    return _estimate(LEVEL_E * np.array(views), rays, seed)
 
 
 def _pair_px(other_mm: float) -> float:
@@ -79,10 +79,12 @@ def _pair_px(other_mm: float) -> float:
     return NODE_MM * FOCAL_PX * (1 / other_mm - FAR)
 
 
-@pytest.mark.parametrize("other_mm", [480, 500, 510])
-def test_of_a_wall_of_equal_squares_little_is_sure_and_wrong(other_mm: float) -> None:
-    _, wrong = _sure(_wall(_pair_px(other_mm), alike=True), np.full(SHAPE, FAR))
-    assert wrong < 0.03
+@pytest.mark.parametrize(("other_mm", "draws"), [(480, 1), (500, 8), (510, 1)])
+def test_of_a_wall_of_equal_squares_little_is_sure_and_wrong(other_mm: float, draws: int) -> None:
+    """At 500 mm the share varies from 0 to 7 % with the noise."""
+    walls = [_wall(_pair_px(other_mm), alike=True, seed=seed) for seed in range(7, 7 + draws)]
+    wrong = [_sure(wall, np.full(SHAPE, FAR))[1] for wall in walls]
+    assert np.mean(wrong) < 0.03
 
 
 def test_a_wall_of_squares_that_differ_is_sure_and_right() -> None:
