@@ -57,7 +57,7 @@ class PlaneOperator(SceneOperator):
         self.grid = grid
         self.samples_shape = grid.shape
 
-    def window(self, rows: slice, columns: slice) -> "PlaneOperator":
+    def window(self, rows: slice, columns: slice, workers: int | None = None) -> "PlaneOperator":
         """Return H of a part of the samples, on the same images; pixels that see another part see nothing.
 
         It shares all maps with this operator, and its sweeps take about as much less time as it has fewer samples.
@@ -66,6 +66,8 @@ class PlaneOperator(SceneOperator):
         ----------
         rows, columns : slice
             The samples, with a start and a stop.
+        workers : int, optional
+            Number of threads; as many as this operator has by default.
 
         Raises
         ------
@@ -74,6 +76,7 @@ class PlaneOperator(SceneOperator):
         """
         grid = self.grid.window(rows, columns)
         part = copy(self)
+        part.workers = workers or self.workers
         part._take_window(grid, window_geometry(self._geometry, grid, (rows.start, columns.start)))  # noqa: SLF001
         return part
 

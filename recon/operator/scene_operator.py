@@ -81,7 +81,7 @@ class SceneOperator:
     ) -> None:
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
         grids = tuple(grids)
-        self._workers = workers or int(numba.config.NUMBA_NUM_THREADS)
+        self.workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
         geometry = scene_geometry(
             plane_from_ray, rays, grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
@@ -159,7 +159,11 @@ class SceneOperator:
     @cached_property
     def seeing_views(self) -> NDArray[np.intp]:
         """The views in which some pixel that counts sees one of the planes."""
-        return np.array([view for view in self.all_views.tolist() if self.sensitivity([view]).any()])
+        reach = self._geometry.reach
+        reaching = np.flatnonzero((reach[:, :, 1] > reach[:, :, 0]).any(axis=1))
+        if self._geometry.valid.size == 0 and (self.response() > 0).all():
+            return reaching  # every pixel that meets a plane counts
+        return np.array([view for view in reaching.tolist() if self.sensitivity([view]).any()], np.intp)
 
     def response(self) -> Image:
         """Return the relative response of each pixel (lattice, row, column)."""
@@ -250,7 +254,7 @@ class SceneOperator:
     ) -> tuple[float, Image]:
         """Run one kernel on all workers; return the sums of their values and of their accumulators."""
         scatters, nothing = operation in kernels.SCATTERING, _read_only(np.zeros(1, self.dtype))
-        sums = [np.zeros(self._size if scatters else 1, self.dtype) for _ in range(self._workers)]
+        sums = [np.zeros(self._size if scatters else 1, self.dtype) for _ in range(self.workers)]
         planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
         pixels = pixels or kernels.PixelModel(0, nothing, nothing, 0.0)
 
@@ -258,10 +262,10 @@ class SceneOperator:
             written = np.zeros(1, self.dtype) if seen is None else seen.reshape(-1)
             arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
             space = make_workspace(len(self.grids), self.dtype)
-            share = (_read_only(views), worker, self._workers)
+            share = (_read_only(views), worker, self.workers)
             return float(kernels.sweep(operation, *arrays, pixels, self._geometry, space, *share))
 
-        values = run_in_threads(work, range(self._workers))
+        values = run_in_threads(work, range(self.workers))
         for other in sums[1:]:
             sums[0] += other
         return sum(values), sums[0].reshape(self.samples_shape) if scatters else sums[0]

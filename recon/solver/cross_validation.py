@@ -1,6 +1,6 @@
 """A penalty weight from the data by cross-validation: the weight under which some views best predict the others."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.windows import windows_of
+from faintfield.recon.threads import map_in_threads
 
 # Largest number of folds; each leaves out one view in as many.
 MAX_FOLDS = 7
@@ -104,10 +105,11 @@ def cross_validated_weight(
     windows = windows_of(problem, MIN_VIEWS)
     if windows:
         # A dark window is solved with the light of the whole plane, as that will be
-        folds = [fold for window in windows for fold in _folds_of(window, penalty, 1, level_e)]
+        per_window = map_in_threads(lambda window: _folds_of(window, penalty, 1, level_e), windows)
+        folds = [fold for of_window in per_window for fold in of_window]
     else:
         folds = _folds_of(problem, penalty, folds_to_predict(problem))
-    losses = _losses(folds, guess)
+    losses = _losses(folds, guess, apply=map_in_threads if windows else _in_turn)
     best = min(losses, key=losses.__getitem__)
     offset = _lowest_offset([losses.get(best + n) for n in (-1, 0, 1)])
     candidates = {guess * _CANDIDATE_RATIO**step: loss for step, loss in sorted(losses.items())}
@@ -167,15 +169,21 @@ class _Fold:
         return problem.operator.negative_log_likelihood(iterate.plane, problem.images, self._validation)
 
 
-def _losses(folds: list[_Fold], guess: float) -> dict[int, float]:
-    """Return the loss of each candidate `guess · ratioⁿ` that was tried, by n."""
+def _in_turn(work: Callable[[_Fold], float], folds: Sequence[_Fold]) -> list[float]:
+    return [work(fold) for fold in folds]
+
+
+def _losses(
+    folds: list[_Fold], guess: float, apply: Callable[[Callable[[_Fold], float], Sequence[_Fold]], list[float]]
+) -> dict[int, float]:
+    """Return the loss of each candidate `guess · ratioⁿ` that was tried, by n; `apply` scores all folds."""
     losses: dict[int, float] = {}
 
     def best() -> int:
         return min(losses, key=losses.__getitem__)
 
     def score(step: int) -> None:
-        losses[step] = sum(fold.score(step, guess * _CANDIDATE_RATIO**step) for fold in folds)
+        losses[step] = sum(apply(lambda fold: fold.score(step, guess * _CANDIDATE_RATIO**step), folds))
         # The next candidate starts from this one, or from the best if there is none beyond it
         for fold in folds:
             fold.solutions = {kept: fold.solutions[kept] for kept in {step, best()}}

@@ -1,6 +1,6 @@
 """What solvers need of a scene: the likelihood's value, its gradient, and a diagonal that bounds its curvature."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,7 +152,8 @@ class SceneProblem:
 
     def dual(self) -> DualField:
         """Return a dual field of zeros."""
-        return DualField.zero([grid.shape for grid in self.operator.grids], self.operator.dtype)
+        dual = DualField.zero([grid.shape for grid in self.operator.grids], self.operator.dtype)
+        return replace(dual, workers=self.operator.workers)
 
     def well_seen(self) -> NDArray[np.bool_]:
         """Return which samples represent the planes, each plane judged by its own best seen sample."""

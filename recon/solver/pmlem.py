@@ -17,7 +17,7 @@ from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
 
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance.
-_INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.1, 0.5
+_INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.3, 0.5
 
 # Limit on the steps of an inner problem.
 _MAX_INNER_STEPS = 600

@@ -20,7 +20,7 @@ def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
     Parameters
     ----------
     problem : SceneProblem
-        One plane. The windows share its images.
+        One plane. The windows share its images. Each is worked on by one thread, so that several can be at a time.
     min_views : int
         Windows that fewer views see are left out.
     """
@@ -36,7 +36,7 @@ def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
     windows = []
     for row, column in np.ndindex(down, across):
         try:
-            window = operator.window(_middle(row, rows, down), _middle(column, columns, across))
+            window = operator.window(_middle(row, rows, down), _middle(column, columns, across), workers=1)
         except GeometryMismatch:  # no view sees it
             continue
         if len(window.seeing_views) >= min_views:
