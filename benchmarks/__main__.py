@@ -92,7 +92,7 @@ def main() -> None:
     """Print the figures as a table, or with --json as one object."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the table to this file as well")
+    parser.add_argument("--keep", type=Path, metavar="FILE", help="write the table to this file; its sections stay")
     parser.add_argument("--size-px", type=int, default=1024, help="width and height of the detector")
     parser.add_argument("--solvers-size-px", type=int, default=256, help="the same for the comparison of solvers")
     parser.add_argument("--rounds", type=int, default=5, help="rounds to take medians over")
@@ -102,7 +102,9 @@ def main() -> None:
     sys.stdout.write(shown)
     if arguments.keep:
         title = "# Benchmarks\n\nMade by `make bench`; each figure is explained in `benchmarks/`."
-        arguments.keep.write_text(f"{title}\nTaken on {machine()}.\n\n{table(figures)}")
+        before = arguments.keep.read_text() if arguments.keep.exists() else ""
+        _, heading, others = before.partition("\n## ")  # sections that other benchmarks made
+        arguments.keep.write_text(f"{title}\nTaken on {machine()}.\n\n{table(figures)}{heading}{others}")
 
 
 main()

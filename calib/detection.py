@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any
 
 import cv2
@@ -221,8 +221,9 @@ def _second_looks(light: NDArray[np.float32], boards: Sequence[Board], first: _L
             hulls.append(hull)
             low, high = outlines.min(axis=(1, 2)), (outlines - light.shape[::-1]).max(axis=(1, 2)) + 1
             inside = (low >= _BORDER_PX) & (high <= -_BORDER_PX)
-            if markers.ids.size < inside.sum():
-                looks.append(_look(light, [board], 1, _window(hull, light.shape)))
+            window = _window(hull, light.shape)
+            if markers.ids.size < inside.sum() and light[window].size:
+                looks.append(_look(light, [board], 1, window))
     quads = [first.in_image(quad) for quad in first.unknown]
     odd = [quad for quad in quads if not any(_holds(hull, quad.mean(axis=0)) for hull in hulls)]
     if unseen and odd:
@@ -251,7 +252,7 @@ def _window(places: NDArray[np.float64], shape: tuple[int, ...]) -> _Window:
     low, high = places.min(axis=0), places.max(axis=0)
     margin = (high - low).max() / 8
     left, top = np.clip(low - margin, 0, None).astype(int).tolist()
-    right, bottom = np.ceil(high + margin).astype(int).tolist()
+    right, bottom = np.ceil(np.clip(high + margin, 0, None)).astype(int).tolist()
     return slice(top, min(bottom, shape[0])), slice(left, min(right, shape[1]))
 
 
@@ -294,7 +295,7 @@ def _squares_px(printed: Any, markers: _Markers, corners: NDArray[np.intp]) -> N
     return np.moveaxis(np.array(steps), -1, 0)
 
 
-@cache
+@lru_cache(maxsize=32)  # windows ask for perimeters of their own
 def _marker_detector(dictionary: str, wanted: tuple[int, ...], min_perimeter: float) -> Any:
     """Return a detector of the wanted markers only, since each candidate is compared with all markers that it knows."""
     whole = predefined_dictionary(dictionary)

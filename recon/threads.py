@@ -68,4 +68,6 @@ def map_in_threads[Item, Result](work: Callable[[Item], Result], items: Sequence
         raise
     if failures:
         raise failures[min(failures)]
+    for other in others:
+        other.result()  # of what is not a failure, such as an exit
     return [results[index] for index in range(len(items))]

@@ -8,6 +8,11 @@ from concurrent.futures import ThreadPoolExecutor
 _STRIP_PX = 1 << 16
 
 
+def usable_cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...]) -> list[T]:
     """Return the results of `work` for the strips of an array (row, column), first to last.
 
@@ -22,5 +27,5 @@ def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...]) -> list[T
     strips = [slice(first, min(first + step, shape[0])) for first in range(0, shape[0], step)]
     if len(strips) == 1:
         return [work(strips[0])]
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         return list(pool.map(work, strips))

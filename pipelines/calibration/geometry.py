@@ -1,7 +1,6 @@
 """Where the camera was, from a board set: corners found, lens and poses solved; the record and files of the result."""
 
 import io
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -24,6 +23,7 @@ from faintfield.calib.geometry import (
 from faintfield.calib.geometry.homings import HomingShift
 from faintfield.calib.geometry.stage import StageReport, approach_directions, stage_report
 from faintfield.calib.mrcal_loader import load_mrcal
+from faintfield.calib.noise.strips import usable_cores
 from faintfield.pipelines.calibration.reading_ahead import read_ahead
 from faintfield.pipelines.console import inform, progress, working
 from faintfield.pipelines.formats.exchange.mrcal import camera_model_text
@@ -165,7 +165,7 @@ def _observe(board_set: BoardSet) -> tuple[list[BoardObservation], tuple[int, in
     def seen_in(view: BoardView) -> list[BoardCorners]:
         return detect_boards(first if view is views[0] else view.image(size_px), boards)
 
-    found = read_ahead(views, seen_in, os.cpu_count() or 1)
+    found = read_ahead(views, seen_in, usable_cores())
     per_view = list(progress(found, "looking for boards", len(views)))
     _inform_of_found(per_view)
     observations = [

@@ -24,7 +24,10 @@ _COLOUR_NAMES = {"R": "red", "G": "green", "B": "blue"}
 _RGB = ("red", "green", "blue")
 
 # Share of the free disk that decoded frames may take; the rest is for results, and for electrons if memory is short.
-_SHARE_OF_DISK = 0.25
+SHARE_OF_DISK = 0.25
+
+# Most frames that are kept: each needs an open file, of which a process may have about a thousand.
+_MOST_KEPT = 256
 
 # Maps of the noise model, a value per pixel or one for all.
 _NOISE_MAPS = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
@@ -77,13 +80,23 @@ def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
     """Return a set that decodes each frame once: what took decoding is kept in files in a folder.
 
     The files have no name, so they disappear with the set, however the process ends. They take at most a quarter of
-    the free disk; frames beyond that are decoded each time.
+    the free disk, and are 256 at most; frames beyond that are decoded each time.
     """
     # A set is read once per colour, and again by searches and priors. Pixels are kept rather than electrons, as they
     # take half the room and serve all of these, and in files, as memory is for the solvers
     if loaded.read_frame is not read_frame:
         return loaded
     kept: dict[Path, Frame] = {}
+    storing = Lock()
+
+    def room_for(frame: Frame) -> NDArray[Any] | None:
+        kept_bytes = sum(one.pixels_dn.nbytes for one in kept.values())
+        folder.mkdir(parents=True, exist_ok=True)
+        needed_bytes = kept_bytes + frame.pixels_dn.nbytes
+        if len(kept) == _MOST_KEPT or needed_bytes > SHARE_OF_DISK * (kept_bytes + disk_usage(folder).free):
+            return None
+        with TemporaryFile(dir=folder) as file:
+            return mapped(file, frame.pixels_dn.shape, frame.pixels_dn.dtype)
 
     def read(path: Path, size_px: tuple[int, int]) -> Frame:
         if path in kept:
@@ -92,12 +105,8 @@ def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
         pixels = frame.pixels_dn
         if path.suffix.lower() not in RAW_SUFFIXES and path.stat().st_size >= pixels.nbytes:
             return frame  # uncompressed: it is read as fast from its own file
-        kept_bytes = sum(one.pixels_dn.nbytes for one in list(kept.values()))
-        with suppress(OSError):  # without room it is decoded again
-            folder.mkdir(parents=True, exist_ok=True)
-            if kept_bytes + pixels.nbytes <= _SHARE_OF_DISK * (kept_bytes + disk_usage(folder).free):
-                with TemporaryFile(dir=folder) as file:
-                    stored = mapped(file, pixels.shape, pixels.dtype)
+        with storing, suppress(OSError):  # without room it is decoded again
+            if path not in kept and (stored := room_for(frame)) is not None:
                 stored[:] = pixels
                 kept[path] = replace(frame, pixels_dn=stored)
         return frame

@@ -34,7 +34,7 @@ from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, plane_stem
 from faintfield.pipelines.formats.units import StatedUnits
 from faintfield.pipelines.reconstruction.accuracy import assess
-from faintfield.pipelines.reconstruction.channels import channel_layouts, keeping_frames
+from faintfield.pipelines.reconstruction.channels import SHARE_OF_DISK, channel_layouts, keeping_frames
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.depth_map import check_light, check_sweep, kept_depth_map, write_depth_map
 from faintfield.pipelines.reconstruction.operators import default_pitch_px, plane_grid, tilted_grid
@@ -140,7 +140,7 @@ def _refuse_surfaces(folders: list[Path]) -> None:
 
 def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: Runner) -> None:
     """Write the planes that are missing, having removed the records that vouch for earlier ones."""
-    require_room(out, sweep.needed_bytes())
+    require_room(out, int(sweep.needed_bytes() / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
     for folder in {out, *folders.values()}:
         remove_leftovers(folder)
     for folder in folders.values():

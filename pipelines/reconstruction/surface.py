@@ -28,7 +28,13 @@ from faintfield.pipelines.formats.results.surface import (
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import in_units, light_per_e, unit_of_maps
 from faintfield.pipelines.reconstruction.autofocus import imported_range_px
-from faintfield.pipelines.reconstruction.channels import ChannelLayout, channel_layouts, keeping_frames, load_channel
+from faintfield.pipelines.reconstruction.channels import (
+    SHARE_OF_DISK,
+    ChannelLayout,
+    channel_layouts,
+    keeping_frames,
+    load_channel,
+)
 from faintfield.pipelines.reconstruction.depth_accuracy import write_depth_errors
 from faintfield.pipelines.reconstruction.luminance import default_bins
 from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
@@ -99,7 +105,8 @@ def reconstruct_surface(
         return kept.surface
     layouts = channel_layouts(loaded)
     grid = plane_grid(loaded, 1.0)
-    require_room(out, _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal))
+    needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal)
+    require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
     range_mm = limits_mm(loaded, request)
     find_range = request.depth_range_mm is None and imported_range_px(loaded) is None
     remove_leftovers(out)

@@ -15,6 +15,9 @@ from faintfield.recon.operator.relief import Relief
 # Distance of the pixels at which the part of the detector that sees a window is looked for.
 _NODE_PX = 16
 
+# Largest code of a relief, in its unit.
+_LARGEST_CODE = 2**15 - 1
+
 # How homographies (view, 3, 3) to samples change with 1/depth, and where each pixel meets the surface.
 type Surface = tuple[NDArray[np.float64], Relief]
 
@@ -85,9 +88,15 @@ def window_geometry(geometry: SceneGeometry, grid: PlaneGrid, first: tuple[int, 
     moved[:2, 2] = -first[1], -first[0]
     homographies = moved @ geometry.homographies.reshape(-1, 3, 3).astype(np.float64)
     rays = geometry.maps.reshape(3, -1, rows, padded)[:2, :, :, :columns]
-    reach = np.zeros((len(homographies), rows, 2), np.intp)
+    views = len(geometry.lattice_of_view)
+    # The nearest and the farthest depth of a surface; a pixel moves along a line between them
+    ends = (-1, 1) if geometry.bent else ()
+    bends = [end * _LARGEST_CODE * float(geometry.relief_step) * homographies[views:] for end in ends]
+    depths = [homographies[:views] + bend for bend in bends] or [homographies]
+    reach = np.zeros((views, rows, 2), np.intp)
     for view, lattice in enumerate(geometry.lattice_of_view.tolist()):
-        top, bottom, left, right = _pixels_of(homographies[view], grid.shape, rays[:, lattice])
+        found = np.array([_pixels_of(depth[view], grid.shape, rays[:, lattice]) for depth in depths])
+        (top, left), (bottom, right) = found[:, ::2].min(axis=0), found[:, 1::2].max(axis=0)
         reach[view, top:bottom] = left // BLOCK_PX * BLOCK_PX, min(-(-right // BLOCK_PX) * BLOCK_PX, padded)
     return geometry._replace(
         homographies=np.ascontiguousarray(homographies, geometry.homographies.dtype).reshape(-1),

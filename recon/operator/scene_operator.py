@@ -161,7 +161,8 @@ class SceneOperator:
         """The views in which some pixel that counts sees one of the planes."""
         reach = self._geometry.reach
         reaching = np.flatnonzero((reach[:, :, 1] > reach[:, :, 0]).any(axis=1))
-        if self._geometry.valid.size == 0 and (self.response() > 0).all():
+        factors = self._geometry.valid.size + self._geometry.transmission.size
+        if factors == 0 and (self.response() > 0).all():
             return reaching  # every pixel that meets a plane counts
         return np.array([view for view in reaching.tolist() if self.sensitivity([view]).any()], np.intp)
 

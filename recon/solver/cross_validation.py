@@ -87,7 +87,7 @@ def cross_validated_weight(
     penalty : Penalty
         φ.
     level_e : float, optional
-        Mean light of the samples that the views see, in electrons; by default that of each window or plane itself.
+        Mean light of the samples that the views see, in electrons, for windows; by default that of each window.
 
     Raises
     ------

@@ -75,7 +75,7 @@ class PmlemIterate:
     passes : int
         Passes over the data so far.
     inner_steps : int
-        Steps on the dual field so far.
+        Steps of inner problems so far.
     dual : DualField
         The penalty's dual field, from which a similar problem can start.
     """

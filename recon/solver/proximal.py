@@ -41,7 +41,7 @@ class ProxResult:
     gap : float
         Bound on how much its objective exceeds the minimum, in the unit of the objective.
     steps : int
-        Steps made on the dual field.
+        Steps made.
     """
 
     plane: Image

@@ -31,8 +31,8 @@ def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
     wanted = max(_MIN_SAMPLES, _SHARE * rows * columns)
     if rows * columns < 2 * wanted or min(rows, columns) < 2 * SIDE:
         return []
-    across = round((wanted * columns / rows) ** 0.5 / SIDE)
-    down = round(wanted / SIDE**2 / across)
+    across = max(round((wanted * columns / rows) ** 0.5 / SIDE), 1)
+    down = max(round(wanted / SIDE**2 / across), 1)
     windows = []
     for row, column in np.ndindex(down, across):
         try:

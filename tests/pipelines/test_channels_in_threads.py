@@ -249,6 +249,20 @@ def test_uncompressed_frames_take_no_room(make_set: SetMaker, tmp_path: Path, mo
     assert not (tmp_path / "out").exists()
 
 
+def test_no_more_frames_are_kept_than_files_may_be_open(
+    make_set: SetMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = make_set(_pictures(4), camera={"mosaic": BAYER})
+    _compressed(folder)
+    loaded = load_set(folder)
+    monkeypatch.setattr(channels, "_MOST_KEPT", 3)
+    decoded = _decoded(monkeypatch)
+    keeping = keeping_frames(loaded, tmp_path / "out")
+    for layout in channel_layouts(loaded):
+        load_channel(keeping, layout)
+    assert len(decoded) == 1 + 4 + 2 * 1  # the layouts; the first colour; one frame for each of the others
+
+
 def test_a_folder_that_cannot_be_written_to_does_not_matter(make_set: SetMaker, tmp_path: Path) -> None:
     folder = make_set(_pictures(2))
     _compressed(folder)

@@ -7,13 +7,15 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from faintfield.calib.homography import plane_from_ray
+from faintfield.calib.homography import plane_from_ray, ray_from_surface
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
 from faintfield.recon.operator.geometry import scene_geometry, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.surface_operator import SurfaceOperator
 from faintfield.recon.solver import windows
 from faintfield.recon.solver.data_fit import SceneProblem
 from tests.recon.operator_cases import FACING_AT_500_MM, Case, cases
@@ -133,3 +135,40 @@ def test_windows_that_few_views_see_are_left_out(monkeypatch: pytest.MonkeyPatch
     left = [window.operator.grids[0].origin_mm[0] for window in windows.windows_of(problem, 4)]
     assert left
     assert min(left) >= 60
+
+
+def test_a_window_of_a_surface_keeps_all_pixels_that_see_it() -> None:
+    """Half of the surface is much nearer: its pixels lie far from where those of the other depth do."""
+    inverse_depth = np.full((90, 480), 1 / 1000)
+    inverse_depth[:, 240:] = 1 / 400
+    poses = np.zeros((3, 6))
+    poses[:, 3] = [-150.0, 0.0, 150.0]
+    rays = (np.stack(np.meshgrid(np.arange(480.0), np.arange(90.0)), axis=-1) - [240, 45]) / 800
+    grid = PlaneGrid((90, 480), 1 / 800, (-240 / 800, -45 / 800))
+    whole = SurfaceOperator(ray_from_surface(poses), rays, grid, inverse_depth, dtype=np.float64)
+    for first in (60, 330):
+        rows, columns = slice(30, 70), slice(first, first + 40)
+        window = whole.window(rows, columns)
+        # All four samples of a pixel within the window: its inner samples lose no pixel
+        inner = (slice(1, -1), slice(1, -1))
+        expected = whole.sensitivity()[rows, columns][inner]
+        np.testing.assert_allclose(window.sensitivity()[inner], expected, atol=1e-9)
+        assert expected.max() > 1
+
+
+def test_a_view_that_everything_is_hidden_from_sees_nothing() -> None:
+    rays = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), axis=-1)
+    transmission = np.ones((1, 3, 6, 8), np.float32)
+    transmission[0, 1] = 0
+    grid = PlaneGrid((6, 8), 1.0, (0.0, 0.0))
+    homographies = np.stack([np.eye(3)] * 3)[np.newaxis]
+    hidden = SceneOperator(homographies, rays, [grid], transmission=transmission)
+    assert hidden.seeing_views.tolist() == [0, 2]
+    assert SceneOperator(homographies, rays, [grid]).seeing_views.tolist() == [0, 1, 2]
+
+
+def test_a_long_plane_has_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(windows, "SIDE", 8)
+    monkeypatch.setattr(windows, "_MIN_SAMPLES", 8 * 8 * 3)
+    assert len(windows.windows_of(problem_of((2000, 16)), 4)) > 10
+    assert len(windows.windows_of(problem_of((16, 2000)), 4)) > 10

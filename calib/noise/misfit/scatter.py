@@ -71,8 +71,9 @@ def block_scatter(
 
 def _block_sums(values: NDArray[Any], used: NDArray[np.bool_], rows: int, columns: int) -> Array:
     """Return the sums (block,) of values (row, column) of the pixels in use over rows × columns blocks."""
-    row = np.arange(used.shape[0]) * rows // used.shape[0]
-    first = np.searchsorted(np.arange(used.shape[1]) * columns // used.shape[1], np.arange(columns))
+    row, column = (np.arange(size) * count // size for size, count in zip(used.shape, (rows, columns), strict=True))
+    # Small frames have blocks without pixels
+    first = np.flatnonzero(np.diff(column, prepend=-1))
 
     def work(strip: slice) -> Array:
         own = np.where(used[strip], values[strip], 0.0)
@@ -84,7 +85,7 @@ def _block_sums(values: NDArray[Any], used: NDArray[np.bool_], rows: int, column
     for block, part in zip(
         over_strips(lambda strip: np.unique(row[strip]), used.shape), over_strips(work, used.shape), strict=True
     ):
-        blocks[block] += part
+        blocks[np.ix_(block, column[first])] += part
     return blocks.ravel()
 
 

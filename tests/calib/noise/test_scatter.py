@@ -147,7 +147,7 @@ def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
     assert freedom == pytest.approx([29 * 512 * (1024 - 63) / 1024] * 2)
 
 
-@pytest.mark.parametrize("blocks", [(8, 8), (41, 1), (1, 30), (3, 7)])
+@pytest.mark.parametrize("blocks", [(8, 8), (41, 1), (1, 30), (3, 7), (3, 40)])
 def test_blocks_are_those_of_single_pixels(blocks: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
     frames = [(str(k), np.rint(rng.normal(100, 5, (41, 30)))) for k in range(4)]
