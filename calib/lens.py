@@ -28,6 +28,9 @@ _STRIP_ROWS = 32
 # Distances in pixels of the nodes between which undistorted rays are interpolated: the next if one is too wide.
 _NODES_PX = (32, 16, 8, 4)
 
+# Pixels of a detector below which each is solved: it takes no longer than loading the splines, and less memory.
+_MIN_PX = 1 << 19
+
 # Largest distance in pixels between a point in the middle of four nodes and the image of its interpolated ray. Of all
 # points of 83 lenses and distances of nodes, none was off by more than 1.3 times as much as the worst of these.
 _INTERPOLATION_PX = 5e-5
@@ -144,7 +147,7 @@ class Lens:
 
         The nodes are those of the whole detector, so that a lattice has the rays of all pixels.
         """
-        if not any(self.distortion):
+        if not any(self.distortion) or self.size_px[0] * self.size_px[1] < _MIN_PX:
             return None
         from scipy.interpolate import BSpline, make_interp_spline  # slow to load
 

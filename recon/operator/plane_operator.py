@@ -5,6 +5,7 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.geometry import Surface, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
@@ -57,7 +58,13 @@ class PlaneOperator(SceneOperator):
         self.grid = grid
         self.samples_shape = grid.shape
 
-    def window(self, rows: slice, columns: slice, workers: int | None = None) -> "PlaneOperator":
+    def window(
+        self,
+        rows: slice,
+        columns: slice,
+        workers: int | None = None,
+        kept_maps: dict[float, Image] | None = None,
+    ) -> "PlaneOperator":
         """Return H of a part of the samples, on the same images; pixels that see another part see nothing.
 
         It shares all maps with this operator, and its sweeps take about as much less time as it has fewer samples.
@@ -68,6 +75,8 @@ class PlaneOperator(SceneOperator):
             The samples, with a start and a stop.
         workers : int, optional
             Number of threads; as many as this operator has by default.
+        kept_maps : dict of float to float array (lattice, row, column), optional
+            Place for maps of numbers, which windows can share: making one takes as long as a sweep of a window.
 
         Raises
         ------
@@ -76,7 +85,7 @@ class PlaneOperator(SceneOperator):
         """
         grid = self.grid.window(rows, columns)
         part = copy(self)
-        part.workers = workers or self.workers
+        part.workers, part._kept_maps = workers or self.workers, kept_maps  # noqa: SLF001
         part._take_window(grid, window_geometry(self._geometry, grid, (rows.start, columns.start)))  # noqa: SLF001
         return part
 

@@ -87,7 +87,7 @@ class SceneOperator:
             plane_from_ray, rays, grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
         )
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
-        self._constant_maps: dict[float, Image] = {}
+        self._kept_maps: dict[float, Image] | None = None
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
         self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), geometry.lattice_of_view
         # Each pixel that sees the scene has weights that sum to its response: H 1 is known without a sweep
@@ -278,12 +278,12 @@ class SceneOperator:
         return np.ascontiguousarray(array, self.dtype)
 
     def _map(self, value: float | Image) -> Image:
-        """Return a map of all lattices; those of a number are kept, because a sweep of a window takes hardly longer."""
-        if np.ndim(value) == 0:
+        """Return a map of all lattices; those of numbers are kept if this operator has a place for them."""
+        if np.ndim(value) == 0 and self._kept_maps is not None:
             number = float(value)
-            if number not in self._constant_maps:
-                self._constant_maps[number] = np.full(self.maps_shape, number, self.dtype)
-            return self._constant_maps[number]
+            if number not in self._kept_maps:
+                self._kept_maps[number] = np.full(self.maps_shape, number, self.dtype)
+            return self._kept_maps[number]
         try:
             return np.ascontiguousarray(np.broadcast_to(value, self.maps_shape), self.dtype)
         except ValueError:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.solver.data_fit import SceneProblem
 
@@ -33,10 +34,10 @@ def windows_of(problem: SceneProblem, min_views: int) -> list[SceneProblem]:
         return []
     across = max(round((wanted * columns / rows) ** 0.5 / SIDE), 1)
     down = max(round(wanted / SIDE**2 / across), 1)
-    windows = []
+    windows, maps = [], dict[float, Image]()
     for row, column in np.ndindex(down, across):
         try:
-            window = operator.window(_middle(row, rows, down), _middle(column, columns, across), workers=1)
+            window = operator.window(_middle(row, rows, down), _middle(column, columns, across), 1, maps)
         except GeometryMismatch:  # no view sees it
             continue
         if len(window.seeing_views) >= min_views:

@@ -52,6 +52,13 @@ def test_opencv_projects_every_pixels_ray_onto_that_pixel(distortion: tuple[floa
     np.testing.assert_allclose(images_of(lens, lens.rays()), pixels, rtol=0, atol=1e-4)
 
 
+@pytest.fixture
+def interpolated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small detectors are interpolated, too."""
+    monkeypatch.setattr("faintfield.calib.lens._MIN_PX", 0)
+
+
+@pytest.mark.usefixtures("interpolated")
 @pytest.mark.parametrize("distortion", DISTORTIONS[1:])
 def test_interpolated_rays_are_those_of_every_pixel(distortion: tuple[float, ...]) -> None:
     """Also in the corners, where splines err most."""
@@ -60,6 +67,7 @@ def test_interpolated_rays_are_those_of_every_pixel(distortion: tuple[float, ...
     np.testing.assert_allclose(images_of(lens, lens.rays()), pixels_of(lens), rtol=0, atol=1e-4 + rounding_px)
 
 
+@pytest.mark.usefixtures("interpolated")
 @pytest.mark.parametrize(
     ("distortion", "fx_px", "least", "most"),
     [
@@ -82,6 +90,11 @@ def test_distortion_is_undone_at_as_many_nodes_as_it_takes(
     rays = lens.rays()
     assert least <= solved[0] / (323 * 257) < most
     np.testing.assert_allclose(images_of(lens, rays), pixels_of(lens), rtol=0, atol=1.2e-4)
+
+
+def test_of_a_small_detector_every_pixel_is_solved() -> None:
+    lens = Lens((323, 257), 350.0, 350.0, 150.4, 131.1, (-0.2, 0.05, 1e-3, -2e-3, 0.01))
+    np.testing.assert_array_equal(lens.rays().reshape(-1, 2), lens.rays_at(pixels_of(lens)).astype(np.float32))
 
 
 def test_rays_take_little_more_memory_than_they_have() -> None:
