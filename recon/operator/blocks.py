@@ -2,15 +2,15 @@
 """A block of pixels of one detector row, compiled: what it sees of all planes, and the adjoint.
 
 On a plane whose pitch is about depth / f, pixels advance almost in step with the samples: pixel k of a block sees
-column `c₀ + k + t[k]` and row `r₀ + u[k]`, with small t and u. Where 0 ≤ t < `COLUMN_TAPS` − 1 and
-0 ≤ u < `ROW_TAPS` − 1 hold for the whole block, bilinear interpolation is a sum over taps, each a tent function times
-*neighbouring* samples,
+column `c₀ + a k + t[k]` and row `r₀ + u[k]`, with small t and u and the advance a = 1, or 2 for a lattice of a mosaic.
+Where 0 ≤ t < `COLUMN_TAPS` − 1 and 0 ≤ u < `ROW_TAPS` − 1 hold for the whole block, bilinear interpolation is a sum
+over taps, each a tent function times samples that lie side by side, or every other one,
 
-    (H f)[k] = Σᵢ Σⱼ tent(u[k] − i) tent(t[k] − j) f[r₀ + i, c₀ + j + k],    tent(x) = max(0, 1 − |x|),
+    (H f)[k] = Σᵢ Σⱼ tent(u[k] − i) tent(t[k] − j) f[r₀ + i, c₀ + j + a k],    tent(x) = max(0, 1 − |x|),
 
 in which all but four weights are zero. The sum reads more samples than necessary, but is many times faster: it has no
 branches and no index tables, and it loads, adds and stores vectors in both directions. Blocks that are not in step are
-done pixel by pixel.
+tried as two halves, as the edges of a distorted picture are, and else done pixel by pixel.
 
 All arrays are flat and indexed with offsets: making a slice per block would cost more than the block's arithmetic.
 """
@@ -23,9 +23,11 @@ from faintfield.recon.operator.placement import (
     COLUMN,
     COUNTED,
     EXPECTED,
+    HALF_PX,
     IN_STEP_2_2,
     IN_STEP_2_3,
     IN_STEP_3_3,
+    LAYOUT_SIZE,
     MARGIN,
     OUTSIDE,
     PRODUCT_PX,
@@ -34,6 +36,7 @@ from faintfield.recon.operator.placement import (
     ROW_TAPS,
     SCATTERED,
     WEIGHT,
+    half_of,
     place_of,
     weights_of,
 )
@@ -43,13 +46,12 @@ _LINE_PX = 16
 
 
 @compiled
-def weigh(factors, pixel, to_next_plane, planes, count, scratch):
+def weigh(factors, pixel, planes, count, scratch):
     """Multiply the weights of a block's pixels on every plane."""
     for plane in range(index(planes)):
         weight = weights_of(plane)
         for k in range(count):
             scratch[weight + k] *= type(scratch[0])(factors[pixel + k])
-        pixel += to_next_plane
 
 
 @inlined
@@ -72,34 +74,60 @@ def gather(samples, layout, planes, scratch, blocks):
         for k in range(index(BLOCK_PX)):
             scratch[index(COUNTED) + k] = zero
     for plane in range(index(planes)):
-        block, place, width = index(4) * plane, place_of(plane), layout[index(3) * plane + index(2)]
-        if blocks[block] == OUTSIDE:
-            continue
-        if planes > 1:
+        if planes > 1 and meets(plane, blocks):
             for k in range(index(BLOCK_PX)):
                 at = index(COUNTED) + k
-                scratch[at] = max(scratch[at], scratch[place + index(WEIGHT) + k])
-        if blocks[block] > SCATTERED:
-            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
-            prefetch_block(samples, start + ROW_TAPS * width)
-            gather_in_step(blocks[block], samples, start, width, row, column, scratch, place)
-        else:
-            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
-            gather_scattered(samples, start, height, width, scratch, place)
+                scratch[at] = max(scratch[at], scratch[weights_of(plane) + k])
+        gather_plane(samples, layout, plane, scratch, blocks)
 
 
 @compiled
 def scatter(samples, layout, planes, scratch, blocks):
     """Add `EXPECTED` to all planes."""
     for plane in range(index(planes)):
-        block, place, width = index(4) * plane, place_of(plane), layout[index(3) * plane + index(2)]
-        if blocks[block] > SCATTERED:
-            start, row, column = blocks[block + index(1)], blocks[block + index(2)], blocks[block + index(3)]
+        scatter_plane(samples, layout, plane, scratch, blocks)
+
+
+@inlined
+def meets(plane, blocks):
+    """Return whether a block's pixels see a plane."""
+    return blocks[half_of(plane, index(0))] != OUTSIDE or blocks[half_of(plane, index(1))] != OUTSIDE
+
+
+@compiled
+def gather_plane(samples, layout, plane, scratch, blocks):
+    """Add to `EXPECTED` what a block's pixels see of one plane."""
+    place, on_plane = place_of(plane), advanced(layout, index(LAYOUT_SIZE) * plane)
+    for number in range(2):
+        half, first = advanced(blocks, half_of(plane, index(number))), index(number * HALF_PX)
+        how, start, width = half[index(0)], half[index(1)], on_plane[index(2)]
+        if how > SCATTERED:
             prefetch_block(samples, start + ROW_TAPS * width)
-            scatter_in_step(blocks[block], samples, start, width, row, column, scratch, place)
-        elif blocks[block] == SCATTERED:
-            start, height = layout[index(3) * plane], layout[index(3) * plane + index(1)]
-            scatter_scattered(samples, start, height, width, scratch, place)
+            taps = advanced(samples, index(start))
+            if on_plane[index(3)] == 1:
+                _gather_side_by_side(how, taps, width, half, scratch, place, first)
+            else:
+                _gather_every_other(how, taps, width, half, scratch, place, first)
+        elif how == SCATTERED:
+            _gather_scattered(samples, on_plane, scratch, place, first)
+
+
+@compiled
+def scatter_plane(samples, layout, plane, scratch, blocks):
+    """Add `EXPECTED` to one plane."""
+    place, on_plane = place_of(plane), advanced(layout, index(LAYOUT_SIZE) * plane)
+    for number in range(2):
+        half, first = advanced(blocks, half_of(plane, index(number))), index(number * HALF_PX)
+        how, start, width = half[index(0)], half[index(1)], on_plane[index(2)]
+        if how > SCATTERED:
+            prefetch_block(samples, start + ROW_TAPS * width)
+            taps = advanced(samples, index(start))
+            if on_plane[index(3)] == 1:
+                _scatter_side_by_side(how, taps, width, half, scratch, place, first)
+            else:
+                _scatter_every_other(how, taps, width, half, scratch, place, first)
+        elif how == SCATTERED:
+            _scatter_scattered(samples, on_plane, scratch, place, first)
 
 
 @compiled
@@ -110,31 +138,47 @@ def copy(source, at, target, to, count):
 
 
 @compiled
-def gather_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
-    """Interpolate with as few taps as the block needs; each number of taps is compiled separately."""
-    samples = advanced(samples, index(start))
+def _gather_side_by_side(how, samples, stride, half, scratch, place, first):
+    """Interpolate between samples side by side with as few taps as the pixels need, each number compiled separately."""
     if how == IN_STEP_2_2:
-        _gather_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
+        _gather_taps(2, 2, 1, samples, stride, half, scratch, place, first)
     elif how == IN_STEP_2_3:
-        _gather_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
+        _gather_taps(2, 3, 1, samples, stride, half, scratch, place, first)
     elif how == IN_STEP_3_3:
-        _gather_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+        _gather_taps(3, 3, 1, samples, stride, half, scratch, place, first)
     else:
-        _gather_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+        _gather_taps(3, 4, 1, samples, stride, half, scratch, place, first)
 
 
 @compiled
-def scatter_in_step(how, samples, start, stride, row_from, column_from, scratch, place):
-    """Scatter with the taps of `gather_in_step`."""
-    samples = advanced(samples, index(start))
-    if how == IN_STEP_2_2:
-        _scatter_taps(2, 2, samples, stride, row_from, column_from, scratch, place)
-    elif how == IN_STEP_2_3:
-        _scatter_taps(2, 3, samples, stride, row_from, column_from, scratch, place)
-    elif how == IN_STEP_3_3:
-        _scatter_taps(3, 3, samples, stride, row_from, column_from, scratch, place)
+def _gather_every_other(how, samples, stride, half, scratch, place, first):
+    """Interpolate where pixels advance by two samples."""
+    if how <= IN_STEP_2_3:
+        _gather_taps(2, 3, 2, samples, stride, half, scratch, place, first)
     else:
-        _scatter_taps(3, 4, samples, stride, row_from, column_from, scratch, place)
+        _gather_taps(3, 4, 2, samples, stride, half, scratch, place, first)
+
+
+@compiled
+def _scatter_side_by_side(how, samples, stride, half, scratch, place, first):
+    """Scatter with the taps of `_gather_side_by_side`."""
+    if how == IN_STEP_2_2:
+        _scatter_taps(2, 2, 1, samples, stride, half, scratch, place, first)
+    elif how == IN_STEP_2_3:
+        _scatter_taps(2, 3, 1, samples, stride, half, scratch, place, first)
+    elif how == IN_STEP_3_3:
+        _scatter_taps(3, 3, 1, samples, stride, half, scratch, place, first)
+    else:
+        _scatter_taps(3, 4, 1, samples, stride, half, scratch, place, first)
+
+
+@compiled
+def _scatter_every_other(how, samples, stride, half, scratch, place, first):
+    """Scatter with the taps of `_gather_every_other`."""
+    if how <= IN_STEP_2_3:
+        _scatter_taps(2, 3, 2, samples, stride, half, scratch, place, first)
+    else:
+        _scatter_taps(3, 4, 2, samples, stride, half, scratch, place, first)
 
 
 @inlined
@@ -156,20 +200,20 @@ def _row_weights(down, rows):
 
 
 @inlined
-def _gather_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
-    """Add to `EXPECTED` what the block's pixels see: the plane, interpolated bilinearly, times the weight."""
+def _gather_taps(rows, columns, advance, samples, stride, half, scratch, place, first):
+    """Add to `EXPECTED` what the pixels see: the plane, interpolated bilinearly, times the weight."""
     number = type(scratch[0])
-    row, column = number(row_from), number(column_from)
-    across, down = advanced(scratch, place + index(COLUMN)), advanced(scratch, place + index(ROW))
-    weights = advanced(scratch, place + index(WEIGHT))
-    for k in range(index(BLOCK_PX)):
-        along = across[k] - column
+    row, column = number(half[index(2)]), number(half[index(3)])
+    across, down = advanced(scratch, place + index(COLUMN) + first), advanced(scratch, place + index(ROW) + first)
+    weights, expected = advanced(scratch, place + index(WEIGHT) + first), advanced(scratch, index(EXPECTED) + first)
+    for k in range(index(half[index(4)])):
+        along, at = across[k] - column, index(advance) * k
         u0, u1, u2 = _row_weights(down[k] - row, rows)
-        seen = u0 * _along_row(columns, along, samples, k)
-        seen += u1 * _along_row(columns, along, samples, index(stride) + k)
+        seen = u0 * _along_row(columns, along, samples, at)
+        seen += u1 * _along_row(columns, along, samples, index(stride) + at)
         if rows > 2:
-            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + k)
-        scratch[index(EXPECTED) + k] += weights[k] * seen
+            seen += u2 * _along_row(columns, along, samples, index(2 * stride) + at)
+        expected[k] += weights[k] * seen
 
 
 @inlined
@@ -186,21 +230,21 @@ def _along_row(columns, along, samples, at):
 
 
 @inlined
-def _scatter_taps(rows, columns, samples, stride, row_from, column_from, scratch, place):
+def _scatter_taps(rows, columns, advance, samples, stride, half, scratch, place, first):
     """Add `EXPECTED` to the plane with the weights that `_gather_taps` reads it with.
 
     The products of all taps are formed first and then added, shifted, once per row of samples: the processor would
     have to wait for stores that overlap with loads soon after. A pixel that does not count may hold anything, even NaN.
     """
     number = type(scratch[0])
-    row, column, zero = number(row_from), number(column_from), number(0)
-    across, down = advanced(scratch, place + index(COLUMN)), advanced(scratch, place + index(ROW))
-    weights = advanced(scratch, place + index(WEIGHT))
-    size = index(PRODUCT_PX)
+    row, column, zero = number(half[index(2)]), number(half[index(3)]), number(0)
+    across, down = advanced(scratch, place + index(COLUMN) + first), advanced(scratch, place + index(ROW) + first)
+    weights, expected = advanced(scratch, place + index(WEIGHT) + first), advanced(scratch, index(EXPECTED) + first)
+    size, pixels = index(PRODUCT_PX), index(half[index(4)])
     upper = advanced(scratch, index(PRODUCTS))
     middle, lower = advanced(upper, index(columns) * size), advanced(upper, index(2 * columns) * size)
-    for k in range(index(BLOCK_PX)):
-        value = weights[k] * scratch[index(EXPECTED) + k] if weights[k] != zero else zero
+    for k in range(pixels):
+        value = weights[k] * expected[k] if weights[k] != zero else zero
         along = across[k] - column
         u0, u1, u2 = _row_weights(down[k] - row, rows)
         for tap in range(columns):
@@ -209,33 +253,48 @@ def _scatter_taps(rows, columns, samples, stride, row_from, column_from, scratch
             middle[index(tap) * size + k] = u1 * share
             if rows > 2:
                 lower[index(tap) * size + k] = u2 * share
+    if pixels < index(BLOCK_PX):  # an earlier block has left its products behind those of half a block
+        for tap in range(rows * columns):
+            for k in range(index(MARGIN)):
+                upper[index(tap) * size + pixels + k] = zero
     for r in range(rows):
         products, target = advanced(upper, index(r * columns) * size), advanced(samples, index(r * stride))
-        for k in range(index(BLOCK_PX + MARGIN)):
-            added = products[k]
-            for tap in range(1, columns):
-                added += products[index(tap) * (size - index(1)) + k]
-            target[k] += added
+        for k in range(pixels + index(MARGIN)):
+            if advance == 1:
+                added = products[k]
+                for tap in range(1, columns):
+                    added += products[index(tap) * (size - index(1)) + k]
+                target[k] += added
+            else:
+                even, odd = products[k], products[size + k]
+                if columns > 2:
+                    even += products[index(2) * size - index(1) + k]
+                if columns > 3:
+                    odd += products[index(3) * size - index(1) + k]
+                target[index(2) * k] += even
+                target[index(2) * k + index(1)] += odd
 
 
 @inlined
-def _corner(scratch, place, k, start, height, stride):
+def _corner(scratch, place, k, start, height, stride, advance):
     """Return the upper left of the four samples around a pixel's point, and the point's distances down and right."""
     number = type(scratch[0])
-    column = scratch[place + index(COLUMN) + k] + number(np.int32(k))
+    column = scratch[place + index(COLUMN) + k] + number(np.int32(k)) * advance
     row = scratch[place + index(ROW) + k]
     left, upper = min(np.int32(column), np.int32(stride - 2)), min(np.int32(row), np.int32(height - 2))
     return index(start + np.intp(upper) * stride + np.intp(left)), row - number(upper), column - number(left)
 
 
 @compiled
-def gather_scattered(samples, start, height, stride, scratch, place):
+def _gather_scattered(samples, layout, scratch, place, first):
     """Add to `EXPECTED` what the block's pixels see, pixel by pixel."""
+    start, height, stride = layout[index(0)], layout[index(1)], layout[index(2)]
+    advance = type(scratch[0])(layout[index(3)])
     zero, one, below = type(scratch[0])(0), index(1), index(stride)
-    for k in range(index(BLOCK_PX)):
+    for k in range(first, first + index(HALF_PX)):
         weight = scratch[place + index(WEIGHT) + k]
         if weight != zero:
-            at, down, right = _corner(scratch, place, k, start, height, stride)
+            at, down, right = _corner(scratch, place, k, start, height, stride, advance)
             upper, lower = samples[at], samples[at + below]
             upper += right * (samples[at + one] - upper)
             lower += right * (samples[at + below + one] - lower)
@@ -243,13 +302,15 @@ def gather_scattered(samples, start, height, stride, scratch, place):
 
 
 @compiled
-def scatter_scattered(samples, start, height, stride, scratch, place):
+def _scatter_scattered(samples, layout, scratch, place, first):
     """Add `EXPECTED` to the plane with the same weights, pixel by pixel."""
+    start, height, stride = layout[index(0)], layout[index(1)], layout[index(2)]
+    advance = type(scratch[0])(layout[index(3)])
     zero, one, below = type(scratch[0])(0), index(1), index(stride)
-    for k in range(index(BLOCK_PX)):
+    for k in range(first, first + index(HALF_PX)):
         weight = scratch[place + index(WEIGHT) + k]
         if weight != zero:
-            at, down, right = _corner(scratch, place, k, start, height, stride)
+            at, down, right = _corner(scratch, place, k, start, height, stride, advance)
             value = weight * scratch[index(EXPECTED) + k]
             lower = value * down
             upper = value - lower

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
-from faintfield.recon.operator.placement import BLOCK_PX
+from faintfield.recon.operator.placement import BLOCK_PX, LARGEST_ADVANCE
 from faintfield.recon.operator.relief import Relief
 
 # Distance of the pixels at which the part of the detector that sees a window is looked for.
@@ -28,7 +28,6 @@ def scene_geometry(
     grids: Sequence[PlaneGrid],
     flat: NDArray[Any] | None,
     valid: NDArray[np.bool_] | None,
-    transmission: NDArray[Any] | None,
     lattice_of_view: NDArray[np.intp] | None,
     dtype: np.dtype[Any],
     surface: Surface | None = None,
@@ -40,7 +39,7 @@ def scene_geometry(
     Raises
     ------
     GeometryMismatch
-        Shapes do not fit together, a number is not finite, or a response or transmission is negative.
+        Shapes do not fit together, a number is not finite, or a response is negative.
     """
     lattices, detector = len(rays), rays.shape[1:3]
     planes, views = len(grids), plane_from_ray.shape[1] if plane_from_ray.ndim == 4 else 0
@@ -51,26 +50,26 @@ def scene_geometry(
         )
     flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
-    transmission = np.zeros((0, 0, 0, 0), dtype) if transmission is None else np.ascontiguousarray(transmission, dtype)
     lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
-    _check_shapes(flat, valid, transmission, lattice_of_view, (planes, views, lattices, *detector))
-    _check_numbers(plane_from_ray, rays, flat, transmission)
+    _check_shapes(flat, valid, lattice_of_view, (views, lattices, *detector))
+    _check_numbers(plane_from_ray, rays, flat)
     rows, columns = (int(size) for size in detector)
     padded = -(-columns // BLOCK_PX) * BLOCK_PX
     maps = np.full((3, lattices, rows, padded), np.nan, dtype)
     maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
     homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
+    middle = views // 2, lattice_of_view[views // 2]
+    advances = [_advance(matrices[middle[0]], maps[:2, middle[1], :, :columns]) for matrices in homographies]
     starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
     slopes, relief = surface or (np.zeros((0, 3, 3)), Relief(np.zeros((0, 0, 0), np.int16), 0.0, 0.0))
     homographies = np.concatenate([homographies.reshape(-1, 3, 3), slopes])
     return SceneGeometry(
         np.ascontiguousarray(homographies, dtype).reshape(-1),
-        np.column_stack([starts, [grid.shape for grid in grids]]).astype(np.intp),
+        np.column_stack([starts, [grid.shape for grid in grids], advances]).astype(np.intp),
         lattice_of_view,
         (rows, columns, padded),
         maps.reshape(-1),
         valid.reshape(-1).view(np.uint8),
-        transmission.reshape(-1),
         relief.codes.reshape(-1),
         dtype.type(relief.step),
         () if surface is None else (True,),
@@ -100,9 +99,19 @@ def window_geometry(geometry: SceneGeometry, grid: PlaneGrid, first: tuple[int, 
         reach[view, top:bottom] = left // BLOCK_PX * BLOCK_PX, min(-(-right // BLOCK_PX) * BLOCK_PX, padded)
     return geometry._replace(
         homographies=np.ascontiguousarray(homographies, geometry.homographies.dtype).reshape(-1),
-        layout=np.array([[0, *grid.shape]], np.intp),
+        layout=np.array([[0, *grid.shape, geometry.layout[0, 3]]], np.intp),
         reach=reach,
     )
+
+
+def _advance(homography: NDArray[np.float64], rays: NDArray[Any]) -> int:
+    """Return how many samples about the middle pixel lies beyond the one before, at most `LARGEST_ADVANCE`."""
+    row, column = rays.shape[1] // 2, rays.shape[2] // 2
+    x, y = rays[:, row, max(column - 1, 0) : column + 1].astype(np.float64)
+    moved, _, scale = homography @ np.stack([x, y, np.ones_like(x)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        advance = np.ptp(moved / scale)
+    return int(np.clip(np.round(advance), 1, LARGEST_ADVANCE)) if np.isfinite(advance) else 1
 
 
 def _pixels_of(
@@ -142,16 +151,13 @@ def _nodes(count: int) -> NDArray[np.intp]:
 def _check_shapes(
     flat: NDArray[Any],
     valid: NDArray[Any],
-    transmission: NDArray[Any],
     lattice_of_view: NDArray[np.intp],
-    sizes: tuple[int, int, int, int, int],
+    sizes: tuple[int, int, int, int],
 ) -> None:
     """Refuse maps of pixels of the wrong shape, and lattices that do not exist."""
-    planes, views, lattices, *detector = sizes
-    shapes = {"valid": (valid, (views, *detector)), "transmission": (transmission, (planes, views, *detector))}
-    for name, (part, shape) in shapes.items():
-        if part.size and part.shape != shape:
-            raise GeometryMismatch(f"{name} has shape {part.shape}, the pixels {shape}; give it that shape")
+    views, lattices, *detector = sizes
+    if valid.size and valid.shape != (views, *detector):
+        raise GeometryMismatch(f"valid has shape {valid.shape}, the pixels {(views, *detector)}; give it that shape")
     if flat.shape not in ((1, *detector), (lattices, *detector)):
         raise GeometryMismatch(
             f"flat {flat.shape} does not fit rays {(lattices, *detector, 2)}; give one per lattice, or one"
@@ -163,14 +169,9 @@ def _check_shapes(
         )
 
 
-def _check_numbers(
-    plane_from_ray: NDArray[Any], rays: NDArray[Any], flat: NDArray[Any], transmission: NDArray[Any]
-) -> None:
+def _check_numbers(plane_from_ray: NDArray[Any], rays: NDArray[Any], flat: NDArray[Any]) -> None:
     """Refuse numbers that are not finite, and negative light."""
-    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat, transmission)):
-        raise GeometryMismatch(
-            "a pose, ray, flat field or transmission is not a finite number; check the calibration they came from"
-        )
-    for name, part in (("flat field", flat), ("transmission", transmission)):
-        if (part < 0).any():
-            raise GeometryMismatch(f"the {name} is negative somewhere, {part.min():.3g} at least; measure it again")
+    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):
+        raise GeometryMismatch("a pose, ray or flat field is not a finite number; check the calibration they came from")
+    if (flat < 0).any():
+        raise GeometryMismatch(f"the flat field is negative somewhere, {flat.min():.3g} at least; measure it again")

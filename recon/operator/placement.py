@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from faintfield.recon.likelihood.pixel_models import WORK_ROWS
 from faintfield.recon.numba_tools import advanced, compiled, index, inlined
 
-# Pixels of a block.
-BLOCK_PX = 64
+# Pixels of a block, and of the halves that a block is divided into where it is not in step with a plane.
+BLOCK_PX, HALF_PX = 64, 32
 
 # Largest numbers of taps of a block that is in step with a plane.
 COLUMN_TAPS, ROW_TAPS = 4, 3
@@ -22,7 +22,7 @@ _LINE_BYTES = 64
 EXPECTED, COUNTED = 0, BLOCK_PX
 
 # Then the products of each tap. Each row of products has a margin on either side that stays zero.
-MARGIN = 16
+MARGIN = 8
 PRODUCT_PX = BLOCK_PX + 2 * MARGIN
 PRODUCTS = 2 * BLOCK_PX + MARGIN
 
@@ -44,6 +44,14 @@ UNSEEN = -(2**15)
 # How a block lies on a plane; the last four are in step with it, with so many rows and columns of taps.
 OUTSIDE, SCATTERED, IN_STEP_2_2, IN_STEP_2_3, IN_STEP_3_3, IN_STEP_3_4 = 0, 1, 2, 3, 4, 5
 
+# Columns of `layout`: a plane's first sample, rows, columns, and the samples that it advances by from pixel to pixel.
+LAYOUT_SIZE = 4
+LARGEST_ADVANCE = 2
+
+# Numbers of each half in `blocks`: how it lies, the first sample of its taps, that sample's row and column, and its
+# pixels. Where the block is in step as a whole, the first half stands for both.
+_HALF_SIZE = 5
+
 
 class BlockWorkspace(NamedTuple):
     """The arrays that a worker needs to itself.
@@ -54,8 +62,9 @@ class BlockWorkspace(NamedTuple):
         The rows above.
     models : array (WORK_ROWS, BLOCK_PX)
         Scratch of the pixel models.
-    blocks : int array (plane × 4,)
-        How the block lies on each plane, the first sample of its taps, and that sample's row and column.
+    blocks : int array (plane × half × 5,)
+        How the halves of the block lie on each plane, the first sample of their taps, its row and column, and the
+        number of pixels.
     """
 
     scratch: NDArray[Any]
@@ -69,7 +78,7 @@ def make_workspace(planes: int, dtype: np.dtype[Any]) -> BlockWorkspace:
     raw = np.zeros(size + _LINE_BYTES // dtype.itemsize, dtype)
     skipped = -raw.ctypes.data % _LINE_BYTES // dtype.itemsize
     models = np.zeros((WORK_ROWS, BLOCK_PX), dtype)
-    return BlockWorkspace(raw[skipped : skipped + size], models, np.zeros(4 * planes, np.intp))
+    return BlockWorkspace(raw[skipped : skipped + size], models, np.zeros(2 * _HALF_SIZE * planes, np.intp))
 
 
 @inlined
@@ -84,49 +93,57 @@ def weights_of(plane):
     return place_of(plane) + index(WEIGHT)
 
 
+@inlined
+def half_of(plane, half):
+    """Return where the numbers of half a block begin in `blocks`."""
+    return index(_HALF_SIZE) * (index(2) * plane + half)
+
+
 @compiled
 def locate_on_all(homographies, matrix, views, layout, planes, samples, maps, layer, pixel, bent, scratch, blocks):
     """Find where a block of pixels lies on every plane; return whether it sees any.
 
-    `blocks` (plane × 4,) receives how it lies there, the first sample of its taps, and that sample's row and column.
+    `blocks` (plane × half × 5,) receives how it lies there.
     """
     meets = False
     for plane in range(index(planes)):
-        start = layout[index(3) * plane]
-        height, width = layout[index(3) * plane + index(1)], layout[index(3) * plane + index(2)]
-        row_from, row_to, column_from, column_to = _locate(
-            homographies, matrix + index(9) * plane * views, index(9) * views, maps, layer, pixel, bent, height, width,
-            scratch, place_of(plane),
-        )  # fmt: skip
-        start += row_from * width + column_from
-        how = _arrangement(row_from, row_to, column_from, column_to, start, width, samples)
-        block = index(4) * plane
-        blocks[block], blocks[block + index(1)] = how, start
-        blocks[block + index(2)], blocks[block + index(3)] = row_from, column_from
-        meets |= how != OUTSIDE
+        on_plane = advanced(layout, index(LAYOUT_SIZE) * plane)
+        matrices = advanced(homographies, matrix + index(9) * plane * views)
+        place, first_half, second_half = place_of(plane), half_of(plane, index(0)), half_of(plane, index(1))
+        whole = _locate(matrices, index(9) * views, maps, layer, pixel, bent, on_plane, scratch, place)
+        _arrange(whole, on_plane, samples, blocks, first_half, index(0), index(BLOCK_PX))
+        blocks[second_half] = OUTSIDE
+        meets |= blocks[first_half] != OUTSIDE
+        if blocks[first_half] == SCATTERED:
+            for half in range(2):
+                first = index(half * HALF_PX)
+                ranges = _ranges(scratch, place + first)
+                _arrange(ranges, on_plane, samples, blocks, half_of(plane, index(half)), first, index(HALF_PX))
     return meets
 
 
 @compiled
-def _locate(homographies, matrix, to_slopes, maps, layer, pixel, bent, height, width, scratch, place):
-    """Find where a block's rays meet a plane; return the range of the rows, and that of column minus pixel.
+def _locate(homographies, to_slopes, maps, layer, pixel, bent, layout, scratch, place):
+    """Find where the rays of a block meet a plane; return the ranges of rows, and of columns less the advance.
 
-    Rows `_COLUMN` (minus the pixel's number), `_ROW` and `_WEIGHT` of `place` are written. The weight is the pixel's
-    response, or zero where it does not see the plane: all four samples must exist, so that no edge of the plane dims
-    the model, but points up to `EDGE_TOLERANCE` outside count as on the edge. If no pixel sees it, ranges are empty.
+    Rows `COLUMN` (less the pixel's number times the advance), `ROW` and `WEIGHT` of `place` are written. The weight is
+    the pixel's response, or zero where it does not see the plane: all four samples must exist, so that no edge of the
+    plane dims the model, but points up to `EDGE_TOLERANCE` outside count as on the edge. If no pixel sees it, ranges
+    are empty.
     """
     number = type(scratch[0])  # Python numbers would promote float32 to float64
     zero, one, margin = number(0), number(1), number(EDGE_TOLERANCE)
-    last_row, last_column = number(height - 1), number(width - 1)
+    last_row, last_column = number(layout[index(1)] - 1), number(layout[index(2)] - 1)
+    advance = number(layout[index(3)])
     greatest, least = np.int32(2**30), np.int32(-(2**30))
     row_from, row_to, column_from, column_to = greatest, least, greatest, least
     # In local variables, or the compiler would load them again for every pixel, after each store to the scratch
-    a, b, c = homographies[matrix], homographies[matrix + index(1)], homographies[matrix + index(2)]
-    d, e, f = homographies[matrix + index(3)], homographies[matrix + index(4)], homographies[matrix + index(5)]
-    g, h, i = homographies[matrix + index(6)], homographies[matrix + index(7)], homographies[matrix + index(8)]
+    a, b, c = homographies[index(0)], homographies[index(1)], homographies[index(2)]
+    d, e, f = homographies[index(3)], homographies[index(4)], homographies[index(5)]
+    g, h, i = homographies[index(6)], homographies[index(7)], homographies[index(8)]
     p, q, r, s, t, u = zero, zero, zero, zero, zero, zero
     if len(bent) > 0:
-        slopes = advanced(homographies, matrix + to_slopes)
+        slopes = advanced(homographies, to_slopes)
         p, q, r = slopes[index(0)], slopes[index(1)], slopes[index(2)]
         s, t, u = slopes[index(3)], slopes[index(4)], slopes[index(5)]
     for k in range(index(BLOCK_PX)):
@@ -146,14 +163,29 @@ def _locate(homographies, matrix, to_slopes, maps, layer, pixel, bent, height, w
         within_row = within_row if within_row < last_row else last_row
         # scale > 0 also means that the plane is in front of the camera
         sees = (scale > zero) & (abs(column - within_column) <= margin) & (abs(row - within_row) <= margin)
-        advance = within_column - number(np.int32(k))
-        scratch[place + index(COLUMN) + k] = advance
+        beyond = within_column - number(np.int32(k)) * advance
+        scratch[place + index(COLUMN) + k] = beyond
         scratch[place + index(ROW) + k] = within_row
         scratch[place + index(WEIGHT) + k] = response if sees else zero
-        whole_column, whole_row = np.int32(np.floor(advance)), np.int32(within_row)
+        whole_column, whole_row = np.int32(np.floor(beyond)), np.int32(within_row)
         row_from, row_to = min(row_from, whole_row if sees else greatest), max(row_to, whole_row if sees else least)
         column_from = min(column_from, whole_column if sees else greatest)
         column_to = max(column_to, whole_column if sees else least)
+    return row_from, row_to, column_from, column_to
+
+
+@compiled
+def _ranges(scratch, place):
+    """Return the ranges of `_locate` for half a block that it has placed."""
+    zero, greatest, least = type(scratch[0])(0), np.int32(2**30), np.int32(-(2**30))
+    row_from, row_to, column_from, column_to = greatest, least, greatest, least
+    for k in range(index(HALF_PX)):
+        counts = scratch[place + index(WEIGHT) + k] != zero
+        row = np.int32(scratch[place + index(ROW) + k])
+        column = np.int32(np.floor(scratch[place + index(COLUMN) + k]))
+        row_from, row_to = min(row_from, row if counts else greatest), max(row_to, row if counts else least)
+        column_from = min(column_from, column if counts else greatest)
+        column_to = max(column_to, column if counts else least)
     return row_from, row_to, column_from, column_to
 
 
@@ -169,19 +201,26 @@ def unpack_relief(relief, at, count, step, scratch):
 
 
 @inlined
-def _arrangement(row_from, row_to, column_from, column_to, start, stride, samples):
-    """Return how a block lies on a plane.
+def _arrange(ranges, layout, samples, blocks, half, first, pixels):
+    """Set how some pixels of a block lie on a plane, given the ranges of their rows and columns.
 
     Taps of pixels that do not see the plane may lie outside it: their weights are zero, but the samples must exist.
     """
-    if row_to < row_from:
-        return OUTSIDE
+    row_from, row_to, column_from, column_to = ranges
+    stride, advance = layout[index(2)], layout[index(3)]
+    start = layout[index(0)] + row_from * stride + column_from + np.intp(first) * advance
+    end = start + (ROW_TAPS - 1) * stride + np.intp(pixels + index(MARGIN)) * advance
     rows, columns = row_to - row_from + 2, column_to - column_from + 2
-    end = start + (ROW_TAPS - 1) * stride + BLOCK_PX + MARGIN
-    if rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
-        return SCATTERED
-    if columns > 3:
-        return IN_STEP_3_4
-    if rows > 2:
-        return IN_STEP_3_3
-    return IN_STEP_2_3 if columns > 2 else IN_STEP_2_2
+    how = IN_STEP_3_4
+    if row_to < row_from:
+        how = OUTSIDE
+    elif rows > ROW_TAPS or columns > COLUMN_TAPS or start < 0 or end > samples:
+        how = SCATTERED
+    elif columns <= 3:
+        if rows > 2:
+            how = IN_STEP_3_3
+        else:
+            how = IN_STEP_2_3 if columns > 2 else IN_STEP_2_2
+    blocks[half], blocks[half + index(1)] = how, start
+    blocks[half + index(2)], blocks[half + index(3)] = row_from, column_from
+    blocks[half + index(4)] = np.intp(pixels)

@@ -6,6 +6,7 @@ import numpy as np
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 
@@ -29,13 +30,13 @@ def planes_displaced_by(
     shifts: Sequence[Image],
     shape: tuple[int, int] = SHAPE,
     *,
-    transmission: Image | None = None,
+    occluders: Occluders | None = None,
     dtype: type[np.float32] | type[np.float64] = np.float32,
 ) -> SceneOperator:
     """Several planes of one shape, each displaced by its own shifts (view, 2) in the views."""
     homographies = np.stack([_homographies(of_plane) for of_plane in shifts])
     grids = [PlaneGrid(shape, 1.0, (0.0, 0.0))] * len(shifts)
-    return SceneOperator(homographies, _rays(shape), grids, transmission=transmission, workers=1, dtype=dtype)
+    return SceneOperator(homographies, _rays(shape), grids, occluders=occluders, workers=1, dtype=dtype)
 
 
 def dark_images(operator: SceneOperator, background_e: float, variance_e2: float) -> ElementalImages:

@@ -85,6 +85,23 @@ def test_wide_views_at_scale_one_keep_the_contract(
     check_linear_operator(PlaneOperator(homographies, rays, grid, dtype=np.float64, workers=workers))
 
 
+@pytest.mark.parametrize("advance", [1, 2, 3])
+def test_h_is_bilinear_in_whole_blocks_then_in_halves_then_pixel_by_pixel(advance: int) -> None:
+    generator = np.random.default_rng(advance)
+    even = 0.3 + advance * np.arange(64.0)
+    halves = np.concatenate([even[:32] + 40, even[32:] + 30.2])  # a jump, as between two halves in step
+    columns = np.concatenate([even, halves, generator.uniform(0, 299, 64), even + 7.5, halves])
+    rows = np.array([0.2, 1.0, 2.6])
+    rays = np.stack(np.meshgrid(columns, rows), axis=-1)
+    middle = rays.shape[1] // 2
+    rays[1, middle - 1 : middle + 1, 0] = 50.0, 50.0 + advance  # the advance is that of the middle pixel
+    operator = PlaneOperator(np.eye(3)[np.newaxis], rays, PlaneGrid((4, 300), 1.0, (0.0, 0.0)), dtype=np.float64)
+    weights = np.stack([np.outer(tent(row, 4), tent(column, 300)).ravel() for column, row in rays.reshape(-1, 2)])
+    plane, image = generator.normal(size=(4, 300)), generator.normal(size=(1, *rays.shape[:2]))
+    np.testing.assert_allclose(operator.forward(plane).ravel(), weights @ plane.ravel(), atol=1e-9)
+    np.testing.assert_allclose(operator.adjoint(image).ravel(), weights.T @ image.ravel(), atol=1e-9)
+
+
 @given(case=cases(max_rows=7, max_columns=11))
 def test_h_is_the_matrix_found_by_casting_each_pixels_ray(
     case: Case, check_linear_operator: LinearOperatorCheck
