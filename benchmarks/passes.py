@@ -15,7 +15,6 @@ import scipy.sparse
 from numpy.typing import NDArray
 
 from benchmarks.problem import BenchmarkProblem
-from faintfield.recon.operator.scene_operator import SceneOperator
 
 type Run = Callable[[], object]
 
@@ -89,13 +88,7 @@ def fused_pass(problem: BenchmarkProblem) -> Run:
 
 
 def _scene_pass(problem: BenchmarkProblem, depths_mm: tuple[float, ...]) -> Run:
-    scene = SceneOperator(
-        np.stack([problem.homographies(depth) for depth in depths_mm]),
-        problem.lens.rays(),
-        [problem.grid(depth) for depth in depths_mm],
-        flat=problem.flat,
-        valid=problem.images.valid,
-    )
+    scene = problem.scene(depths_mm)
     samples = np.ones(scene.samples_shape, np.float32)
     return lambda: scene.adjoint_of_ratio(samples, problem.images)
 
@@ -187,6 +180,9 @@ def _bilinear_matrix(problem: BenchmarkProblem, view: int) -> scipy.sparse.csr_a
 
 
 def memory(size_px: int) -> dict[str, float]:
-    """Return the memory that passes over the data need beside them, measured in a separate process."""
+    """Return the memory that passes and solvers need beside the data, each measured in a process of its own."""
     command = [sys.executable, "-m", "benchmarks.memory", str(size_px)]
-    return dict(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+    figures: dict[str, float] = {}
+    for what in ("passes", "joint", "occlusion"):
+        figures |= json.loads(subprocess.run([*command, what], check=True, capture_output=True, text=True).stdout)
+    return figures

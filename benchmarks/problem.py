@@ -1,5 +1,6 @@
 """The benchmark problem: the paper's grid, a distorted lens, maps of every pixel property, dark data."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,9 +8,11 @@ from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
-from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
+from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.rig.plan import nominal_poses_rt_cam_ref
 
 DEPTH_MM = 500.0
@@ -48,6 +51,17 @@ class BenchmarkProblem:
         """Return the samples that overlay the reference view's pixels."""
         size_px, pitch_mm = self.lens.size_px[0], depth_mm / self.lens.fx_px
         return PlaneGrid((size_px, size_px), pitch_mm, (-size_px / 2 * pitch_mm, -size_px / 2 * pitch_mm))
+
+    def scene(self, depths_mm: Sequence[float], opacities: Sequence[Image] | None = None) -> SceneOperator:
+        """Return H of several planes, which hide one another if opacities (row, column) are given."""
+        return SceneOperator(
+            np.stack([self.homographies(depth) for depth in depths_mm]),
+            self.lens.rays(),
+            [self.grid(depth) for depth in depths_mm],
+            flat=self.flat,
+            valid=self.images.valid,
+            occluders=None if opacities is None else Occluders(opacities, depths_mm),
+        )
 
     def operator(self, workers: int | None = None) -> PlaneOperator:
         """Return H."""

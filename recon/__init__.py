@@ -15,8 +15,8 @@ def compile_kernels() -> None:
     from faintfield.recon.solver.penalties import Penalty
     from faintfield.recon.solver.proximal import DualField
 
-    PlaneOperator(np.eye(3)[np.newaxis], np.zeros((2, 2, 2)), PlaneGrid((2, 2), 1.0, (0.0, 0.0)))
     ones = np.ones((2, 2), np.float32)
+    PlaneOperator(np.eye(3)[np.newaxis], np.zeros((2, 2, 2)), PlaneGrid((2, 2), 1.0, (0.0, 0.0)))
     DualField.zero([(2, 2)], ones.dtype).prox(ones, ones, 1.0, Penalty(), lambda _: 0.0, 1)
     patch = np.ones((12, 12), np.float32)
     collaborative_wiener(patch, patch, Noise(patch, np.ones((3, 3))))

@@ -1,14 +1,16 @@
 """All planes of a scene together, in one colour: g = Σ_z H_z f_z + b, optionally with nearer planes hiding others."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 
+import numba
+import numpy as np
 from msgspec import structs
 
 from faintfield.pipelines.console import inform
 from faintfield.pipelines.errors import MemoryShort
 from faintfield.pipelines.formats.large_arrays import available_bytes
-from faintfield.pipelines.formats.plane_poses import Place, depth_of
+from faintfield.pipelines.formats.plane_poses import Place
 from faintfield.pipelines.formats.results.records import Method, SolveRecord
 from faintfield.pipelines.reconstruction.operators import OperatorFactory
 from faintfield.pipelines.reconstruction.penalised import Objective, solve_pmlem
@@ -17,11 +19,12 @@ from faintfield.pipelines.reconstruction.solutions import Pilot, Settings, Solut
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.occlusion import opacity, transmission
+from faintfield.recon.operator.occlusion import opacity
 from faintfield.recon.solver.data_fit import SceneProblem
 
-# Arrays as large as the images that a fit of all planes needs: forward images of ones and of light, and ratios.
-_ARRAYS_OF_IMAGES = 5
+# Arrays as large as all planes that their fit needs, beside one for each thread: while a weight is chosen, or planes
+# hide others.
+_ARRAYS_OF_SAMPLES = 23
 
 
 def solve_together(
@@ -48,7 +51,7 @@ def solve_together(
     dict of Method to dict of Place to Solution
         All records are of one iteration: its penalty weight, passes, objective and certificate.
     """
-    _check_memory(images, len(grids) if "occlusion" in methods else 0)
+    _check_memory(grids.values())
     operator = factory.of_scene(grids)
     objective = Objective.of(SceneProblem(operator, images), settings)
     joint = [pilots[place].solution for place in grids] if pilots else solve_pmlem(objective, settings)
@@ -61,13 +64,15 @@ def solve_together(
     return {method: dict(zip(grids, planes, strict=True)) for method, planes in found.items()}
 
 
-def _check_memory(images: ElementalImages, masks: int) -> None:
-    """Refuse to begin without memory for the arrays as large as the images, with occlusion one more per plane."""
-    needed, free = (_ARRAYS_OF_IMAGES + masks) * images.electrons.nbytes, available_bytes()
+def _check_memory(grids: Iterable[PlaneGrid]) -> None:
+    """Refuse to begin without memory for the arrays as large as all planes."""
+    samples = sum(rows * columns for rows, columns in (grid.shape for grid in grids))
+    arrays = _ARRAYS_OF_SAMPLES + int(numba.config.NUMBA_NUM_THREADS)
+    needed, free = arrays * samples * np.dtype(np.float32).itemsize, available_bytes()
     if needed > free:
         raise MemoryShort(
             f"planes found together need {needed / 1e9:.3g} GB beside the images, and {free / 1e9:.3g} GB of "
-            "memory are free; ask for fewer planes with --occlusion, for --joint alone, or --method pmlem"
+            "memory are free; ask for fewer planes, a larger --pitch-mm, or --method pmlem"
         )
 
 
@@ -89,10 +94,8 @@ def _with_occlusion(
     """
     first = joint[0].record
     settings = replace(settings, penalty_weight=first.penalty_weight)
-    opacities = [opacity(one.plane) for one in joint]
-    hidden = transmission(objective.posed.operator, opacities, [depth_of(place) for place in grids])
     try:
-        occluded = factory.of_scene(grids, hidden)
+        occluded = factory.of_scene(grids, [opacity(one.plane) for one in joint])
     except GeometryMismatch:
         unchanged = done or with_prior(objective, joint, settings, others=others)
         return _without_occlusion(unchanged, "a plane would be hidden from all views")

@@ -19,14 +19,15 @@ from faintfield.recon.likelihood.pixel_models import form_ratio_of_block
 from faintfield.recon.numba_tools import advanced, compiled, index, pointer, prefetch
 from faintfield.recon.operator.blocks import copy, gather, prefetch_block, scatter, weigh
 from faintfield.recon.operator.placement import BLOCK_PX, COUNTED, EXPECTED, locate_on_all, unpack_relief, weights_of
+from faintfield.recon.operator.scene_blocks import form_precision, hide, multiply_by_row_sums, scatter_each
 
 # Detector rows of a tile; 4, 16 or 32 rows take as long.
 TILE_ROWS = 8
 
-FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH = 0, 1, 2, 3, 4, 5
+FORWARD, ADJOINT, RATIO, VALUE, VALUE_AND_RATIO, REACH, NORMAL, PRECISION, PRECISION_OF_EACH = range(9)
 
 # The operations that add to the samples.
-SCATTERING = (ADJOINT, RATIO, VALUE_AND_RATIO)
+SCATTERING = (ADJOINT, RATIO, VALUE_AND_RATIO, NORMAL, PRECISION, PRECISION_OF_EACH)
 
 
 class SceneGeometry(NamedTuple):
@@ -37,8 +38,9 @@ class SceneGeometry(NamedTuple):
     homographies : array (plane × view × 9,)
         From a ray (x, y, 1) to a plane's (column, row, 1), homogeneous. For a surface, their change with 1/depth
         follows as if it were a second plane's.
-    layout : int array (plane, 3)
-        Index of each plane's first sample among all samples, its rows and its columns.
+    layout : int array (plane, 4)
+        Index of each plane's first sample among all samples, its rows, its columns, and how many columns about a pixel
+        lies beyond the one before.
     lattice_of_view : int array (view,)
         The lattice of detector pixels of each view.
     detector : (int, int, int)
@@ -48,8 +50,6 @@ class SceneGeometry(NamedTuple):
         count in any view. Rows are padded to whole blocks with rays of NaN, which see nothing.
     valid : uint8 array (view × row × column,)
         Zero for pixels that do not count in this view; of size zero when all do.
-    transmission : array (plane × view × row × column,)
-        Fraction of a plane's light that reaches a pixel; of size zero when all light does.
     relief : int16 array (view × row × column,)
         How much nearer than the depth of the homographies each pixel meets the surface, in units of `relief_step`;
         `UNSEEN` where it sees no part of it. Of size zero for planes.
@@ -67,7 +67,6 @@ class SceneGeometry(NamedTuple):
     detector: tuple[int, int, int]
     maps: NDArray[Any]
     valid: NDArray[np.uint8]
-    transmission: NDArray[Any]
     relief: NDArray[np.int16]
     relief_step: Any
     bent: tuple[bool, ...]
@@ -95,7 +94,9 @@ class PixelModel(NamedTuple):
 
 # One long function: its loops share some twenty pointers and counts, which would have to be passed for every block.
 @compiled
-def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, space, views, worker, workers):
+def sweep(
+    operation, planes, seen, accumulator, images, image_of_view, pixels, geometry, hiding, space, views, worker, workers
+):
     """Process a worker's share of the detector pixels of `views`; return their negative log-likelihood.
 
     Parameters
@@ -106,6 +107,10 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
         `VALUE`: only the returned value, which is meaningful for this operation and the next alone.
         `VALUE_AND_RATIO`: both; the logarithms of the value take a tenth of the time.
         `REACH`: geometry.reach ← where rows see the planes; it must process all views, and come first.
+        `NORMAL`: accumulator += Hᵀ H planes.
+        `PRECISION`: accumulator += Hᵀ[ (H 1)/v ], where v is `pixels.variance` plus the light of the planes, at least
+        `pixels.level` for each pixel, or for least squares that level times the response.
+        `PRECISION_OF_EACH`: accumulator += H_zᵀ[ (H_z 1)/v ] for each plane z.
         An operation changes nothing else.
     planes, accumulator : array (sample,)
         The samples that are read, and those that are added to: all planes, one after the other.
@@ -113,6 +118,8 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
         The images that are written, and those that are read; view v has image `image_of_view[v]`.
     pixels : PixelModel
         Statistics of the pixels.
+    hiding : Hiding
+        What nearer planes hide.
     space : BlockWorkspace
         The worker's own.
     """
@@ -125,10 +132,9 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
     homographies, maps, layer = pointer(geometry.homographies), pointer(geometry.maps), index(geometry.maps.size // 3)
     planes_at, added_at, seen_at, images_at = pointer(planes), pointer(accumulator), pointer(seen), pointer(images)
     background_at, variance_at = pointer(pixels.background), pointer(pixels.variance)
-    valid_at, transmission_at = pointer(geometry.valid), pointer(geometry.transmission)
-    masked, occluded = geometry.valid.size > 0, geometry.transmission.size > 0
-    bent, relief_at = geometry.bent, pointer(geometry.relief)
-    per_plane = count_of_views * index(rows * columns)
+    valid_at, masked = pointer(geometry.valid), geometry.valid.size > 0
+    opacities, opaque, depths = pointer(hiding.opacities), pointer(hiding.opaque), pointer(hiding.depths)
+    hides, bent, relief_at = hiding.opacities.size > 0, geometry.bent, pointer(geometry.relief)
     model, level = pixels.model, pixels.level
     value = 0.0
     for tile in range(worker * TILE_ROWS, rows, workers * TILE_ROWS):
@@ -151,14 +157,15 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     met_from, met_to = min(met_from, first), first + BLOCK_PX
                     if operation == REACH:
                         continue
-                    at = index((view * rows + row) * columns + first)
                     if masked:
+                        at = index((view * rows + row) * columns + first)
                         prefetch(valid_at, at + index(columns))
-                        weigh(valid_at, at, index(0), count_of_planes, count, scratch)
-                    if occluded:
-                        weigh(transmission_at, at, per_plane, count_of_planes, count, scratch)
+                        weigh(valid_at, at, count_of_planes, count, scratch)
+                    if hides:
+                        hide(opacities, opaque, depths, layout, count_of_planes, scratch, blocks)
                     pixel = index((image * rows + row) * columns + first)
-                    prefetch_block(images_at, pixel + index(columns))
+                    if operation < NORMAL:
+                        prefetch_block(images_at, pixel + index(columns))
                     if operation == ADJOINT:
                         copy(images_at, pixel, scratch, index(EXPECTED), count)
                     else:
@@ -166,13 +173,20 @@ def sweep(operation, planes, seen, accumulator, images, image_of_view, pixels, g
                     if operation == FORWARD:
                         copy(scratch, index(EXPECTED), seen_at, pixel, count)
                         continue
-                    if operation != ADJOINT:
-                        at = index((lattice * rows + row) * columns + first)
+                    at = index((lattice * rows + row) * columns + first)
+                    if operation < NORMAL and operation != ADJOINT:
                         value += form_ratio_of_block(
                             model, count, expected, advanced(images_at, pixel), advanced(background_at, at),
                             advanced(variance_at, at), counted, level, models, operation != RATIO,
                         )  # fmt: skip
-                    if operation != VALUE:
+                    elif operation > NORMAL:
+                        response = advanced(maps, layer + layer + index((lattice * rows + row) * padded + first))
+                        form_precision(model, count, advanced(variance_at, at), response, level, scratch)
+                    if operation == PRECISION:
+                        multiply_by_row_sums(count_of_planes, scratch, models)
+                    if operation == PRECISION_OF_EACH:
+                        scatter_each(added_at, layout, count_of_planes, scratch, blocks, models)
+                    elif operation != VALUE:
                         scatter(added_at, layout, count_of_planes, scratch, blocks)
                 if operation == REACH:
                     geometry.reach[view, row, 0], geometry.reach[view, row, 1] = met_from, met_to

@@ -1,12 +1,15 @@
-"""How much of a plane's light nearer planes hide, judged by the light of the nearer planes."""
+"""What nearer planes hide of the light of others, judged by the light of the nearer planes."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.scene_blocks import Hiding
 from faintfield.recon.smoothing import blurred
 
 # Spacings of the blurs before the light is judged, of about two samples (noise is not opaque), and after.
@@ -14,6 +17,21 @@ _BLUR_BEFORE, _BLUR_AFTER = (1, 2, 2), (1,)
 
 # A plane is transparent below the first of these fractions of its typical light, and opaque above the second.
 _TRANSPARENT, _OPAQUE = 0.15, 0.35
+
+
+class Occluders(NamedTuple):
+    """Planes that hide those behind them: light of a plane is multiplied by `Π (1 − H_z' α_z')` over nearer planes z'.
+
+    Attributes
+    ----------
+    opacities : sequence of float array (row, column)
+        α of each plane, 0 to 1; H_z' without the response of the pixels.
+    depths_mm : sequence of float
+        Depth of each plane. Planes of the same depth do not hide one another.
+    """
+
+    opacities: Sequence[Image]
+    depths_mm: Sequence[float]
 
 
 def opacity(plane: Image) -> Image:
@@ -32,29 +50,33 @@ def opacity(plane: Image) -> Image:
     return np.asarray(blurred(np.clip(share, 0, 1), _BLUR_AFTER), plane.dtype)
 
 
-def transmission(
-    operator: SceneOperator, opacities: Sequence[Image], depths_mm: Sequence[float]
-) -> NDArray[np.floating]:
-    """Return `Π (1 − H_z' α_z')` over the planes z' nearer than z, (plane, view, row, column).
+def hiding_of(occluders: Occluders | None, grids: Sequence[PlaneGrid], dtype: np.dtype[Any]) -> Hiding:
+    """Return what hides what as the kernel reads it.
 
-    Parameters
-    ----------
-    operator : SceneOperator
-        H of all planes without occlusion; its response is divided out.
-    opacities : sequence of float array (row, column)
-        α of each plane.
-    depths_mm : sequence of float
-        Depth of each plane.
+    Raises
+    ------
+    GeometryMismatch
+        There is not one opacity and one depth for each plane, or an opacity is negative or not a finite number.
     """
-    response = np.asarray(operator.map_of_views(operator.response(), operator.all_views))
-    through = np.ones((len(depths_mm), *operator.images_shape), operator.dtype)
-    for near, depth in enumerate(depths_mm):
-        farther = [index for index, other in enumerate(depths_mm) if other > depth]
-        if not farther:
-            continue
-        alone = np.zeros(operator.samples_shape, operator.dtype)
-        operator.planes_of(alone)[near][:] = opacities[near]
-        seen = operator.forward(alone)
-        hidden = np.divide(seen, response, out=np.zeros_like(seen), where=response > 0)
-        through[farther] *= np.clip(1 - hidden, 0, 1)
-    return through
+    if occluders is None:
+        return Hiding(np.zeros(0, dtype), np.zeros(0, np.intp), np.zeros(0))
+    opacities, depths_mm = occluders
+    if [one.shape for one in opacities] != [grid.shape for grid in grids] or len(depths_mm) != len(grids):
+        raise GeometryMismatch(
+            f"opacities of shapes {[one.shape for one in opacities]} and {len(depths_mm)} depths do not fit "
+            f"planes of {[grid.shape for grid in grids]} samples; give one of each for each plane"
+        )
+    if not all(((one >= 0) & np.isfinite(one)).all() for one in opacities):
+        raise GeometryMismatch("an opacity is negative or not a finite number; give numbers from 0 to 1")
+    samples = np.concatenate([np.ascontiguousarray(one, dtype).reshape(-1) for one in opacities])
+    # The farthest plane hides nothing
+    hides = [depth < max(depths_mm) for depth in depths_mm]
+    columns = [_opaque_columns(one * nearer) for one, nearer in zip(opacities, hides, strict=True)]
+    return Hiding(samples, np.concatenate(columns).reshape(-1), np.array(depths_mm, np.float64))
+
+
+def _opaque_columns(alpha: Image) -> NDArray[np.intp]:
+    """Return the first and the past-the-last column with some opacity (row, 2); one without begins nowhere."""
+    some = alpha > 0
+    first = np.where(some.any(axis=1), some.argmax(axis=1), np.iinfo(np.int32).max)
+    return np.column_stack([first, alpha.shape[1] - some[:, ::-1].argmax(axis=1)])

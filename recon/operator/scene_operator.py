@@ -13,6 +13,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
 from faintfield.recon.operator.geometry import Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders, hiding_of
 from faintfield.recon.operator.placement import make_workspace
 from faintfield.recon.threads import run_in_threads
 
@@ -43,8 +44,8 @@ class SceneOperator:
         Relative response of each pixel (vignetting); zero for pixels that never count.
     valid : bool array (view, row, column), optional
         False for pixels that do not count in one view.
-    transmission : float array (plane, view, row, column), optional
-        Fraction of a plane's light that reaches a pixel past nearer planes; multiplies H and Hᵀ. One by default.
+    occluders : Occluders, optional
+        What the planes hide of those behind them, in H and Hᵀ; nothing by default.
     lattice_of_view : int array (view,), optional
         The lattice of detector pixels of each view; the first by default.
     dtype : dtype
@@ -57,8 +58,8 @@ class SceneOperator:
     Raises
     ------
     GeometryMismatch
-        Shapes do not fit together, a number is not finite, a transmission is negative, or no pixel of any view sees one
-        of the planes.
+        Shapes do not fit together, a number is not finite, an opacity is negative, or no pixel of any view sees one of
+        the planes.
 
     Notes
     -----
@@ -73,7 +74,7 @@ class SceneOperator:
         *,
         flat: NDArray[np.floating] | None = None,
         valid: NDArray[np.bool_] | None = None,
-        transmission: NDArray[np.floating] | None = None,
+        occluders: Occluders | None = None,
         lattice_of_view: NDArray[np.intp] | None = None,
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
@@ -83,15 +84,14 @@ class SceneOperator:
         grids = tuple(grids)
         self.workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
-        geometry = scene_geometry(
-            plane_from_ray, rays, grids, flat, valid, transmission, lattice_of_view, self.dtype, surface
-        )
+        geometry = scene_geometry(plane_from_ray, rays, grids, flat, valid, lattice_of_view, self.dtype, surface)
+        self._hiding = hiding_of(occluders, grids, self.dtype)
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
         self._kept_maps: dict[float, Image] | None = None
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
         self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), geometry.lattice_of_view
         # Each pixel that sees the scene has weights that sum to its response: H 1 is known without a sweep
-        self.row_sums_are_response = len(grids) == 1 and transmission is None
+        self.row_sums_are_response = len(grids) == 1 and occluders is None
         self._see(geometry, grids)
 
     def _see(self, geometry: kernels.SceneGeometry, grids: tuple[PlaneGrid, ...]) -> None:
@@ -123,11 +123,45 @@ class SceneOperator:
         return self._sweep(kernels.ADJOINT, self._views([view]), np.zeros_like(self.all_views), images=image)[1]
 
     def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
-        """Return Hᵀ H f (samples), view by view, with no array as large as the images."""
-        total = np.zeros(self.samples_shape, self.dtype)
-        for view in self._views(views).tolist():
-            total += self.adjoint_of_view(self.forward(samples, [view])[0], view)
-        return total
+        """Return Hᵀ H f (samples), with no array as large as the images."""
+        samples = self._checked("samples", samples, self.samples_shape)
+        return self._sweep(kernels.NORMAL, self._views(views), self.all_views, samples=samples)[1]
+
+    def adjoint_of_precision(
+        self,
+        samples: Image,
+        images: ElementalImages,
+        min_light_e: float,
+        views: ViewSelection = None,
+        *,
+        of_each: bool = False,
+    ) -> Image:
+        """Return `Hᵀ[ (H 1)/(H f + b + σ²) ]` (samples), with no array as large as the images.
+
+        Parameters
+        ----------
+        samples : float array (samples)
+            f.
+        images : ElementalImages
+            Where b, σ² and the likelihood are taken from; least squares takes its own level for the light.
+        min_light_e : float
+            Least light of a pixel in electrons, > 0.
+        views : sequence of int, optional
+            The views that count; all by default.
+        of_each : bool, optional
+            Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` of each plane z instead.
+        """
+        likelihood = images.likelihood
+        known = _read_only(self._map(images.known_variance_e2()))
+        level = likelihood.level_e if likelihood.name == "least-squares" else min_light_e
+        operation = kernels.PRECISION_OF_EACH if of_each else kernels.PRECISION
+        return self._sweep(
+            operation,
+            self._views(views),
+            self.all_views,
+            samples=self._checked("samples", samples, self.samples_shape),
+            pixels=kernels.PixelModel(likelihood.model, known, known, level),
+        )[1]
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
@@ -161,9 +195,8 @@ class SceneOperator:
         """The views in which some pixel that counts sees one of the planes."""
         reach = self._geometry.reach
         reaching = np.flatnonzero((reach[:, :, 1] > reach[:, :, 0]).any(axis=1))
-        factors = self._geometry.valid.size + self._geometry.transmission.size
-        if factors == 0 and (self.response() > 0).all():
-            return reaching  # every pixel that meets a plane counts
+        if self._geometry.valid.size == 0 and (self.response() > 0).all():
+            return reaching  # every pixel that meets planes counts, and sees the nearest
         return np.array([view for view in reaching.tolist() if self.sensitivity([view]).any()], np.intp)
 
     def response(self) -> Image:
@@ -264,7 +297,7 @@ class SceneOperator:
             arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
             space = make_workspace(len(self.grids), self.dtype)
             share = (_read_only(views), worker, self.workers)
-            return float(kernels.sweep(operation, *arrays, pixels, self._geometry, space, *share))
+            return float(kernels.sweep(operation, *arrays, pixels, self._geometry, self._hiding, space, *share))
 
         values = run_in_threads(work, range(self.workers))
         for other in sums[1:]:

@@ -66,7 +66,6 @@ def test_a_plane_found_with_others_is_made_anew_with_other_others(scene: Path, t
 def test_workers_find_planes_together(
     scene: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("distributed")
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
     words = ("reconstruct", scene, *BOTH, "--occlusion", "--passes", 2, "--penalty-weight", 1)
     done(*words, "--out", tmp_path / "local")

@@ -5,6 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes, noise_of_back_projection
 from faintfield.recon.solver.initialization import back_projection, well_seen_samples
@@ -30,8 +31,8 @@ def tiny_scene(planes: int, seed: int, *, occluded: bool = False) -> tuple[Scene
     """Planes in six views, the second partly out of sight, and noisy images with background and noise of each pixel."""
     generator = np.random.default_rng(seed)
     shifts = [generator.uniform(-0.5, 0.5, (6, 2)) + np.array([0.0, 3.0 * k]) for k in range(planes)]
-    hidden = generator.uniform(0.2, 1, (planes, 6, TINY[0] + 2, TINY[1] + 2)) if occluded else None
-    operator = planes_displaced_by(shifts, TINY, transmission=hidden, dtype=np.float64)
+    hiding = Occluders(list(generator.uniform(0, 0.8, (planes, *TINY))), range(planes)) if occluded else None
+    operator = planes_displaced_by(shifts, TINY, occluders=hiding, dtype=np.float64)
     lights = list(generator.uniform(1, 5, (planes, *TINY)))
     clean = noisy_images(operator, operator.samples_of(lights), 0.4, 2.0, seed)
     background, variance = generator.uniform(0.2, 0.6, (2, *operator.images_shape[1:]))

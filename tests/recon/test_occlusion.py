@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from faintfield.recon.likelihood.images import Image
 from faintfield.recon.operator.grid import PlaneGrid
-from faintfield.recon.operator.occlusion import opacity, transmission
+from faintfield.recon.operator.occlusion import Occluders, opacity
 from faintfield.recon.operator.scene_operator import SceneOperator
 
 
@@ -30,13 +31,17 @@ def test_each_plane_is_hidden_by_all_nearer_planes_and_no_other() -> None:
     rays = np.stack(np.meshgrid(np.arange(7.0), np.arange(5.0)), axis=-1)
     grids = [PlaneGrid((5, 9), 1.0, (0.0, 0.0))] * 3
     flat = np.full((5, 7), 0.5)
-    operator = SceneOperator(homographies, rays, grids, flat=flat, dtype=np.float64, workers=1)
     opacities = [np.zeros((5, 9)) for _ in grids]
     opacities[0][2, 4], opacities[1][2, 4], opacities[2][1, 1] = 0.5, 1.0, 1.0
-    found = transmission(operator, opacities, [600.0, 500.0, 900.0])
+
+    def transmission() -> list[Image]:
+        hiding = Occluders(opacities, [600.0, 500.0, 900.0])
+        operator = SceneOperator(homographies, rays, grids, flat=flat, occluders=hiding, dtype=np.float64, workers=1)
+        return [operator.forward(one) / flat for one in np.repeat(np.eye(3), 5 * 9, axis=1)]
+
     expected = np.ones((3, 2, 5, 7))
     expected[0, 0, 2, 4] = expected[0, 1, 2, 3] = 0.0  # by the plane at 500 mm alone
     expected[2, 0, 2, 4] = expected[2, 1, 2, 3] = 0.0  # by both
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(transmission(), expected, atol=1e-12)
     opacities[1][2, 4] = 0.4
-    assert transmission(operator, opacities, [600.0, 500.0, 900.0])[2, 0, 2, 4] == pytest.approx(0.3)
+    assert transmission()[2][0, 2, 4] == pytest.approx(0.3)

@@ -13,9 +13,10 @@ from scipy.ndimage import map_coordinates
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages, Image
+from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator import kernels
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.placement import BLOCK_PX
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
@@ -54,11 +55,29 @@ def planes_of(generator: np.random.Generator) -> list[Image]:
     return [generator.normal(size=grid.shape) for grid in GRIDS]
 
 
+def occluders(generator: np.random.Generator) -> Occluders:
+    """A few opaque samples on each plane, of which many blocks see none; the first two planes hide not each other."""
+    opacities = [(generator.random(grid.shape) < 0.02) * generator.uniform(0, 1, grid.shape) for grid in GRIDS]
+    opacities[2][3:5, 40:60] = 1.0
+    return Occluders(opacities, [700.0, 700.0, 300.0])
+
+
+def transmission_of(hiding: Occluders) -> Image:
+    """What nearer planes leave of each plane's light (plane, view, row, column), by operators of one plane each."""
+    alone = [PlaneOperator(h, LENS.rays(), grid, dtype=np.float64) for h, grid in zip(HOMOGRAPHIES, GRIDS, strict=True)]
+    left = [1 - one.forward(alpha) for one, alpha in zip(alone, hiding.opacities, strict=True)]
+    through = [
+        [part for part, other_mm in zip(left, hiding.depths_mm, strict=True) if other_mm < depth_mm]
+        for depth_mm in hiding.depths_mm
+    ]
+    return np.stack([np.prod([np.ones(IMAGES_SHAPE), *parts], axis=0) for parts in through])
+
+
 @pytest.mark.parametrize("occluded", [False, True])
 def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.Generator) -> None:
-    options = known(generator)
-    transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE)) if occluded else np.ones((len(GRIDS), 1, 1, 1))
-    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options, transmission=transmission if occluded else None)
+    options, hiding = known(generator), occluders(generator) if occluded else None
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options, occluders=hiding)
+    transmission = transmission_of(hiding) if hiding else np.ones((len(GRIDS), 1, 1, 1))
     alone = singles(options)
     planes, images = planes_of(generator), generator.normal(size=IMAGES_SHAPE)
     expected = sum(t * one.forward(plane) for one, plane, t in zip(alone, planes, transmission, strict=True))
@@ -68,12 +87,39 @@ def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.G
 
 
 def test_a_scene_and_its_adjoint_are_adjoint(generator: np.random.Generator) -> None:
-    transmission = generator.uniform(0, 1, (len(GRIDS), *IMAGES_SHAPE))
-    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **known(generator), transmission=transmission)
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **known(generator), occluders=occluders(generator))
     samples, images = scene.samples_of(planes_of(generator)), generator.normal(size=IMAGES_SHAPE)
     seen = scene.forward(samples)
     back = float(np.vdot(samples, scene.adjoint(images)))
     assert abs(float(np.vdot(seen, images)) - back) <= 1e-12 * np.linalg.norm(seen) * np.linalg.norm(images)
+
+
+@pytest.mark.parametrize("occluded", [False, True])
+@pytest.mark.parametrize("likelihood", ["shifted-poisson", "least-squares"])
+def test_sums_without_images_are_those_of_forward_and_adjoint(
+    likelihood: LikelihoodName, occluded: bool, generator: np.random.Generator
+) -> None:
+    options, hiding = known(generator), occluders(generator) if occluded else None
+    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options, occluders=hiding)
+    background, variance = generator.uniform(0.5, 3.0, (2, *IMAGES_SHAPE[1:]))
+    judged_by = PixelLikelihood(likelihood, level_e=2.0)
+    images = ElementalImages(np.zeros(IMAGES_SHAPE), background, variance, options["valid"], judged_by)
+    samples, views = scene.samples_of([generator.uniform(0, 2, grid.shape) for grid in GRIDS]), [0, 2, 3]
+    chosen = np.isin(scene.all_views, views)[:, np.newaxis, np.newaxis]
+    expected = scene.adjoint(chosen * scene.forward(samples))
+    np.testing.assert_allclose(scene.adjoint_of_forward(samples, views), expected, atol=1e-12)
+
+    fixed = likelihood == "least-squares"
+    light = 2.0 * options["flat"] if fixed else np.maximum(scene.forward(samples), 0.7)
+    precision = chosen / (light + background + variance)
+    ones = scene.samples_of([np.ones(grid.shape) for grid in GRIDS])
+    found = scene.adjoint_of_precision(samples, images, 0.7, views)
+    np.testing.assert_allclose(found, scene.adjoint(precision * scene.forward(ones)), atol=1e-12)
+    each = scene.planes_of(scene.adjoint_of_precision(samples, images, 0.7, views, of_each=True))
+    for index, own in enumerate(each):
+        alone = scene.samples_of([np.full(grid.shape, float(at == index)) for at, grid in enumerate(GRIDS)])
+        expected = scene.planes_of(scene.adjoint(precision * scene.forward(alone)))[index]
+        np.testing.assert_allclose(own, expected, atol=1e-12)
 
 
 def test_the_ratio_of_a_scene_uses_the_light_of_all_planes(generator: np.random.Generator) -> None:
@@ -114,9 +160,10 @@ def index_of_pixels(homographies: NDArray[Any], grid: PlaneGrid) -> NDArray[np.f
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
-        ({"transmission": np.ones((3, 4, 13, 5))}, "transmission has shape"),
-        ({"transmission": np.full((3, *IMAGES_SHAPE), -0.1)}, "the transmission is negative"),
-        ({"transmission": np.full((3, *IMAGES_SHAPE), np.nan)}, "not a finite number"),
+        ({"occluders": Occluders([np.ones((2, 2))] * 3, DEPTHS_MM)}, "opacities of shapes"),
+        ({"occluders": Occluders([np.ones(grid.shape) for grid in GRIDS], DEPTHS_MM[:2])}, "and 2 depths do not fit"),
+        ({"occluders": Occluders([np.full(grid.shape, -0.1) for grid in GRIDS], DEPTHS_MM)}, "an opacity is negative"),
+        ({"occluders": Occluders([np.full(grid.shape, np.nan) for grid in GRIDS], DEPTHS_MM)}, "not a finite number"),
         ({"grids": GRIDS[:2]}, "do not fit"),
         ({"grids": (*GRIDS[:2], PlaneGrid((5, 5), 1.0, (9e5, 0.0)))}, "no pixel of any of the 4 views"),
     ],

@@ -1,5 +1,6 @@
 """Several planes solved together, against a primal-dual method on dense matrices and the solver of one plane."""
 
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -7,12 +8,15 @@ import pytest
 
 from faintfield.recon.likelihood.images import ElementalImages, Image, LikelihoodName, PixelLikelihood
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator
+from faintfield.recon.prior.evidence import evidence_of_planes
 from faintfield.recon.solver.cross_validation import cross_validated_weight
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
+from faintfield.recon.solver.uncertainty import local_fits
 from tests.recon.small_problems import problem
 
 WEIGHT = 0.8
@@ -27,8 +31,9 @@ def scene(likelihood: LikelihoodName = "shifted-poisson", *, occluded: bool = Fa
     homographies[0, :, :2, 2] = generator.uniform(-2.5, 2.5, (VIEWS, 2))
     homographies[1, :, :2, 2] = generator.uniform(-0.5, 0.5, (VIEWS, 2))
     rays = np.stack(np.meshgrid(np.arange(float(SIZE)), np.arange(float(SIZE))), axis=-1)
-    transmission = generator.uniform(0.2, 1, (2, VIEWS, SIZE, SIZE)) if occluded else None
-    operator = SceneOperator(homographies, rays, GRIDS, transmission=transmission, dtype=np.float64, workers=1)
+    opacities = [generator.uniform(0, 0.8, grid.shape) for grid in GRIDS]
+    hiding = Occluders(opacities, [500.0, 700.0]) if occluded else None
+    operator = SceneOperator(homographies, rays, GRIDS, occluders=hiding, dtype=np.float64, workers=1)
     near, far = np.zeros(GRIDS[0].shape), np.zeros(GRIDS[1].shape)
     near[3:7, 2:6], far[1:5, 4:7] = 5.0, 3.0
     mean = operator.forward(operator.samples_of([near, far]))
@@ -115,6 +120,42 @@ def test_the_objective_never_rises() -> None:
     assert objectives[-1] < objectives[0] - 10
 
 
+@pytest.mark.parametrize("occluded", [False, True])
+def test_no_array_is_as_large_as_the_images(occluded: bool) -> None:
+    _solve(_wide_scene(3, occluded))  # compiles and imports
+    posed = _wide_scene(60, occluded)
+    tracemalloc.start()
+    _solve(posed)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < posed.images.electrons.nbytes / 4
+
+
+def _wide_scene(views: int, occluded: bool) -> SceneProblem:
+    """Two planes of few samples in views of many pixels."""
+    generator = np.random.default_rng(5)
+    homographies = np.stack([np.eye(3)] * 2 * views).reshape(2, views, 3, 3)
+    homographies[0, :, :2, 2] = generator.uniform(-9, 9, (views, 2))
+    rays = np.stack(np.meshgrid(np.arange(128.0), np.arange(128.0)), axis=-1)
+    grids = [PlaneGrid((32, 32), 4.0, (0.0, 0.0))] * 2
+    hiding = Occluders([np.full((32, 32), 0.5)] * 2, [500.0, 700.0]) if occluded else None
+    electrons = generator.normal(1, 3, (views, 128, 128)).astype(np.float32)
+    operator = SceneOperator(homographies, rays, grids, occluders=hiding, workers=2)
+    return SceneProblem(operator, ElementalImages(electrons, 0.1, 9.0))
+
+
+def _solve(posed: SceneProblem) -> None:
+    """Make two passes with all views but one, and what else is done with the planes."""
+    operator, images = posed.operator, posed.images
+    training, (held_out,) = operator.seeing_views[:-1], operator.seeing_views[-1:]
+    fit = posed.fit(1.0, training)
+    iterates = pmlem(fit, posed.start(training), penalty_weight=1.0, dual=posed.dual())
+    plane = [next(iterates).plane for _ in range(2)][-1]
+    operator.negative_log_likelihood(plane, images, [held_out])
+    local_fits(operator, fit, plane)
+    evidence_of_planes(operator, images, plane)
+
+
 def test_a_scene_of_one_plane_equals_that_plane() -> None:
     posed = problem()
     plane = posed.operator
@@ -123,9 +164,9 @@ def test_a_scene_of_one_plane_equals_that_plane() -> None:
     alone = solved(SceneProblem(plane, posed.images), 1.5)
     same = solved(SceneProblem(scene_of_one, posed.images), 1.5)
     np.testing.assert_array_equal(same.plane, alone.plane.ravel())
-    # A transmission of one changes nothing but the way to the metric, which is that of several planes
-    through = np.ones((1, *plane.images_shape))
-    general = SceneOperator(homographies, rays, [plane.grid], transmission=through, dtype=np.float64, workers=1)
+    # A plane that hides nothing changes nothing but the way to the metric, which is that of several planes
+    clear = Occluders([np.zeros(plane.grid.shape)], [500.0])
+    general = SceneOperator(homographies, rays, [plane.grid], occluders=clear, dtype=np.float64, workers=1)
     together = solved(SceneProblem(general, posed.images), 1.5)
     np.testing.assert_allclose(together.plane.reshape(plane.grid.shape), alone.plane, rtol=1e-4, atol=1e-5)
 
