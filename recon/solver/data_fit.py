@@ -14,6 +14,9 @@ from faintfield.recon.solver.proximal import DualField
 # Smallest value of the metric relative to its median over seen samples; samples below follow their neighbours.
 _MIN_METRIC = 1e-3
 
+# Samples that a median is taken of: sorting all of a large plane takes as long as a sweep of the data.
+_MEDIAN_SAMPLES = 2**20
+
 # Smallest light relative to the typical light when the curvature is computed.
 _MIN_LIGHT = 0.01
 
@@ -57,8 +60,6 @@ class DataFit:
         if operator.row_sums_are_response:
             self._coverage = operator.coverage(views)
             self._known_e2 = self._averaged(known_e2, level_e)
-        else:
-            self._row_sums = operator.forward(np.ones(operator.samples_shape, operator.dtype), views)
 
     def value_and_gradient(self, samples: Image) -> tuple[float, Image]:
         """Return L(f) up to a constant, and ∇L = s − Hᵀ r (samples), in one pass over the data."""
@@ -73,11 +74,11 @@ class DataFit:
         solver must still check that it descends.
 
         For one plane this takes no pass over the data: the inverse variance is averaged over a sample's neighbours,
-        which is no less than what the pixels between them have. Several planes take two passes.
+        which is no less than what the pixels between them have. Several planes take one pass.
         """
         if self._operator.row_sums_are_response:
             return self._metric_of_plane(samples)
-        metric = self._adjoint_of_precision(self._row_sums, self._variance_e2(samples))
+        metric = self._operator.adjoint_of_precision(samples, self._images, self._min_light_e, self._views)
         return np.asarray(_positive(metric), samples.dtype)
 
     def metric_of_each(self, samples: Image) -> list[Image]:
@@ -85,14 +86,8 @@ class DataFit:
         operator = self._operator
         if operator.row_sums_are_response:
             return operator.planes_of(self.metric(samples))
-        variance_e2 = self._variance_e2(samples)
-        metrics = []
-        for index in range(len(operator.grids)):
-            ones = np.zeros(operator.samples_shape, operator.dtype)
-            operator.planes_of(ones)[index].fill(1)
-            metric = self._adjoint_of_precision(operator.forward(ones, self._views), variance_e2)
-            metrics.append(_positive(operator.planes_of(metric)[index]))
-        return metrics
+        metric = operator.adjoint_of_precision(samples, self._images, self._min_light_e, self._views, of_each=True)
+        return [_positive(of_plane) for of_plane in operator.planes_of(metric)]
 
     def _metric_of_plane(self, samples: Image) -> Image:
         """Return the metric of a single plane from the light of its samples."""
@@ -114,25 +109,11 @@ class DataFit:
         np.divide(inverse, self.sensitivity, out=mean, where=self.sensitivity > 0)
         return np.asarray(np.maximum(1 / mean - level_e, 0))
 
-    def _variance_e2(self, samples: Image) -> Image:
-        """Return the variance that L assumes for each pixel, `H f + b + σ²` (view, row, column)."""
-        likelihood, operator = self._images.likelihood, self._operator
-        if likelihood.name == "least-squares":
-            light_e = likelihood.level_e * operator.map_of_views(operator.response(), self._views)
-        else:
-            light_e = np.maximum(operator.forward(samples, self._views), self._min_light_e)
-        return np.asarray(light_e + operator.map_of_views(self._images.known_variance_e2(), self._views))
-
-    def _adjoint_of_precision(self, seen: Image, variance_e2: Image) -> Image:
-        """Return `Hᵀ[ seen/variance ]` (samples)."""
-        ratio = np.zeros(self._operator.images_shape, self._operator.dtype)
-        ratio[self._views] = seen / variance_e2
-        return self._operator.adjoint(ratio, self._views)
-
 
 def _positive(metric: Image) -> Image:
     """Return a metric that is also positive where no view sees anything."""
-    return np.maximum(metric, _MIN_METRIC * np.median(metric[metric > 0]))
+    seen = metric[metric > 0]
+    return np.maximum(metric, _MIN_METRIC * np.median(seen[:: 1 + seen.size // _MEDIAN_SAMPLES]))
 
 
 @dataclass(frozen=True)

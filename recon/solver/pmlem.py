@@ -15,9 +15,10 @@ from faintfield.recon.likelihood.images import Image
 from faintfield.recon.solver.data_fit import DataFit
 from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.proximal import DualField
+from faintfield.recon.solver.proximal_kernels import squared_distance
 
 # An inner problem is solved until its error is this fraction of the last step, or of the tolerance.
-_INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.3, 0.5
+_INNER_OF_STEP, _INNER_OF_TOLERANCE = 0.3, 0.8
 
 # Limit on the steps of an inner problem.
 _MAX_INNER_STEPS = 600
@@ -179,7 +180,7 @@ class _Pmlem:
             size = norm(here.plane, scaled)
 
             def gap_tolerance(plane: Image) -> float:
-                step = norm(plane - here.plane, scaled)
+                step = distance(plane, here.plane, scaled)
                 return 0.5 * max(_INNER_OF_STEP * step, _INNER_OF_TOLERANCE * self._tolerance * size) ** 2
 
             found = dual.prox(point, scaled, self._weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
@@ -193,7 +194,7 @@ class _Pmlem:
         """Return the certificate of a plane in the metric it was found with."""
         reach = plane.dtype.type(self._weight) / metric
         after = dual.primal(plane - gradient / metric, reach)
-        residual = norm(plane - np.maximum(after, 0), metric)
+        residual = distance(plane, np.maximum(after, 0), metric)
         slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1]
         slack += float(np.sum(metric * plane * np.maximum(-after, 0), dtype=np.float64))
         size = norm(plane, metric)
@@ -210,4 +211,9 @@ def _relative(part: float, size: float) -> float:
 
 def norm(plane: Image, metric: Image) -> float:
     """Return √ Σ w x², summed in float64."""
-    return float(np.sqrt(np.einsum("i,i,i->", metric.ravel(), plane.ravel(), plane.ravel(), dtype=np.float64)))
+    return distance(plane, np.empty(0, plane.dtype), metric)
+
+
+def distance(plane: Image, other: Image, metric: Image) -> float:
+    """Return √ Σ w (x − y)², summed in float64; y = 0 if it has no samples."""
+    return float(np.sqrt(squared_distance(plane.reshape(-1), other.reshape(-1), metric.reshape(-1))))

@@ -173,3 +173,17 @@ def penalty_and_slack(first, stop, plane, dual, smoothing, bounded):
         penalty += of_row
         slack += slack_of_row
     return penalty, slack
+
+
+@compiled
+def squared_distance(plane, other, metric):
+    """Return Σ w (x − y)² over samples (sample,), summed in float64; y = 0 if it has no samples."""
+    total = 0.0
+    if other.size > 0:
+        for k in range(plane.size):
+            change = plane[k] - other[k]
+            total += np.float64(metric[k] * change * change)
+    else:
+        for k in range(plane.size):
+            total += np.float64(metric[k] * plane[k] * plane[k])
+    return total

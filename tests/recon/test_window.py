@@ -69,7 +69,7 @@ def test_few_pixels_are_looked_at_for_a_small_window() -> None:
     """Views that overlay the samples see a window of 29 x 29 in as many pixels; rows come in blocks of 64."""
     rays = np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), axis=-1)
     args = (np.eye(3)[np.newaxis, np.newaxis], rays[np.newaxis], [PlaneGrid((300, 400), 1.0, (0.0, 0.0))])
-    whole = scene_geometry(*args, None, None, None, None, np.dtype(np.float64))
+    whole = scene_geometry(*args, None, None, None, np.dtype(np.float64))
     reach = window_geometry(whole, PlaneGrid((29, 29), 1.0, (207.0, 131.0)), (131, 207)).reach[0]
     looked_at = reach[:, 1] - reach[:, 0]
     assert (looked_at[131:160] > 0).all()
@@ -156,14 +156,14 @@ def test_a_window_of_a_surface_keeps_all_pixels_that_see_it() -> None:
         assert expected.max() > 1
 
 
-def test_a_view_that_everything_is_hidden_from_sees_nothing() -> None:
+def test_a_view_without_pixels_that_count_sees_nothing() -> None:
     rays = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0)), axis=-1)
-    transmission = np.ones((1, 3, 6, 8), np.float32)
-    transmission[0, 1] = 0
+    valid = np.ones((3, 6, 8), bool)
+    valid[1] = False
     grid = PlaneGrid((6, 8), 1.0, (0.0, 0.0))
     homographies = np.stack([np.eye(3)] * 3)[np.newaxis]
-    hidden = SceneOperator(homographies, rays, [grid], transmission=transmission)
-    assert hidden.seeing_views.tolist() == [0, 2]
+    masked = SceneOperator(homographies, rays, [grid], valid=valid)
+    assert masked.seeing_views.tolist() == [0, 2]
     assert SceneOperator(homographies, rays, [grid]).seeing_views.tolist() == [0, 1, 2]
 
 
