@@ -3,13 +3,17 @@
 import resource
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from faintfield.calib.board import Board
 from faintfield.calib.detection import detect_boards
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
+from faintfield.calib.noise.room import maps_by
+from faintfield.pipelines.formats.large_arrays import maps_in_files
 
 _SEED, _LIGHT_E = 1288, (1000.0, 4000.0, 16000.0)
 
@@ -22,8 +26,9 @@ def main() -> None:
     scene = _scene(boards, shape)
     found = _timed("six boards", lambda: detect_boards(scene, boards))
     print(f"{sum(len(one.corners) for one in found)} of 210 corners")
-    series = _timed(f"statistics of {5 * frames} frames, which are simulated", lambda: _series(shape, frames))
-    _timed("fit and maps", lambda: calibrate(series, 65535.0))
+    with TemporaryDirectory() as folder, maps_by(maps_in_files(Path(folder))):
+        series = _timed(f"statistics of {5 * frames} frames, which are simulated", lambda: _series(shape, frames))
+        _timed("fit and maps", lambda: calibrate(series, 65535.0))
 
 
 def _timed[T](what: str, work: Callable[[], T]) -> T:
@@ -55,15 +60,13 @@ def _series(shape: tuple[int, int], frames: int) -> list[Series]:
     rng = np.random.default_rng(_SEED)
     offset = 200 + rng.standard_normal(shape, np.float32)
 
-    def taken(mean_e: float) -> list[tuple[str, np.ndarray]]:
+    def taken(mean_e: float) -> Iterator[tuple[str, np.ndarray]]:
         sigma = np.float32((9 + mean_e) ** 0.5)
-        return [
-            (
-                f"{mean_e}_{k}",
-                np.rint(offset + mean_e + sigma * rng.standard_normal(shape, np.float32)).astype(np.uint16),
-            )
-            for k in range(frames)
-        ]
+        for k in range(frames):
+            values = sigma * rng.standard_normal(shape, np.float32)
+            values += offset
+            values += np.float32(mean_e)
+            yield f"{mean_e}_{k}", np.rint(values, out=values).astype(np.uint16)
 
     darks = [measure_series(taken(2 * t), Conditions("dark", t)) for t in (0.1, 20.0)]
     flats = [measure_series(taken(e), Conditions("flat", 0.1, k, 2 * e)) for k, e in enumerate(_LIGHT_E)]

@@ -23,6 +23,7 @@ from faintfield.calib.noise.maps.pixels import quantum_efficiency
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.series.saturation import Saturation
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import map_of
 
 # Largest relative standard error of the gain, without which no quantity in electrons has a value.
 MAX_RELATIVE_SE = 0.1
@@ -230,7 +231,9 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
 def _profiles(fitted: SeriesFit) -> dict[str, Estimate]:
     """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, in DN."""
     dark = max(fitted.darks, key=lambda one: one.frames)
-    parts = nonuniformity(dark.mean_dn, fitted.used, temporal_noise(dark, fitted.used))
+    parts = nonuniformity(
+        map_of(dark.mean_of, fitted.used.shape, np.float64), fitted.used, temporal_noise(dark, fitted.used)
+    )
     return {"dsnu_row_dn": parts.row, "dsnu_column_dn": parts.column}
 
 

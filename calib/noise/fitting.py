@@ -26,7 +26,7 @@ from faintfield.calib.noise.likelihood.response import (
 from faintfield.calib.noise.likelihood.starts import censored_start, gaussian_start
 from faintfield.calib.noise.misfit.odd_light import without_odd
 from faintfield.calib.noise.misfit.scatter import fit_with_excess
-from faintfield.calib.noise.series.statistics import Series, sample_index
+from faintfield.calib.noise.series.statistics import Series, any_suspect, sample_index
 
 # Read noise, in electrons and in DN, below which single electrons or the rounding shape the distribution of values.
 _MIN_GAUSSIAN_READ_E, _MIN_GAUSSIAN_READ_DN = 1.0, 0.5
@@ -138,9 +138,8 @@ def fit_series(
     PoorFit, NotIdentifiable
         The likelihood has no maximum, or too many values are cut off at the black level to start.
     """
-    suspect = np.any([one.suspect for one in darks], axis=0)
-    used = usable & ~suspect
-    fit, bend, moments = _fit_gaussian(gather_moments(darks, flats, used), darks, flats, used, saturation_dn)
+    used = usable & ~any_suspect(darks)
+    fit, bend, moments = _fit_gaussian(gather_moments(darks, flats, used), darks, flats, saturation_dn)
     # Among values cut off at the floor the highest look suspect; leaving them out would bias the fit.
     counts = collect_counts(darks, usable)
     # The likelihood of single values has no part for what pixels share, be it of a frame or of a series.
@@ -171,7 +170,7 @@ def with_rounding(fit: NoiseFit, error: float) -> NoiseFit:
 
 
 def _fit_gaussian(
-    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_], saturation_dn: float
+    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], saturation_dn: float
 ) -> tuple[NoiseFit, NoiseFit | None, Moments]:
     """Return the fit, a fit that tells the bend of the response if there is one, and the scatter beyond both.
 
@@ -179,7 +178,7 @@ def _fit_gaussian(
     significant. If not, a bend of the usual size may be there and widens the interval of the gain.
     """
     if not flats:
-        fit, moments = fit_with_excess(moments, darks, flats, used, 0)
+        fit, moments = fit_with_excess(moments, darks, 0)
         return fit, None, moments
     offset_dn = float(moments.darks.mean_dn.min())
     signal = moments.flats.mean_dn - offset_dn
@@ -192,18 +191,18 @@ def _fit_gaussian(
     bends = choose_bends(light, signal, level_dn2)
     measured = replace(moments, flats=replace(moments.flats, range_dn=range_dn, bend_se=MEASURED_BEND_SE))
     if bends:
-        fit, grown = fit_with_excess(measured, darks, flats, used, bends)
+        fit, grown = fit_with_excess(measured, darks, bends)
         if grown.excess.light2 < MAX_LIGHT_ERROR**2:
             return fit, fit, grown
     dark = replace(light, group=np.full(light.group.shape, -1), odd=())
     unknown = replace(measured.flats, light=dark)
     free = None
     if np.unique(np.round(moments.flats.mean_dn, -1)).size >= 3:
-        free, grown = fit_with_excess(replace(measured, flats=unknown), darks, flats, used, 1)
+        free, grown = fit_with_excess(replace(measured, flats=unknown), darks, 1)
         if abs(free.values["nonlinearity_per_dn"]) > 3 * free.standard_error("nonlinearity_per_dn"):
             return free, free, grown
     usual = replace(moments, flats=replace(unknown, bend_se=UNKNOWN_BEND_SE))
-    fit, grown = fit_with_excess(usual, darks, flats, used, 1)
+    fit, grown = fit_with_excess(usual, darks, 1)
     return fit, free, grown
 
 

@@ -36,7 +36,7 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
     """Return why the noise of the series denies the model, None if it does not; only with flats."""
     if not fitted.flats:
         return None
-    series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats, fitted.used)
+    series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats)
     for one in series:
         # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
         if one.noise_excess is None or one.noise_se is None or one.series.conditions.kind == "dark":

@@ -3,9 +3,18 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
-# Pixels of a strip.
-_STRIP_PX = 1 << 16
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from faintfield.calib.noise.room import new_map, release
+
+# Pixels of a strip, and strips after which maps in files are taken out of memory.
+_STRIP_PX, _RELEASE = 1 << 16, 32
+
+# Pixels that tell a median or a quantile well enough where nothing but a start or a scale depends on it.
+_ENOUGH_PX = 1 << 22
 
 
 def usable_cores() -> int:
@@ -13,7 +22,7 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...]) -> list[T]:
+def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> list[T]:
     """Return the results of `work` for the strips of an array (row, column), first to last.
 
     Parameters
@@ -22,10 +31,78 @@ def over_strips[T](work: Callable[[slice], T], shape: tuple[int, ...]) -> list[T
         Takes the rows of a strip; must not write outside of them.
     shape : tuple of int
         Rows and columns of the array.
+    parts : int, optional
+        Number of strips, at most; without it they are small.
     """
-    step = max(_STRIP_PX // max(shape[1], 1), 1)
+    step = max(_STRIP_PX // max(shape[1], 1), 1) if parts is None else -(-shape[0] // parts)
     strips = [slice(first, min(first + step, shape[0])) for first in range(0, shape[0], step)]
     if len(strips) == 1:
         return [work(strips[0])]
+    found: list[T] = []
     with ThreadPoolExecutor(usable_cores()) as pool:
-        return list(pool.map(work, strips))
+        for first in range(0, len(strips), _RELEASE):
+            found += pool.map(work, strips[first : first + _RELEASE])
+            release()
+    return found
+
+
+def map_of(
+    work: Callable[[slice], NDArray[Any]], shape: tuple[int, ...], dtype: DTypeLike = np.float32
+) -> NDArray[Any]:
+    """Return a map (row, column) of what `work` returns for the rows of each strip."""
+    (found,) = maps_of(lambda rows: (work(rows),), shape, (dtype,))
+    return found
+
+
+def maps_of(
+    work: Callable[[slice], tuple[NDArray[Any], ...]], shape: tuple[int, ...], dtypes: tuple[DTypeLike, ...]
+) -> tuple[NDArray[Any], ...]:
+    """Return several maps (row, column) of what `work` returns for the rows of each strip."""
+    maps = tuple(new_map(shape, dtype) for dtype in dtypes)
+
+    def fill(rows: slice) -> None:
+        for one, values in zip(maps, work(rows), strict=True):
+            one[rows] = values
+
+    over_strips(fill, shape)
+    return maps
+
+
+def total_of[T](work: Callable[[slice], T], shape: tuple[int, ...], parts: int | None = None) -> T:
+    """Return the sum, from the first strip to the last, of what `work` returns for the rows of each."""
+    first, *others = over_strips(work, shape, parts)
+    for part in others:
+        first = first + part  # type: ignore[operator]
+    return first
+
+
+def thinned(
+    values: NDArray[np.floating], usable: NDArray[np.bool_], scale: Callable[[slice], NDArray[Any]] | None = None
+) -> NDArray[np.floating]:
+    """Return the values of usable pixels (pixel,), over their scale if given; of large arrays those of some rows."""
+    every = max(values.size // _ENOUGH_PX, 1) | 1  # odd, so that even and odd rows have their share
+
+    def work(rows: slice) -> NDArray[np.floating]:
+        first = -rows.start % every
+        some = values[rows][first::every]
+        found: NDArray[np.floating] = (some if scale is None else some / scale(rows)[first::every])[
+            usable[rows][first::every]
+        ]
+        return found
+
+    return np.concatenate(over_strips(work, values.shape))
+
+
+def mean_over(values_of: Callable[[slice], NDArray[Any]], usable: NDArray[np.bool_]) -> float:
+    """Return the mean over the usable pixels of what a function returns for the rows of each strip."""
+
+    def work(rows: slice) -> float:
+        return float(values_of(rows).sum(where=usable[rows], dtype=np.float64))
+
+    return total_of(work, usable.shape) / float(usable.sum())
+
+
+def variance_over(values_of: Callable[[slice], NDArray[Any]], usable: NDArray[np.bool_]) -> float:
+    """Return the variance over the usable pixels, likewise."""
+    mean = mean_over(values_of, usable)
+    return mean_over(lambda rows: np.square(values_of(rows) - mean), usable)

@@ -1,6 +1,6 @@
 """A sensor's noise from a noise set: each phase of its mosaic calibrated, as the record and the maps of the result."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import CalibrationError
 from faintfield.calib.noise import Estimate, NoiseCalibration, calibrate
+from faintfield.calib.noise.room import release
 from faintfield.pipelines.calibration.noise_emva import EmvaMeasurement, measure_emva
 from faintfield.pipelines.calibration.noise_fit import fit_record
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase, Readout, read_series
@@ -117,21 +118,26 @@ def noise_record(sensor: SensorCalibration) -> NoiseRecord:
     )
 
 
-def noise_maps(sensor: SensorCalibration) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `noise_maps.npz` (row, column): float32 by the names in `NoiseMaps`, and the bool `mask`."""
-    readout, phases = sensor.readout, sensor.phases
-    maps = {"mask": _interleave(readout, [c.maps.unusable for c in phases], fill=True)}
+def noise_maps(sensor: SensorCalibration) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield name and array of the maps of `noise_maps.npz` (row, column): float32, but the bool `mask`."""
+    for name, parts, fill in _parts_of_maps(sensor.phases):
+        yield name, _interleave(sensor.readout, parts, fill)
+        release()
+
+
+def _parts_of_maps(phases: Sequence[NoiseCalibration]) -> Iterator[tuple[str, list[NDArray[Any]], float]]:
+    """Yield the name of each map, its part of each phase, and the value of pixels that were not calibrated."""
+    yield "mask", [c.maps.unusable for c in phases], True
     for name, fill in _MAPS.items():
         parts = [getattr(c.maps, name) for c in phases]
         if all(part is not None for part in parts):
-            maps[name] = _interleave(readout, parts, fill)
-    gains = [_gain_map(c) for c in phases]
-    if len(gains) > 1 or phases[0].maps.gain_dn_per_e is not None:
+            yield name, parts, fill
+    if len(phases) > 1 or phases[0].maps.gain_dn_per_e is not None:
+        gains = [_gain_map(c) for c in phases]
         for (name, fill), kept in zip(_GAIN_MAPS.items(), zip(*gains, strict=True), strict=True):
             whole = [part for part in kept if part is not None]
             if len(whole) == len(phases):
-                maps[name] = _interleave(readout, whole, fill)
-    return maps
+                yield name, whole, fill
 
 
 def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
@@ -141,7 +147,7 @@ def _gain_map(calibration: NoiseCalibration) -> tuple[NDArray[np.float32] | None
         return None, None
     if maps.gain_dn_per_e is not None:
         return maps.gain_dn_per_e, maps.gain_se_dn_per_e
-    return np.full(maps.offset_dn.shape, gain, np.float32), None
+    return np.broadcast_to(np.float32(gain), maps.offset_dn.shape), None
 
 
 def _calibrate_phase(phase: MosaicPhase, saturation_dn: float) -> NoiseCalibration:

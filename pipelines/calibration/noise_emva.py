@@ -11,6 +11,7 @@ from faintfield.calib.noise import Estimate, NoiseCalibration, Series
 from faintfield.calib.noise.emva.nonuniformity import Nonuniformity, TemporalNoise, nonuniformity, temporal_noise
 from faintfield.calib.noise.emva.quantities import derived_quantities, gather_inputs
 from faintfield.calib.noise.emva.warmth import dark_current_doubling
+from faintfield.calib.noise.strips import map_of, mean_over
 from faintfield.pipelines.calibration.noise_frames import MosaicPhase
 from faintfield.pipelines.formats.results.noise_emva import EmvaImageRecord, EmvaRecord
 from faintfield.pipelines.formats.results.noise_fit import Measured
@@ -139,9 +140,9 @@ def _dark_image(
     most = 0 if nearest else max(one.frames for one in several)
     enough = [one for one in several if one.frames >= most]
     dark = min(enough, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
-    mean = dark.mean_dn
+    mean = map_of(dark.mean_of, used.shape, np.float64)
     offset = calibration.estimates["offset_dn"].value or 0.0
-    return MeanImage(dark, mean, temporal_noise(dark, used), float(mean.mean(where=used)) - offset)
+    return MeanImage(dark, mean, temporal_noise(dark, used), mean_over(lambda rows: mean[rows], used) - offset)
 
 
 def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanImage | None:
@@ -159,19 +160,27 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
     if dark is None:
         return None
-    signal = flat.mean_dn - dark.values
-    signal_dn = float(signal.mean(where=used))
-    slope = 1.0
-    if calibration.response is not None:  # PRNU is that of the charge, which a bend of the response compresses
-        ends = calibration.response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
+    response, vignetting = calibration.response, calibration.maps.vignetting
+
+    def signal(rows: slice) -> NDArray[np.float64]:
+        return np.asarray(flat.mean_of(rows) - dark.values[rows])
+
+    def charge(rows: slice) -> NDArray[np.float64]:
+        return signal(rows) if response is None else response.charge_dn(signal(rows))
+
+    def smooth(rows: slice) -> NDArray[np.float64]:
+        if vignetting is None:
+            return np.ones(used[rows].shape)
+        return np.maximum(vignetting[rows], 1e-3, dtype=np.float64)
+
+    signal_dn, mean, slope = mean_over(signal, used), mean_over(charge, used), 1.0
+    if response is not None:  # PRNU is that of the charge, which a bend of the response compresses
+        ends = response.charge_dn(np.array([0.99, 1.01]) * signal_dn)
         slope = float(ends[1] - ends[0]) / (0.02 * signal_dn)
-        signal = calibration.response.charge_dn(signal)
-    mean = float(signal.mean(where=used))
-    vignetting = calibration.maps.vignetting
-    smooth = np.ones_like(signal) if vignetting is None else np.maximum(vignetting, 1e-3)
+    image = map_of(lambda rows: charge(rows) / smooth(rows) / mean, used.shape, np.float64)
     noise = temporal_noise(flat, used) + dark.noise
-    weight = float((1 / smooth**2).mean(where=used)) * (slope / mean) ** 2
-    return MeanImage(flat, signal / smooth / mean, noise.scaled(weight), signal_dn)
+    weight = mean_over(lambda rows: 1 / smooth(rows) ** 2, used) * (slope / mean) ** 2
+    return MeanImage(flat, image, noise.scaled(weight), signal_dn)
 
 
 def _end_dn(calibration: NoiseCalibration) -> float:

@@ -63,7 +63,10 @@ def noise(
 
 def measure(folder: Path, out: Path | None) -> "NoiseRecord":
     """Measure a sensor from the frames in a folder, and write the result with its pages, there if not to `out`."""
+    from faintfield.calib.noise.room import maps_by
     from faintfield.pipelines.calibration.noise import calibrate_sensor, noise_maps, noise_record
+    from faintfield.pipelines.formats.files import removed_if_empty
+    from faintfield.pipelines.formats.large_arrays import maps_in_files
     from faintfield.pipelines.formats.results.noise import NOISE_FILE, write_noise
     from faintfield.pipelines.formats.sets.noise_set import FILE_NAME, load_noise_set
     from faintfield.pipelines.pages.emva_page import EMVA_PAGE, emva_page
@@ -73,17 +76,18 @@ def measure(folder: Path, out: Path | None) -> "NoiseRecord":
         raise MissingFile(f"{folder}: no such folder; name a folder with {FILE_NAME} and frames")
     folder, settings = load_noise_set(folder)
     out = out or folder
-    sensor = calibrate_sensor(folder, settings)
-    with working("drawing the pages"):
-        pages = {
-            f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
-                calibration, f"{folder.resolve().name} {phase.name}"
-            )
-            for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
-        }
-        record = noise_record(sensor)
-        pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
-    record = write_noise(out, record, noise_maps(sensor), pages)
+    with removed_if_empty(out), maps_by(maps_in_files(out)):
+        sensor = calibrate_sensor(folder, settings)
+        with working("drawing the pages"):
+            pages = {
+                f"noise_page{f'_{phase.name}' if phase.name else ''}.png": draw_page(
+                    calibration, f"{folder.resolve().name} {phase.name}"
+                )
+                for phase, calibration in zip(sensor.readout.phases, sensor.phases, strict=True)
+            }
+            record = noise_record(sensor)
+            pages[EMVA_PAGE] = emva_page(folder.resolve().name, record, sensor.emva).encode()
+        record = write_noise(out, record, noise_maps(sensor), pages)
     _inform_of(record)
     inform(f"{out / NOISE_FILE}")
     return record

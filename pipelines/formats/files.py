@@ -152,6 +152,18 @@ def check_free(out: Path, *, replace_if: str | None = None, replace_only: Collec
 
 
 @contextmanager
+def removed_if_empty(folder: Path) -> Iterator[None]:
+    """Remove a folder that the block made and left empty."""
+    existed = folder.exists()
+    try:
+        yield
+    finally:
+        if not existed:
+            with suppress(OSError):  # it has files, or was never made
+                folder.rmdir()
+
+
+@contextmanager
 def exclusive(folder: Path) -> Iterator[None]:
     """Lock a folder of results while the block runs, and first remove what a killed process left unfinished there.
 

@@ -4,12 +4,15 @@ import os
 import re
 import tempfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
+from shutil import disk_usage
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from faintfield.pipelines.errors import CannotWrite, DiskFull
 from faintfield.pipelines.formats.files import translated_write_errors
 
 # Makes an uninitialised array, given its shape and dtype.
@@ -17,6 +20,9 @@ type Allocate = Callable[[tuple[int, ...], DTypeLike], NDArray[Any]]
 
 # Share of the free memory that one array may take; the rest is for planes, other programs, and other arrays.
 SHARE_OF_MEMORY = 0.5
+
+# Arrays below are kept in memory by `maps_in_files`, whose files take at most a share of the free disk: results follow.
+_MIN_FILE_BYTES, _SHARE_OF_DISK = 2_000_000, 0.5
 
 _PROC, _CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
@@ -34,6 +40,28 @@ def memory_or_file(folder: Path) -> Allocate:
             folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder) as file:
                 return mapped(file, shape, dtype)
+
+    return allocate
+
+
+def maps_in_files(folder: Path) -> Allocate:
+    """Return a function that makes large arrays in files in `folder`, small ones, and what finds no room, in memory.
+
+    The files have no names, as those of `memory_or_file`, and take at most half of the free disk.
+    """
+    left_bytes: list[float] = []
+
+    def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
+        if _bytes(shape, dtype) >= _MIN_FILE_BYTES:
+            with suppress(DiskFull, CannotWrite), translated_write_errors(folder):
+                folder.mkdir(parents=True, exist_ok=True)
+                free_bytes = disk_usage(folder).free
+                left_bytes[:] = left_bytes or [(1 - _SHARE_OF_DISK) * free_bytes]
+                if free_bytes - _bytes(shape, dtype) < left_bytes[0]:
+                    return np.empty(shape, dtype)
+                with tempfile.TemporaryFile(dir=folder) as file:
+                    return mapped(file, shape, dtype)
+        return np.empty(shape, dtype)
 
     return allocate
 

@@ -11,6 +11,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.calib.noise import Estimate, NoiseCalibration, TransferPoint
+from faintfield.calib.noise.emva.nonuniformity import spectrogram
+from faintfield.calib.noise.strips import over_strips, thinned, variance_over
 from faintfield.pipelines.formats.results.noise import STANDARD
 
 _INK, _MODEL, _SECOND = "#1b1b1b", "#c23b22", "#2b6ca3"
@@ -80,7 +82,7 @@ def page_plots(calibration: NoiseCalibration) -> tuple[Plot, ...]:
         Plot("Photon transfer" + cut_off, _photon_transfer),
         Plot("Dark signal against exposure time", _dark_signal),
         Plot("Results, 95 % intervals", _table),
-        _map("Offset less its mean (DSNU) [DN]", maps.offset_dn - offset, maps.unusable),
+        _map("Offset less its mean (DSNU) [DN]", maps.offset_dn, maps.unusable, offset),
         _map("Dark current [e⁻/s]", maps.dark_current_e_per_s, maps.unusable),
         # Uniform if the model is complete.
         _map("Temporal variance, measured / model", calibration.variance_ratio, maps.unusable),
@@ -155,16 +157,16 @@ def _value_and_interval(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{digits}f}", f"{low:.{digits}f} … {high:.{digits}f}"
 
 
-def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_]) -> Plot:
-    """Return the plot of one map; its scale spans the usable pixels."""
+def _map(title: str, values: NDArray[np.floating] | None, unusable: NDArray[np.bool_], less: float = 0.0) -> Plot:
+    """Return the plot of one map less a number; its scale spans the usable pixels."""
 
     def draw(axes: Axes, _: NoiseCalibration) -> None:
         assert values is not None
-        low, high = np.quantile(values[~unusable], [0.005, 0.995])
+        low, high = np.quantile(thinned(values, ~unusable), [0.005, 0.995]) - less
         height, width = values.shape
         step = max(max(height, width) // _MAX_SHOWN_PX, 1)  # more pixels than the page has take seconds to draw
         extent = (-0.5, width - 0.5, height - 0.5, -0.5)
-        shown = values[::step, ::step]
+        shown = values[::step, ::step] - less
         image = axes.imshow(
             shown, extent=extent, vmin=low, vmax=max(high, low + 1e-6), cmap="viridis", interpolation="nearest"
         )
@@ -180,7 +182,13 @@ def _why_empty(values: NDArray[np.floating] | None, unusable: NDArray[np.bool_])
         return "not identifiable from these frames"
     if unusable.all():
         return "no usable pixel"
-    return None if np.ptp(values[~unusable]) else "the same for all pixels"
+    ends = over_strips(lambda rows: _ends(values[rows][~unusable[rows]]), values.shape)
+    return None if min(low for low, _ in ends) < max(high for _, high in ends) else "the same for all pixels"
+
+
+def _ends(values: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the lowest and the highest value."""
+    return float(values.min(initial=np.inf)), float(values.max(initial=-np.inf))
 
 
 def _histograms(axes: Axes, calibration: NoiseCalibration) -> None:
@@ -208,15 +216,12 @@ def _value_range(calibration: NoiseCalibration) -> tuple[float, float]:
 
 def _spectrogram(axes: Axes, calibration: NoiseCalibration) -> None:
     """Draw the amplitude spectra of the offset map; a peak is a fixed pattern with a period."""
-    offset = np.asarray(calibration.maps.offset_dn, np.float64)
-    usable = ~calibration.maps.unusable
-    mean = float(offset.mean(where=usable))
-    deviation = np.where(usable, offset - mean, 0.0)
+    offset, usable = calibration.maps.offset_dn, ~calibration.maps.unusable
+    share = float(usable.mean())
     for axis, label, colour in ((1, "along rows (horizontal)", _SECOND), (0, "along columns (vertical)", _INK)):
-        length = offset.shape[axis]
-        power = (np.abs(np.fft.rfft(deviation, axis=axis)) ** 2 / length).mean(1 - axis)
-        axes.plot(np.fft.rfftfreq(length)[1:], np.sqrt(power[1:]), lw=0.8, color=colour, label=label)
-    white = float(np.sqrt((deviation**2).mean()))
+        spectrum = spectrogram(offset, usable, axis)
+        axes.plot(spectrum.frequency, np.sqrt(share * spectrum.power), lw=0.8, color=colour, label=label)
+    white = np.sqrt(share * variance_over(lambda rows: offset[rows], usable))
     axes.axhline(white, color=_MODEL, lw=1, ls="--", label="same variance, no pattern")
     axes.set_ylim(bottom=0)
     axes.set(xlabel="spatial frequency [cycles/px]", ylabel="amplitude [DN]")

@@ -11,12 +11,13 @@ import tomli_w
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.commands.reconstruct import reconstruct
 from faintfield.pipelines.commands.simulate import simulate
+from faintfield.pipelines.reconstruction.options import Options
 from faintfield.rig.simulation.sensor import SimulatedSensor
 from tests.pipelines.noise_sets import write_frames
 
 
 def texture_errors(elemental_set: Path, out: Path) -> dict[float, float]:
-    reconstruct(elemental_set, out=out, depth_mm=[500.0, 700.0], method=["pmlem-osl"])
+    reconstruct(elemental_set, options=Options(depth_mm=[500.0, 700.0], method=["pmlem-osl"]), out=out)
     rows = json.loads((out / "metrics.json").read_text())["planes"]
     return {row["depth_mm"]: float(np.sqrt(row["mse_texture"])) for row in rows}
 

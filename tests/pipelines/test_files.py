@@ -12,6 +12,7 @@ from faintfield.pipelines.formats.files import (
     CACHE_FILE,
     Hashes,
     exclusive,
+    removed_if_empty,
     require_room,
     sha256,
     write_json,
@@ -247,3 +248,16 @@ def test_an_interrupt_as_soon_as_the_file_is_there_leaves_nothing(
     with pytest.raises(KeyboardInterrupt):
         write_whole(tmp_path / "plane.json", "{}")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_only_an_empty_folder_that_the_block_made_is_removed(tmp_path: Path) -> None:
+    made, kept, filled = tmp_path / "made", tmp_path / "kept", tmp_path / "filled"
+    kept.mkdir()
+    with removed_if_empty(made):
+        made.mkdir()
+    with removed_if_empty(kept):
+        pass
+    with removed_if_empty(filled):
+        filled.mkdir()
+        (filled / "file").touch()
+    assert (made.exists(), kept.exists(), filled.exists()) == (False, True, True)

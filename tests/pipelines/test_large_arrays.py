@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from shutil import disk_usage
 from subprocess import CompletedProcess
 
 import numpy as np
@@ -14,7 +15,7 @@ import tifffile
 
 from faintfield.pipelines.errors import DiskFull
 from faintfield.pipelines.formats import large_arrays
-from faintfield.pipelines.formats.large_arrays import available_bytes, memory_or_file
+from faintfield.pipelines.formats.large_arrays import available_bytes, maps_in_files, memory_or_file
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 
@@ -121,3 +122,29 @@ def test_a_set_larger_than_memory_is_reconstructed(
     assert (ended.returncode == 0) == succeeds, ended.stderr
     assert ("MemoryError" in ended.stderr) == (not succeeds)
     assert (tmp_path / "out" / "plane_00500.0.tiff").is_file() == succeeds
+
+
+@pytest.mark.parametrize(("free_bytes", "in_files"), [(20_000_000, [True, True, False]), (3_000_000, [False] * 3)])
+def test_maps_lie_in_files_until_half_of_the_free_disk_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_bytes: int, in_files: list[bool]
+) -> None:
+    taken = 0
+    usage = disk_usage(tmp_path)
+    monkeypatch.setattr(large_arrays, "disk_usage", lambda _: usage._replace(free=free_bytes - taken))
+    allocate, found = maps_in_files(tmp_path), []
+    for _ in in_files:
+        made = allocate((1000, 1000), np.float32)
+        made[:] = 1.0
+        found.append(isinstance(made.base, np.memmap))
+        taken += made.nbytes if found[-1] else 0
+    assert found == in_files
+    assert not isinstance(allocate((10, 10), np.float32).base, np.memmap)
+    assert [*tmp_path.iterdir()] == []  # files have no names
+
+
+def test_a_full_disk_leaves_maps_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    assert maps_in_files(tmp_path)((1000, 1000), np.float32).base is None

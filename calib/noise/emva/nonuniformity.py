@@ -8,13 +8,15 @@ import math
 from dataclasses import dataclass, fields
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
+from scipy import stats
 
 from faintfield.calib.noise.intervals import root
 from faintfield.calib.noise.result import Estimate
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import map_of, mean_over, over_strips, total_of
 
 type Array = NDArray[np.float64]
 type Mask = NDArray[np.bool_]
@@ -24,6 +26,9 @@ _BOX_PX = 5
 
 # Largest number of steps of an accumulated histogram.
 _MAX_STEPS = 256
+
+# Lines whose spectra are taken at a time, and pixels that are counted at a time.
+_LINES, _CHUNK_PX = 128, 1 << 16
 
 _QUANTILE = float(stats.norm.ppf(0.975))
 
@@ -71,7 +76,7 @@ class Nonuniformity:
 def temporal_noise(series: Series, used: Mask) -> TemporalNoise:
     """Return what temporal noise leaves in the mean image of a series of at least two frames."""
     pixels, again = used.sum() * _freedom_share(used), series.frames - 1
-    within = float(series.within_dn2.sum(where=used)) / (again * pixels)
+    within = mean_over(lambda strip: series.within_dn2[strip], used) * float(used.sum()) / (again * pixels)
     # The level of a frame is subtracted from its rows, and takes one degree of freedom of each set of means
     rows, columns = (size - 1 for size in used.shape)
     row, column = series.row_noise_dn2 * (1 + 1 / rows), series.column_noise_dn2 * (1 + 1 / columns)
@@ -86,10 +91,10 @@ def nonuniformity(image: NDArray[Any], used: Mask, noise: TemporalNoise, scale: 
     With the means of M rows and N columns subtracted, the rest has the variance s_pixel² + σ², where σ² is the temporal
     noise that is left; the means of rows have s_row² + s_pixel²/N and theirs. A difference has the errors of both.
     """
-    rows, columns, rest = _parts(np.asarray(image, np.float64), used)
+    rows, columns, squares = _parts(image, used)
     freedom = used.sum() * _freedom_share(used)
     across = used.sum() / rows.size, used.sum() / columns.size
-    scatter = float((rest**2).sum() / freedom)
+    scatter = squares / freedom
     pixel, pixel_se = scatter - noise.pixel, math.hypot(scatter * math.sqrt(2 / freedom), noise.pixel_se)
     row, row_se = _of_means(rows, noise.row + pixel / across[0], noise.row_se)
     column, column_se = _of_means(columns, noise.column + pixel / across[1], noise.column_se)
@@ -115,14 +120,24 @@ def _freedom_share(used: Mask) -> float:
     return max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
 
 
-def _parts(image: Array, used: Mask) -> tuple[Array, Array, Array]:
-    """Return the means of rows and columns with pixels in use, and the rest (row, column), 0 for unused pixels."""
-    deviation = np.where(used, image - image.mean(where=used), 0.0)
+def _parts(image: NDArray[Any], used: Mask) -> tuple[Array, Array, float]:
+    """Return the means of rows and columns with pixels in use, and the sum of squares of the rest."""
+    mean = mean_over(lambda rows: image[rows], used)
+
+    def deviation(rows: slice) -> Array:
+        return np.where(used[rows], image[rows] - np.float64(mean), 0.0)
+
+    sums = over_strips(lambda rows: ((it := deviation(rows)).sum(1), it.sum(0)), used.shape)
+    of_rows, of_columns = zip(*sums, strict=True)
     per_row, per_column = used.sum(1), used.sum(0)
-    row = deviation.sum(1) / np.maximum(per_row, 1)
-    column = deviation.sum(0) / np.maximum(per_column, 1)
-    rest = np.where(used, deviation - row[:, None] - column, 0.0)
-    return row[per_row > 0], column[per_column > 0], rest
+    row = np.concatenate(of_rows) / np.maximum(per_row, 1)
+    column = np.sum(of_columns, axis=0) / np.maximum(per_column, 1)
+
+    def squares(rows: slice) -> float:
+        rest = deviation(rows) - row[rows, None] - column
+        return float(np.square(rest).sum(where=used[rows]))
+
+    return row[per_row > 0], column[per_column > 0], total_of(squares, used.shape)
 
 
 @dataclass(frozen=True)
@@ -152,10 +167,16 @@ def spectrogram(image: NDArray[Any], used: Mask, axis: int) -> Spectrogram:
     With ŷ the discrete Fourier transform of a line of N pixels, the mean subtracted, the power is the mean of |ŷ|²/N
     over the lines. Pixels that are not used count as the mean.
     """
-    deviation = np.where(used, image - np.mean(image, where=used), 0.0)
-    length = image.shape[axis]
-    power = (np.abs(np.fft.rfft(deviation, axis=axis)) ** 2 / length).mean(axis=1 - axis) / float(used.mean())
-    return Spectrogram(np.fft.rfftfreq(length)[1:], power[1:])
+    mean = mean_over(lambda rows: image[rows], used)
+    lines, counts = (image, used) if axis == 1 else (image.T, used.T)
+
+    def work(some: slice) -> Array:
+        deviation = np.where(counts[some], lines[some] - np.float64(mean), 0.0)
+        return np.asarray(np.square(np.abs(np.fft.rfft(deviation, axis=1))).sum(axis=0))
+
+    total = total_of(work, lines.shape, -(-len(lines) // _LINES))
+    power = total / lines.size / float(used.mean())
+    return Spectrogram(np.fft.rfftfreq(lines.shape[1])[1:], power[1:])
 
 
 @dataclass(frozen=True)
@@ -179,16 +200,27 @@ class AccumulatedHistogram:
 
 def accumulated_histogram(image: NDArray[Any], used: Mask) -> AccumulatedHistogram:
     """Return the accumulated histogram, which shows few outlying pixels on a logarithmic axis as well as many."""
-    values = np.asarray(image, np.float64)[used]
-    deviation = np.sort(np.abs(values - values.mean()))
-    steps = np.linspace(0.0, deviation[-1], min(_MAX_STEPS, deviation.size))
-    beyond = deviation.size - np.searchsorted(deviation, steps, side="left")
+    mean = mean_over(lambda rows: image[rows], used)
+    deviation = np.concatenate(
+        over_strips(lambda rows: np.abs(image[rows] - np.float64(mean))[used[rows]].astype(np.float32), used.shape)
+    )
+    steps = np.linspace(0.0, deviation.max(), min(_MAX_STEPS, deviation.size))
+    parts = np.array_split(deviation, max(deviation.size // _CHUNK_PX, 1))
+    reached = np.zeros(steps.size + 1, np.int64)
+    for it in parts:
+        reached += np.bincount(np.searchsorted(steps, it, side="right"), minlength=reached.size)
+    beyond = np.cumsum(reached[::-1])[-2::-1]
     # Half of a normal law lies within 0.6745 standard deviations
-    return AccumulatedHistogram(steps, 100.0 * beyond / deviation.size, float(np.median(deviation)) / 0.6745)
+    sigma = float(np.median(deviation, overwrite_input=True)) / 0.6745
+    return AccumulatedHistogram(steps, 100.0 * beyond / deviation.size, sigma)
 
 
-def high_pass(image: NDArray[Any], used: Mask) -> Array:
+def high_pass(image: NDArray[Any], used: Mask) -> NDArray[Any]:
     """Return an image less its mean over 5 × 5 pixels, so that uneven light does not count as a deviation."""
-    share = ndimage.uniform_filter(used.astype(np.float64), _BOX_PX, mode="nearest")
-    mean = ndimage.uniform_filter(np.where(used, image, 0.0).astype(np.float64), _BOX_PX, mode="nearest")
-    return np.asarray(np.where(used, image - mean / np.maximum(share, 1e-6), 0.0))
+    share = cv2.blur(used.astype(image.dtype), (_BOX_PX, _BOX_PX), borderType=cv2.BORDER_REPLICATE)
+    mean = cv2.blur(np.where(used, image, 0), (_BOX_PX, _BOX_PX), borderType=cv2.BORDER_REPLICATE)
+
+    def work(rows: slice) -> NDArray[Any]:
+        return np.where(used[rows], image[rows] - mean[rows] / np.maximum(share[rows], 1e-6), 0.0)
+
+    return map_of(work, image.shape, image.dtype)

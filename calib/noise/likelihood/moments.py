@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.noise.likelihood.groups import BLOCKS, SeriesNoise, group_noise
 from faintfield.calib.noise.likelihood.response import Light, known_light
 from faintfield.calib.noise.likelihood.rounding import dark_roundings, flat_rounding
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import total_of
 
 
 @dataclass(frozen=True)
@@ -114,13 +116,17 @@ NO_EXCESS = Excess()
 
 @dataclass(frozen=True)
 class Moments:
-    """Sufficient statistics of all series, from `pixels` pixels in use with `freedom` degrees of freedom."""
+    """Sufficient statistics of all series, from `pixels` pixels in use with `freedom` degrees of freedom.
+
+    `noise` are the sums of the noise of each series over groups of pixels, darks first.
+    """
 
     pixels: float
     freedom: float
     darks: DarkMoments
     flats: FlatMoments
     excess: Excess = NO_EXCESS
+    noise: tuple[SeriesNoise, ...] = ()
 
 
 def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]) -> Moments:
@@ -135,45 +141,59 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
     """
     rows, columns = used.shape
     pixels = float(used.sum())
-    patterns = np.array([series.pattern_dn[used] for series in darks], np.float64)
-    dark_dn = darks[0].mean_dn
     freedom = max(pixels - rows - columns + 1.0, 1.0)
+    mean_dn = [_mean_dn(one, used) for one in (*darks, *flats)]
+    floor_dn = min(mean_dn[: len(darks)])
+    noise = tuple(group_noise(one, used, floor_dn, (BLOCKS, BLOCKS)) for one in (*darks, *flats))
     roundings = dark_roundings(darks, used)
+
+    def work(strip: slice) -> NDArray[np.float64]:
+        at = used[strip]
+        patterns = np.array([one.pattern_dn[strip][at] for one in darks], np.float64)
+        return patterns @ patterns.T
+
     return Moments(
         pixels=pixels,
         freedom=freedom,
         darks=DarkMoments(
             exposure_s=np.array([series.conditions.dark_time_s for series in darks]),
             frames=np.array([series.frames for series in darks], np.float64),
-            mean_dn=np.array([_mean_dn(series, used) for series in darks]),
+            mean_dn=np.array(mean_dn[: len(darks)]),
             within_dn2=np.array(
                 [
-                    series.within_dn2.sum(where=used, dtype=np.float64) - one.excess_dn2 * (series.frames - 1) * freedom
-                    for series, one in zip(darks, roundings, strict=True)
+                    one.within_dn2 - rounding.excess_dn2 * (one.frames - 1) * freedom
+                    for one, rounding in zip(noise, roundings, strict=False)
                 ]
             ),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
-            scatter_dn2=patterns @ patterns.T,
+            scatter_dn2=total_of(work, used.shape),
             rounding2=np.array([one.error**2 for one in roundings]),
         ),
         flats=FlatMoments(
             frames=np.array([series.frames for series in flats], np.float64),
-            mean_dn=np.array([_mean_dn(series, used) for series in flats]),
-            within_dn2=np.array([series.within_dn2.sum(where=used, dtype=np.float64) for series in flats]),
-            evenness=np.array([_evenness(series.mean_dn[used] - dark_dn[used]) for series in flats]),
+            mean_dn=np.array(mean_dn[len(darks) :]),
+            within_dn2=np.array([one.within_dn2 for one in noise[len(darks) :]]),
+            evenness=np.array([_evenness(series, darks[0], used) for series in flats]),
             exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
             light=known_light(flats),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in flats]),
             rounding2=np.array([flat_rounding(series, used).error ** 2 for series in flats]),
         ),
+        noise=noise,
     )
 
 
 def _mean_dn(series: Series, used: NDArray[np.bool_]) -> float:
     """Return the mean over frames and the pixels in use."""
-    return float(series.mean_dn.mean(where=used))
+    return float(total_of(lambda rows: series.mean_of(rows).sum(where=used[rows]), used.shape)) / float(used.sum())
 
 
-def _evenness(signal_dn: NDArray[np.float64]) -> float:
-    """Return ⟨s⟩²/⟨s²⟩."""
-    return float(signal_dn.mean() ** 2 / max(float((signal_dn**2).mean()), 1e-12))
+def _evenness(flat: Series, dark: Series, used: NDArray[np.bool_]) -> float:
+    """Return ⟨s⟩²/⟨s²⟩ of the signal s of a flat over a dark."""
+
+    def work(rows: slice) -> NDArray[np.float64]:
+        signal = (flat.mean_of(rows) - dark.mean_of(rows))[used[rows]]
+        return np.array([signal.sum(), signal @ signal])
+
+    mean, square = total_of(work, used.shape) / float(used.sum())
+    return float(mean**2 / max(square, 1e-12))

@@ -48,20 +48,21 @@ LINEARITY_RANGE, _MIN_LINEARITY_LEVELS = (0.05, 0.95), 3
 
 def charge_dn(values: Mapping[str, Any], signal_dn: Any) -> Any:
     """Return the charge K Q behind a signal, eq. (5); numbers, arrays or casadi expressions."""
-    factor: Any = 1.0
-    for power, name in enumerate(BENDS, 1):
-        if name in values:
-            factor = factor + values[name] * signal_dn**power
-    return signal_dn * factor
+    return signal_dn * (1.0 + _polynomial([values[name] for name in BENDS if name in values], signal_dn))
 
 
 def charge_slope(values: Mapping[str, Any], signal_dn: Any) -> Any:
     """Return the derivative of `charge_dn`: the gain at zero signal over that at the signal."""
-    slope: Any = 1.0
-    for power, name in enumerate(BENDS, 1):
-        if name in values:
-            slope = slope + (power + 1) * values[name] * signal_dn**power
-    return slope
+    bends = [(power + 1) * values[name] for power, name in enumerate(BENDS, 1) if name in values]
+    return 1.0 + _polynomial(bends, signal_dn)
+
+
+def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
+    """Return c₁ x + c₂ x² and so on."""
+    found: Any = 0.0
+    for coefficient in reversed(coefficients):
+        found = (coefficient + found) * x
+    return found
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import total_of
 
 # Variance in DN² that rounding to whole DN adds on average over the phases.
 ROUNDING_DN2 = 1 / 12
@@ -56,7 +57,7 @@ def flat_rounding(series: Series, used: NDArray[np.bool_]) -> Rounding:
     if series.frames < 2:
         return Rounding(0.0, 0.0)
     total = _variance_dn2(series, used)
-    pattern = max(float(series.pattern_dn.var(where=used)) - total / series.frames, 0.0)
+    pattern = max(_pattern_dn2(series, used) - total / series.frames, 0.0)
     return Rounding(0.0, float(_amplitude(max(total - ROUNDING_DN2, 0.0)) * np.exp(-2 * np.pi**2 * pattern) / total))
 
 
@@ -66,8 +67,10 @@ def dark_roundings(darks: Sequence[Series], used: NDArray[np.bool_]) -> list[Rou
     if max(one.error for one in roundings) < _NEGLIGIBLE:
         return roundings
     weight = np.array([one.frames for one in darks], np.float64)
-    relative = [one.mean_dn[used] - one.mean_dn.mean(where=used) for one in darks]
-    phase = np.average(relative, axis=0, weights=weight)
+    phase = np.zeros(int(used.sum()))
+    for one, share in zip(darks, weight / weight.sum(), strict=True):
+        mean = one.mean_dn[used]
+        phase += share * (mean - mean.mean())
     measured = [_dark_rounding(one, phase, float(weight.sum()), used) for one in darks]
     return [min(both, key=lambda rounding: rounding.error) for both in zip(roundings, measured, strict=True)]
 
@@ -109,8 +112,20 @@ def _dark_rounding(series: Series, phase_dn: NDArray[np.float64], frames: float,
 
 def _variance_dn2(series: Series, used: NDArray[np.bool_]) -> float:
     """Return the mean variance of the pixels over the frames; their levels, rows and columns took a share of it."""
-    share = max(1 - sum(used.shape) / used.sum(), 0.1)
-    return max(float(series.within_dn2.mean(where=used)) / (series.frames - 1) / share, 1e-6)
+    pixels = used.sum()
+    total = total_of(lambda rows: series.within_dn2[rows].sum(where=used[rows], dtype=np.float64), used.shape)
+    return max(float(total) / pixels / (series.frames - 1) / max(1 - sum(used.shape) / pixels, 0.1), 1e-6)
+
+
+def _pattern_dn2(series: Series, used: NDArray[np.bool_]) -> float:
+    """Return the variance over the pixels of their means without rows and columns."""
+
+    def work(rows: slice) -> NDArray[np.float64]:
+        pattern = series.pattern_dn[rows][used[rows]].astype(np.float64)
+        return np.array([pattern.sum(), pattern @ pattern])
+
+    mean, square = total_of(work, used.shape) / used.sum()
+    return float(square - mean**2)
 
 
 def _amplitude(noise_dn2: float) -> float:

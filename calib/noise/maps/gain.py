@@ -12,6 +12,7 @@ with 120 frames, where the gains of pixels differ by 1 %. But all pixels togethe
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,13 @@ from numpy.typing import NDArray
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.maps.photo_response import Response
-from faintfield.calib.noise.maps.read_noise import kept_variance
+from faintfield.calib.noise.maps.read_noise import kept_of
 from faintfield.calib.noise.maps.seams import Seam, find_seams, share_of_seam
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import map_of, maps_of, mean_over, total_of, variance_over
 
 type Array = NDArray[np.float64]
+type Map = NDArray[np.floating]
 
 # Standard errors from which a share is real, and a scatter; up to which a share counts as 1; at which a pixel is cut.
 _MIN_SIGMA, _MIN_SCATTER_SIGMA, _ONE_SIGMA, _CLIP_SIGMA = 3.0, 4.0, 2.0, 5.0
@@ -46,48 +49,58 @@ class PixelGain:
         β, the part of the response of a pixel that is its gain; 0 if that is not known.
     """
 
-    relative: Array
-    se: Array
+    relative: Map
+    se: Map
     seams: tuple[Seam, ...]
     share: float
 
     @property
-    def of_regions(self) -> Array:
+    def of_regions(self) -> Map:
         """Gain of the region of each pixel over the mean."""
-        return 1 + _of_regions(self.seams, self.relative.shape)
+        return _gain_of_regions(self.seams, self.relative.shape)
 
 
 def photon_transfer(
-    flats: Sequence[Series], offset_dn: Array, read_dn2: Array, values: Mapping[str, float]
-) -> tuple[Array, Array]:
+    flats: Sequence[Series], offset_dn: Map, read_dn: Map, values: Mapping[str, float]
+) -> tuple[Map, Map]:
     """Return ε by the photon transfer of each pixel alone, and its inverse variance, both (row, column).
 
     Parameters
     ----------
     flats : sequence of Series
         Flat series of two frames at least.
-    offset_dn, read_dn2 : array (row, column)
-        Offset and read variance of each pixel.
+    offset_dn, read_dn : array (row, column)
+        Offset and read noise of each pixel.
     values : mapping
         Parameters of the fit.
     """
     gain = float(np.exp(values["log_gain"]))
-    found, information = np.zeros(offset_dn.shape), np.zeros(offset_dn.shape)
-    for one in flats:
-        signal = one.mean_dn - offset_dn
-        slope2 = charge_slope(values, signal) ** 2
+
+    def noise(one: Series, rows: slice) -> tuple[Array, Array]:
+        """Return shot noise and all noise of some rows of a flat."""
+        signal = one.mean_of(rows) - offset_dn[rows]
+        slope2 = np.square(charge_slope(values, signal))
         shot = gain * np.maximum(charge_dn(values, signal), 0.0) / slope2
-        variance = shot + read_dn2 / slope2 + ROUNDING_DN2
-        share = shot / variance
-        expected = (one.frames - 1) * kept_variance(variance, ~one.suspect)
-        weight = 0.5 * (one.frames - 1) * share
-        found += weight * (one.within_dn2 / expected - 1)
-        information += weight * share
-    return found / np.maximum(information, 1e-12), information
+        return shot, shot + np.square(read_dn[rows], dtype=np.float64) / slope2 + ROUNDING_DN2
+
+    kept = [kept_of(lambda rows, one=one: noise(one, rows)[1], ~one.suspect) for one in flats]  # type: ignore[misc]
+
+    def work(rows: slice) -> tuple[Array, Array]:
+        found, information = np.zeros((2, *offset_dn[rows].shape))
+        for one, of_strip in zip(flats, kept, strict=True):
+            shot, variance = noise(one, rows)
+            share = shot / variance
+            weight = 0.5 * (one.frames - 1) * share
+            found += weight * (one.within_dn2[rows] / ((one.frames - 1) * of_strip(rows, variance)) - 1)
+            information += weight * share
+        return found / np.maximum(information, 1e-12), information
+
+    found, information = maps_of(work, offset_dn.shape, (np.float32, np.float32))
+    return found, information
 
 
 def measure_gain(
-    transfer: tuple[Array, Array], usable: NDArray[np.bool_], even: Response, response: Callable[[Array], Response]
+    transfer: tuple[Map, Map], usable: NDArray[np.bool_], even: Response, response: Callable[[Map], Response]
 ) -> tuple[PixelGain | None, str]:
     """Return the gain of every pixel, or None and the reason why the frames do not determine it.
 
@@ -102,42 +115,78 @@ def measure_gain(
     response : callable
         Returns it given relative gains (row, column) by which the signals are divided first.
     """
-    epsilon, information = transfer
-    weight = np.where(usable, information, 0.0)
-    limit = _CLIP_SIGMA / np.sqrt(np.maximum(information, 1e-12))
-    epsilon = np.clip(epsilon - np.average(epsilon, weights=weight), -limit, limit)
+    found, information = transfer
+    shape = usable.shape
+    weight = map_of(lambda rows: np.where(usable[rows], information[rows], 0.0), shape)
+    mean = _weighted(weight, lambda rows: found[rows])
+
+    def clipped(rows: slice) -> Array:
+        limit = _CLIP_SIGMA / np.sqrt(np.maximum(information[rows], 1e-12))
+        return np.clip(np.subtract(found[rows], mean, dtype=np.float64), -limit, limit)
+
+    epsilon = map_of(clipped, shape)
     seams = _gain_seams(epsilon, weight, even)
-    region = _of_regions(seams, epsilon.shape)
-    known = response(1 + region) if seams else even
+    known = response(_gain_of_regions(seams, shape)) if seams else even
     seams = tuple(_refined(seam, known, weight) for seam in seams)
-    region = _of_regions(seams, epsilon.shape)
-    part = np.where(usable, known.relative / np.maximum(known.vignetting, 1e-6) - 1, 0.0)
-    share, share_se = _share(epsilon - region, part, weight)
-    rest = epsilon - region - share * part
+
+    def part(rows: slice) -> Array:
+        relative = np.divide(known.relative[rows], np.maximum(known.vignetting[rows], 1e-6), dtype=np.float64)
+        return np.where(usable[rows], relative - 1, 0.0)
+
+    def beyond(rows: slice) -> Array:
+        return np.asarray(epsilon[rows] - _of_regions(seams, rows))
+
+    share, share_se = _share(beyond, part, weight)
+
+    def rest(rows: slice) -> Array:
+        return np.asarray(beyond(rows) - share * part(rows))
+
     scatter2, scatter_se = _scatter(rest, information, usable)
     if not seams and not share and not scatter2:
-        return None, _why(information[usable], known, share_se, scatter_se)
-    kept = scatter2 / (scatter2 + 1 / np.maximum(information, 1e-12)) * usable
-    # What is neither response nor found may differ by as much as the response leaves open.
-    open2 = scatter2 * (1 - kept) if scatter2 else known.prnu**2 * (share * (1 - share) if share else 1.0)
-    variance = open2 + (share_se * part) ** 2 * bool(share) + sum((0.5 * seam.se) ** 2 for seam in seams)
-    relative = 1 + region + share * part + kept * rest
-    return PixelGain(np.maximum(relative, 0.1), np.sqrt(np.broadcast_to(variance, relative.shape)), seams, share), ""
+        return None, _why(mean_over(lambda rows: information[rows], usable), known, share_se, scatter_se)
+    of_seams = sum((0.5 * seam.se) ** 2 for seam in seams)
+
+    def work(rows: slice) -> tuple[Array, Array]:
+        kept = scatter2 / (scatter2 + 1 / np.maximum(information[rows], 1e-12)) * usable[rows]
+        # What is neither response nor found may differ by as much as the response leaves open.
+        open2 = scatter2 * (1 - kept) if scatter2 else known.prnu**2 * (share * (1 - share) if share else 1.0)
+        of_response = part(rows)
+        variance = open2 + ((share_se if share else 0.0) * of_response) ** 2 + of_seams
+        relative = 1 + _of_regions(seams, rows) + share * of_response + kept * rest(rows)
+        return np.maximum(relative, 0.1), np.sqrt(variance)
+
+    relative, se = maps_of(work, shape, (np.float32, np.float32))
+    return PixelGain(relative, se, seams, share), ""
 
 
-def _of_regions(seams: Sequence[Seam], shape: tuple[int, ...]) -> Array:
-    """Return by how much the gain of the region of each pixel differs from the mean (row, column)."""
-    return np.asarray(sum((seam.map for seam in seams), np.zeros(shape)))
+def _of_regions(seams: Sequence[Seam], rows: slice) -> Array:
+    """Return by how much the gain of the region of each pixel of some rows differs from the mean."""
+    return np.asarray(sum((seam.of(rows) for seam in seams), np.zeros((1, 1))))
 
 
-def _gain_seams(epsilon: Array, weight: Array, response: Response) -> tuple[Seam, ...]:
+def _gain_of_regions(seams: Sequence[Seam], shape: tuple[int, ...]) -> Map:
+    """Return the gain of the region of each pixel over the mean (row, column)."""
+    return map_of(lambda rows: 1 + _of_regions(seams, rows), shape)
+
+
+def _weighted(weight: Map, values_of: Callable[[slice], NDArray[Any]]) -> float:
+    """Return the weighted mean of what a function returns for some rows."""
+
+    def work(rows: slice) -> Array:
+        weights = weight[rows].astype(np.float64)
+        return np.array([(weights * values_of(rows)).sum(), weights.sum()])
+
+    total, weights = total_of(work, weight.shape)
+    return float(total / weights)
+
+
+def _gain_seams(epsilon: Map, weight: Map, response: Response) -> tuple[Seam, ...]:
     """Return the seams of the gain: those of the response that are of the gain, and others that photon transfer shows.
 
     The response tells the size of a step ten times better than photon transfer, but not whether gain makes it.
     """
     found = {seam.lines: seam for seam in find_seams(epsilon, weight)}
-    even = (weight > 0) / max(response.prnu, 1e-4) ** 2
-    for seam in find_seams(response.relative / np.average(response.relative, weights=even), even):
+    for seam in find_seams(*_over_mean(response, weight)):
         share, se = share_of_seam(seam, epsilon, weight)
         if share > _MIN_SIGMA * se:
             whole = abs(share - 1) < _ONE_SIGMA * se
@@ -146,39 +195,52 @@ def _gain_seams(epsilon: Array, weight: Array, response: Response) -> tuple[Seam
     return tuple(seam for seam in found.values() if seam.difference > _MIN_SEAM)
 
 
-def _refined(seam: Seam, response: Response, weight: Array) -> Seam:
+def _over_mean(response: Response, weight: Map) -> tuple[Map, NDArray[np.bool_], float]:
+    """Return the response over its mean, the pixels that count, and the inverse variance of each."""
+    counts = map_of(lambda rows: weight[rows] > 0, weight.shape, bool)
+    mean = mean_over(lambda rows: response.relative[rows], counts)
+    relative = map_of(lambda rows: response.relative[rows] / mean, weight.shape)
+    return relative, counts, max(response.prnu, 1e-4) ** -2
+
+
+def _refined(seam: Seam, response: Response, weight: Map) -> Seam:
     """Return a seam of the whole response with what is left of it in the response divided by its gains.
 
     The response is smoothed and shrunk across a seam, so that the first value of a step is a little too small.
     """
     if not seam.of_response:
         return seam
-    even = (weight > 0) / max(response.prnu, 1e-4) ** 2
-    left, _ = share_of_seam(seam, response.relative / np.average(response.relative, weights=even), even)
+    left, _ = share_of_seam(seam, *_over_mean(response, weight))
     return replace(seam, effect=(1 + left) * seam.effect)
 
 
-def _share(epsilon: Array, part: Array, weight: Array) -> tuple[float, float]:
+def _share(epsilon: Callable[[slice], Array], part: Callable[[slice], Array], weight: Map) -> tuple[float, float]:
     """Return β within 0…1 and its standard error; 0 if it is not significant."""
-    information = float(np.sum(weight * part**2))
+
+    def work(rows: slice) -> Array:
+        of_response = part(rows)
+        weighted = weight[rows] * of_response
+        return np.array([(weighted * of_response).sum(), (weighted * epsilon(rows)).sum()])
+
+    information, product = total_of(work, weight.shape).tolist()
     if information <= 0:
         return 0.0, np.inf
-    share, se = float(np.sum(weight * part * epsilon)) / information, information**-0.5
+    share, se = product / information, information**-0.5
     return (float(np.clip(share, 0.0, 1.0)) if share > _MIN_SIGMA * se else 0.0), se
 
 
-def _scatter(rest: Array, information: Array, usable: NDArray[np.bool_]) -> tuple[float, float]:
+def _scatter(rest: Callable[[slice], Array], information: Map, usable: NDArray[np.bool_]) -> tuple[float, float]:
     """Return the variance of ε beyond chance, 0 if it is not significant, and its standard error."""
-    chance = float(np.mean(1 / information[usable]))
+    chance = mean_over(lambda rows: 1 / information[rows].astype(np.float64), usable)
     se = chance * float(np.sqrt(2 / usable.sum()))
-    excess = float(np.var(rest[usable])) - chance
+    excess = variance_over(rest, usable) - chance
     return (excess if excess > _MIN_SCATTER_SIGMA * se else 0.0), se
 
 
-def _why(information: Array, response: Response, share_se: float, scatter_se: float) -> str:
+def _why(information: float, response: Response, share_se: float, scatter_se: float) -> str:
     """Return why pixels have no gain of their own, and what to record."""
     found = (
-        f"photon transfer tells the gain of one pixel to ±{np.mean(information) ** -0.5:.0%}, and nothing shows that "
+        f"photon transfer tells the gain of one pixel to ±{information**-0.5:.0%}, and nothing shows that "
         f"gains differ; differences of {np.sqrt(_MIN_SCATTER_SIGMA * scatter_se):.1%} would show"
     )
     if not np.isfinite(share_se) or _MIN_SIGMA * share_se < 1:

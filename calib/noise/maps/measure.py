@@ -1,6 +1,6 @@
 """What differs from pixel to pixel, in the order in which it is measured: noise, offset, response to light, gain."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +15,11 @@ from faintfield.calib.noise.maps.read_noise import PixelReadNoise, measure_read_
 from faintfield.calib.noise.maps.seams import Seam, find_seams
 from faintfield.calib.noise.maps.telegraph import telegraph_pixels
 from faintfield.calib.noise.result import Estimate, NoiseMaps
+from faintfield.calib.noise.room import new_map
+from faintfield.calib.noise.strips import map_of, total_of
 
 type Array = NDArray[np.float64]
+type Map = NDArray[np.floating]
 
 # A step of the offsets is named from this fraction of the read noise, telegraph pixels from this share of all.
 _NOTABLE_STEP, _NOTABLE_SHARE = 0.1, 1e-4
@@ -32,6 +35,8 @@ class Pixels:
     ----------
     read : PixelReadNoise
         Their read noise.
+    variance_ratio : array (row, column)
+        Their variance over that of the model.
     telegraph, noisy : array (row, column), bool
         Pixels that jump between two levels; pixels that are too noisy to be of use.
     levels : PixelLevels
@@ -47,6 +52,7 @@ class Pixels:
     """
 
     read: PixelReadNoise
+    variance_ratio: NDArray[np.float32]
     telegraph: NDArray[np.bool_]
     noisy: NDArray[np.bool_]
     levels: PixelLevels
@@ -90,14 +96,15 @@ def measure_pixels(fitted: SeriesFit, hot: NDArray[np.bool_], outlying: NDArray[
         Pixels with a large dark signal; pixels with more noise than chance allows.
     """
     read, telegraph = _read_noise(fitted, hot)
-    noisy = noisy_pixels(outlying & ~hot, variance_ratio(fitted.darks, fitted.dark_noise_dn2)[0], telegraph)
-    usable = ~hot & ~noisy
+    ratio = variance_ratio(fitted.darks, fitted.dark_noise_dn2)[0]
+    noisy = noisy_pixels(outlying & ~hot, ratio, telegraph)
+    usable = ~(hot | noisy)
     levels = _levels(fitted, read, hot)
     response = gain = response_e = None
     why = "no flats: record 10 flats each of 3 light levels"
     if fitted.flats:
-        response = response_e = _response(fitted, levels, usable, 1.0)
-        transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn**2, fitted.fit.values)
+        response = response_e = _response(fitted, levels, usable, None)
+        transfer = photon_transfer(fitted.flats, levels.offset_dn, read.read_noise_dn, fitted.fit.values)
         bright = usable & ~response.dead
         gain, why = measure_gain(
             transfer, bright, response, lambda relative: _response(fitted, levels, usable, relative)
@@ -109,7 +116,7 @@ def measure_pixels(fitted: SeriesFit, hot: NDArray[np.bool_], outlying: NDArray[
             even = _response(fitted, levels, usable, gain.of_regions)
             response = replace(response, prnu=even.prnu, prnu_se=even.prnu_se, why_no_prnu=even.why_no_prnu)
     seams = () if fitted.likelihood is _CENSORED else _offset_seams(fitted, levels, read, usable)
-    return Pixels(read, telegraph, noisy, levels, response, response_e, gain, why, seams)
+    return Pixels(read, ratio, telegraph, noisy, levels, response, response_e, gain, why, seams)
 
 
 def noise_maps(
@@ -118,26 +125,36 @@ def noise_maps(
     """Return the maps; those in electrons only where the gain is known."""
     mean_gain = estimates["gain_dn_per_e"].value
     levels, read = pixels.levels, pixels.read
-    maps = {"offset_dn": levels.offset_dn, "offset_variance_dn2": levels.offset_variance_dn2}
+    maps: dict[str, Map] = {"offset_dn": levels.offset_dn, "offset_variance_dn2": levels.offset_variance_dn2}
     absent = {"gain_dn_per_e": pixels.gain_why} if pixels.gain is None else {}
+
+    def in_electrons(values: Map, power: int = 1, least: float = -np.inf) -> Map:
+        """Return a map over a power of the gain of the pixels, and at least `least`."""
+        own = None if pixels.gain is None else pixels.gain.relative
+
+        def work(rows: slice) -> Array:
+            gain = np.float64(mean_gain) * (1.0 if own is None else own[rows])
+            return np.asarray(np.maximum(values[rows] / gain**power, least))
+
+        return map_of(work, values.shape)
+
     if mean_gain is None:
         absent = dict.fromkeys(("gain_dn_per_e", "read_noise_e"), str(estimates["gain_dn_per_e"].why))
     else:
-        gain: Array | float = mean_gain
         if pixels.gain is not None:
-            gain = mean_gain * pixels.gain.relative
-            maps |= {"gain_dn_per_e": gain, "gain_se_dn_per_e": mean_gain * pixels.gain.se}
-        maps["read_noise_e"] = read.read_noise_dn / gain
+            for name, values in (("gain_dn_per_e", pixels.gain.relative), ("gain_se_dn_per_e", pixels.gain.se)):
+                maps[name] = map_of(lambda rows, values=values: mean_gain * values[rows], values.shape)  # type: ignore[misc]
+        maps["read_noise_e"] = in_electrons(read.read_noise_dn)
         if fitted.likelihood is not _CENSORED:
-            maps["read_noise_se_e"] = read.se_dn / gain
+            maps["read_noise_se_e"] = in_electrons(read.se_dn)
         if estimates["dark_current_e_per_s"].value is not None:
-            maps["dark_current_e_per_s"] = np.maximum(levels.dark_signal_dn_per_s / gain, 0)
-            maps["dark_current_variance_e2_per_s2"] = levels.dark_signal_variance_dn2_per_s2 / gain**2
+            maps["dark_current_e_per_s"] = in_electrons(levels.dark_signal_dn_per_s, least=0.0)
+            maps["dark_current_variance_e2_per_s2"] = in_electrons(levels.dark_signal_variance_dn2_per_s2, 2)
     response = pixels.response if mean_gain is None else pixels.response_e
     if response is not None:
         maps |= {"relative_response": response.relative, "vignetting": response.vignetting}
         maps["relative_response_se"] = response.relative_se
-    single = {name: values.astype(np.float32) for name, values in maps.items()}
+    single = {name: values.astype(np.float32, copy=False) for name, values in maps.items()}
     return NoiseMaps(unusable=unusable, absent=absent, **single)
 
 
@@ -145,8 +162,8 @@ def _read_noise(fitted: SeriesFit, hot: NDArray[np.bool_]) -> tuple[PixelReadNoi
     """Return the read noise of every pixel, and the telegraph pixels; the sensor's own if values are cut off."""
     read_dn2, noise_dn2 = float(np.exp(fitted.fit.values["log_read_dn2"])), fitted.dark_noise_dn2
     if fitted.likelihood is _CENSORED:
-        common = np.full(hot.shape, np.sqrt(read_dn2))
-        return PixelReadNoise(common, np.zeros(hot.shape), resolved=False), np.zeros_like(hot)
+        common, none = (np.full(hot.shape, value, np.float32) for value in (np.sqrt(read_dn2), 0.0))
+        return PixelReadNoise(common, none, resolved=False), np.zeros_like(hot)
     read = measure_read_noise(fitted.darks, read_dn2, noise_dn2, ~hot)
     return read, telegraph_pixels(fitted.darks, read, noise_dn2) & ~hot
 
@@ -156,23 +173,36 @@ def _levels(fitted: SeriesFit, read: PixelReadNoise, hot: NDArray[np.bool_]) -> 
     values = fitted.fit.values
     if fitted.likelihood is _CENSORED:
         names = ("offset_dn", "dark_signal_dn_per_s", "dsnu_dn2", "dcnu_dn2_per_s2")
-        return PixelLevels(*(np.full(hot.shape, values[name]) for name in names))
-    more_dn2 = read.read_noise_dn**2 - np.exp(values["log_read_dn2"])
-    noise_dn2 = [variance + more_dn2 for variance in fitted.dark_noise_dn2]
+        return PixelLevels(*(np.full(hot.shape, values[name], np.float32) for name in names))
+
+    def noise(beside_dn2: float) -> Callable[[slice], Array]:
+        return lambda rows: np.square(read.read_noise_dn[rows], dtype=np.float64) + beside_dn2
+
+    noise_dn2 = [noise(variance - float(np.exp(values["log_read_dn2"]))) for variance in fitted.dark_noise_dn2]
     return pixel_levels(fitted.darks, values, noise_dn2, line_pattern(fitted.darks, values["dsnu_dn2"]), hot)
 
 
-def _response(
-    fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_], relative_gain: Array | float
-) -> Response:
-    """Return the photo response, the signals divided by the relative gains of the pixels."""
-    values, signals, noise = fitted.fit.values, [], []
-    for v, one in zip(fitted.flat_noise_dn2, fitted.flats, strict=True):
-        signal = one.mean_dn - levels.offset_dn
-        dark = levels.dark_signal_dn_per_s * one.conditions.dark_time_s
-        signals.append((charge_dn(values, signal) - dark) / relative_gain)
-        noise.append(v / one.frames * float(charge_slope(values, np.mean(signal)) ** 2))
-    return measure_response(signals, noise, usable)
+def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_], relative_gain: Map | None) -> Response:
+    """Return the photo response, the signals divided by the relative gains of the pixels if there are any."""
+    values, flats, shape = fitted.fit.values, fitted.flats, usable.shape
+    total = new_map(shape)
+
+    def work(rows: slice) -> Array:
+        charge, sums = np.zeros(total[rows].shape), []
+        for one in flats:
+            signal = one.mean_of(rows) - levels.offset_dn[rows]
+            sums.append(signal.sum())
+            charge += charge_dn(values, signal)
+            charge -= levels.dark_signal_dn_per_s[rows] * one.conditions.dark_time_s
+        total[rows] = charge if relative_gain is None else charge / relative_gain[rows]
+        return np.array(sums)
+
+    means = total_of(work, shape) / usable.size
+    noise = (
+        v / one.frames * float(charge_slope(values, mean) ** 2)
+        for v, one, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
+    )
+    return measure_response(total, sum(noise), usable)
 
 
 def _offset_seams(
@@ -181,5 +211,5 @@ def _offset_seams(
     """Return regions whose offsets differ notably."""
     read_dn = float(np.median(read.read_noise_dn))
     spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(one.frames for one in fitted.darks)
-    seams = find_seams(levels.offset_dn, usable / spread_dn2)
+    seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
     return tuple(seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn)

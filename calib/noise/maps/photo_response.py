@@ -1,6 +1,6 @@
 """Response of the pixels to light: dead pixels, vignetting, and the spread of the rest (PRNU)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -10,8 +10,10 @@ from scipy import ndimage
 
 from faintfield.calib.noise.intervals import interval
 from faintfield.calib.noise.result import Estimate
+from faintfield.calib.noise.strips import map_of, maps_of, mean_over, over_strips, thinned, variance_over
 
 type Array = NDArray[np.float64]
+type Map = NDArray[np.floating]
 type Mask = NDArray[np.bool_]
 
 # Response below which a pixel is dead, over the lower quartile of its neighbourhood. At an edge of the light, and at
@@ -20,6 +22,9 @@ _MIN_RESPONSE, _QUARTILE = 0.5, 0.25
 
 # Width of the neighbourhood, and pixels that are compared with theirs at once.
 _WINDOW_PX, _CHUNK_PX = 15, 1 << 14
+
+# Rows whose products are summed at once.
+_ROWS = 256
 
 # Least value of the surface of fourth order; light that is as uneven is not fitted.
 _MIN_SURFACE = 0.1
@@ -50,9 +55,9 @@ class Response:
         Why the rest is not the PRNU; empty if it is.
     """
 
-    relative: NDArray[np.float64]
-    vignetting: NDArray[np.float64]
-    relative_se: NDArray[np.float64]
+    relative: Map
+    vignetting: Map
+    relative_se: Map
     prnu: float
     prnu_se: float
     dead: NDArray[np.bool_]
@@ -65,39 +70,53 @@ class Response:
         return interval(self.prnu, self.prnu_se, quantile)
 
 
-def measure_response(signals_dn: Sequence[Array], noise_dn2: Sequence[float], usable: Mask) -> Response:
+def measure_response(signal_dn: Map, noise_dn2: float, usable: Mask) -> Response:
     """Separate vignetting from PRNU, and shrink the latter by its share of noise.
 
     Parameters
     ----------
-    signals_dn : sequence of arrays (row, column)
-        Mean of each flat series minus offset and dark signal.
-    noise_dn2 : sequence of float
-        Variance of these means for a pixel of mean signal.
+    signal_dn : array (row, column)
+        Means of the flat series minus offset and dark signal, summed over the series.
+    noise_dn2 : float
+        Variance of this sum for a pixel of mean signal.
     usable : array (row, column), bool
         Pixels in use.
     """
-    total = np.sum(signals_dn, axis=0)
-    mean = float(total.mean(where=usable))
-    raw = total / mean
+    mean = mean_over(lambda rows: signal_dn[rows], usable)
+    raw = map_of(lambda rows: signal_dn[rows] / mean, usable.shape, signal_dn.dtype)
     dead = _dead(raw, usable)
-    usable = usable & ~dead
+    usable = map_of(lambda rows: usable[rows] & ~dead[rows], dead.shape, bool)
     vignetting = _running_mean(raw, usable, _width(raw.shape))
     why_no_prnu = _why_colour(raw, usable) or _why_uneven(vignetting, usable)
     if not why_no_prnu:
         vignetting = _smooth(raw, usable)
-    pixel = raw / np.maximum(vignetting, 1e-6) - 1
+
+    def pixel(rows: slice) -> Array:
+        return np.asarray(np.divide(raw[rows], np.maximum(vignetting[rows], 1e-6), dtype=np.float64) - 1)
+
     # Shot noise grows less than the signal, so that brighter pixels have less of it in relation to their signal.
-    noise = float(np.sum(noise_dn2)) / mean**2 / np.maximum(vignetting, 1e-6)
+    def noise(rows: slice) -> Array:
+        return np.asarray(noise_dn2 / mean**2 / np.maximum(vignetting[rows], 1e-6, dtype=np.float64))
+
     # The running mean holds a part of each pixel, which is missing from the rest
-    scatter2 = float(pixel.var(where=usable)) / float(_kept_share(usable).mean(where=usable))
-    spread2 = max(scatter2 - float(noise.mean(where=usable)), 0.0)
-    kept = spread2 / (spread2 + noise)
-    error2 = (spread2 + float(noise.mean(where=usable))) * np.sqrt(2 / usable.sum())
+    scatter2 = variance_over(pixel, usable) / mean_over(_kept_share(usable), usable)
+    mean_noise = mean_over(noise, usable)
+    spread2 = max(scatter2 - mean_noise, 0.0)
+    error2 = (spread2 + mean_noise) * np.sqrt(2 / usable.sum())
+
+    def work(rows: slice) -> tuple[Map, Map]:
+        chance = noise(rows)
+        kept = spread2 / (spread2 + chance)
+        return (
+            vignetting[rows] * (1 + np.where(usable[rows], kept * pixel(rows), 0.0)),
+            vignetting[rows] * np.sqrt(kept * chance),
+        )
+
+    relative, relative_se = maps_of(work, raw.shape, (raw.dtype,) * 2)
     return Response(
-        relative=vignetting * (1 + np.where(usable, kept * pixel, 0.0)),
+        relative=relative,
         vignetting=vignetting,
-        relative_se=vignetting * np.sqrt(kept * noise),
+        relative_se=relative_se,
         prnu=float(np.sqrt(spread2)),
         prnu_se=float(np.sqrt(spread2 + error2) - np.sqrt(spread2)),
         dead=dead,
@@ -105,7 +124,7 @@ def measure_response(signals_dn: Sequence[Array], noise_dn2: Sequence[float], us
     )
 
 
-def _why_colour(raw: Array, usable: Mask) -> str:
+def _why_colour(raw: Map, usable: Mask) -> str:
     """Return that the pixels respond as colour filters in periods of 2 × 2 do, "" if they do not."""
     phases = [np.s_[row::2, column::2] for row, column in np.ndindex(2, 2)]
     middle = [float(np.median(raw[at][usable[at]])) for at in phases if usable[at].any()]
@@ -118,9 +137,9 @@ def _why_colour(raw: Array, usable: Mask) -> str:
     )
 
 
-def _why_uneven(vignetting: Array, usable: Mask) -> str:
+def _why_uneven(vignetting: Map, usable: Mask) -> str:
     """Return that the light is too uneven for PRNU, "" if it is not."""
-    dim, bright = np.quantile(vignetting[usable], (_TAIL, 1 - _TAIL))
+    dim, bright = np.quantile(thinned(vignetting, usable), (_TAIL, 1 - _TAIL))
     if bright <= _MAX_UNEVEN * max(dim, 1e-6):
         return ""
     return (
@@ -130,15 +149,22 @@ def _why_uneven(vignetting: Array, usable: Mask) -> str:
     )
 
 
-def _dead(raw: Array, usable: Mask) -> Mask:
+def _dead(raw: Map, usable: Mask) -> Mask:
     """Return the usable pixels that respond less than half as much as the lower quartile of their neighbourhood."""
     # No quartile is above 4/3 of the mean, so that few pixels need one
-    dim = usable & (raw < _MIN_RESPONSE / (1 - _QUARTILE) * _running_mean(raw, usable, _WINDOW_PX))
+    around_mean = _running_mean(raw, usable, _WINDOW_PX)
+
+    def dim(rows: slice) -> NDArray[np.intp]:
+        row, column = np.nonzero(usable[rows] & (raw[rows] < _MIN_RESPONSE / (1 - _QUARTILE) * around_mean[rows]))
+        return np.stack([rows.start + row, column], axis=1)
+
+    places = np.concatenate(over_strips(dim, raw.shape))
+    dead = np.zeros(raw.shape, bool)
+    if not places.size:
+        return dead
     half = _WINDOW_PX // 2
-    padded = np.pad(np.where(usable, raw, np.nan), half, constant_values=np.nan)
+    padded = np.pad(np.where(usable, raw, raw.dtype.type(np.nan)), half, constant_values=np.nan)
     around = np.lib.stride_tricks.sliding_window_view(padded, (_WINDOW_PX, _WINDOW_PX))
-    dead = np.zeros_like(dim)
-    places = np.argwhere(dim)
     for start in range(0, len(places), _CHUNK_PX):
         row, column = places[start : start + _CHUNK_PX].T
         quartile = np.nanquantile(around[row, column].reshape(row.size, -1), _QUARTILE, axis=1)
@@ -151,54 +177,75 @@ def _width(shape: tuple[int, ...]) -> int:
     return int(max(_WINDOW_PX, min(shape) // 16) | 1)
 
 
-def _smooth(response: Array, usable: Mask) -> Array:
+def _smooth(response: Map, usable: Mask) -> Map:
     """Return the smooth part: a surface of fourth order, times the running mean over the rest.
 
     The running mean is a sixteenth of the frame wide, over the usable pixels. Alone it would be off where the light
     slopes at the edges of the frame.
     """
-    surface = np.maximum(_surface(response, usable), _MIN_SURFACE)
-    return surface * _running_mean(response / surface, usable, _width(response.shape))
+    surface = _surface(response, usable)
+    rest = map_of(lambda rows: response[rows] / surface(rows), response.shape, response.dtype)
+    smooth = _running_mean(rest, usable, _width(response.shape))
+    return map_of(lambda rows: smooth[rows] * surface(rows), smooth.shape, smooth.dtype)
 
 
-def _surface(response: Array, usable: Mask) -> Array:
-    """Return the polynomial of fourth order in row and column with the least squares over the usable pixels."""
+def _surface(response: Map, usable: Mask) -> Callable[[slice], Array]:
+    """Return the polynomial of fourth order in row and column with the least squares over the usable pixels.
+
+    It is a function of some rows (row, column), and no less than `_MIN_SURFACE`.
+    """
     of_rows, of_columns = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 4) for size in usable.shape)
     low = np.add.outer(np.arange(5), np.arange(5)) <= 4
     products = [np.einsum("pi,pk->pik", one, one).reshape(len(one), 25) for one in (of_rows, of_columns)]
-    moments = (products[0].T @ usable.astype(float) @ products[1]).reshape(5, 5, 5, 5).transpose(0, 2, 1, 3)
-    weighted = of_rows.T @ np.where(usable, response, 0.0) @ of_columns
+
+    def work(rows: slice) -> Array:
+        counted = usable[rows].astype(np.float64)
+        moments = products[0][rows].T @ (counted @ products[1])
+        weighted = of_rows[rows].T @ (np.where(usable[rows], response[rows], 0.0).astype(np.float64) @ of_columns)
+        return np.concatenate([moments.ravel(), weighted.ravel()])
+
+    # Products of matrices have threads of their own
+    sums = sum((work(slice(first, first + _ROWS)) for first in range(0, len(usable), _ROWS)), np.zeros(650))
+    moments, weighted = sums[:625].reshape(5, 5, 5, 5).transpose(0, 2, 1, 3), sums[625:].reshape(5, 5)
     found = np.zeros((5, 5))
     found[low] = np.linalg.lstsq(moments[low][:, low], weighted[low])[0]
-    return np.asarray(of_rows @ found @ of_columns.T)
+    return lambda rows: np.maximum(of_rows[rows] @ found @ of_columns.T, _MIN_SURFACE)
 
 
-def _running_mean(response: Array, usable: Mask, window: int) -> Array:
+def _running_mean(response: Map, usable: Mask, window: int) -> Map:
     """Return the mean over the usable pixels of a window around each pixel (row, column)."""
-    mean = _box(np.where(usable, response, 0.0), window)
-    mean /= np.maximum(_box(usable.astype(float), window), 1e-6)
-    return mean
+    mean = _box(np.where(usable, response, response.dtype.type(0)), window)
+    share = _box(usable.astype(response.dtype), window)
+    return map_of(lambda rows: mean[rows] / np.maximum(share[rows], 1e-6), mean.shape, mean.dtype)
 
 
-def _box(values: Array, window: int) -> Array:
+def _box(values: Map, window: int) -> Map:
     """Return the mean over a window around each value, beyond an edge of the values at the edge (row, column)."""
     return np.asarray(cv2.blur(values, (window, window), borderType=cv2.BORDER_REPLICATE))
 
 
-def _kept_share(usable: Mask) -> Array:
-    """Return the share of the variance of independent pixels that is left when `_smooth` is subtracted.
+def _kept_share(usable: Mask) -> Callable[[slice], Array]:
+    """Return the share of the variance of independent pixels that is left when `_smooth` is subtracted, by its rows.
 
     With the weights a_ij of the running mean it is 1 − 2 a_ii + Σ_j a_ij². At an edge of the frame the outermost pixel
     stands for those that are missing beyond.
     """
     window = _width(usable.shape)
     own, squares = zip(*(_line_weights(size, window) for size in usable.shape), strict=True)
-    weight = np.maximum(_box(usable.astype(float), window), 1e-6)
-    share = 1 - (2 * np.outer(*own) - np.outer(*squares)) / weight
-    return np.asarray(np.maximum(share, 0.05))
+    weight = _box(usable.astype(np.float32), window)
+
+    def share(rows: slice) -> Array:
+        taken = 2 * np.outer(own[0][rows], own[1]) - np.outer(squares[0][rows], squares[1])
+        return np.asarray(np.maximum(1 - taken / np.maximum(weight[rows], 1e-6), 0.05))
+
+    return share
 
 
 def _line_weights(size: int, window: int) -> tuple[Array, Array]:
     """Return the weight of each place of a line in its own running mean, and the sum of all squared weights there."""
-    weights = ndimage.uniform_filter1d(np.eye(size), window, axis=0, mode="nearest")
-    return np.diag(weights).copy(), np.square(weights).sum(axis=1)
+    # Only near the ends do they differ from those in the middle
+    some = min(size, 2 * window + 1)
+    weights = ndimage.uniform_filter1d(np.eye(some), window, axis=0, mode="nearest")
+    spread = np.minimum(np.arange(size), some // 2)
+    spread = np.where(np.arange(size) >= size - some // 2, np.arange(size) - (size - some), spread)
+    return np.diag(weights)[spread], np.square(weights).sum(axis=1)[spread]

@@ -7,7 +7,7 @@ v_ij/n_j, v_ij the noise of the pixel itself. Since both are Gaussian, the poste
 2 × 2 matrix (Gelman et al., Bayesian Data Analysis, 3rd ed., §5.4). What rows and columns share is part of μ.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.series.statistics import Series, robust_sigma
+from faintfield.calib.noise.strips import map_of, maps_of, mean_over
 
 type Array = NDArray[np.float64]
 
@@ -43,10 +44,11 @@ def hot_pixels(darks: Sequence[Series]) -> NDArray[np.bool_]:
     shortest, longest = darks[int(np.argmin(exposure_s))], darks[int(np.argmax(exposure_s))]
     if shortest.conditions.dark_time_s == longest.conditions.dark_time_s:
         return np.zeros(darks[0].pattern_dn.shape, bool)
-    signal_dn = longest.mean_dn - shortest.mean_dn
+    signal_dn = map_of(lambda rows: longest.mean_of(rows) - shortest.mean_of(rows), darks[0].pattern_dn.shape)
     # Means of few frames take few values, so that the median absolute deviation can be zero.
     spread_dn = max(robust_sigma(signal_dn), 0.5 / np.sqrt(longest.frames))
-    return np.asarray(signal_dn > np.median(signal_dn) + _HOT_SIGMA * spread_dn)
+    limit_dn = np.median(signal_dn) + _HOT_SIGMA * spread_dn
+    return map_of(lambda rows: signal_dn[rows] > limit_dn, signal_dn.shape, bool)
 
 
 def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDArray[np.bool_]:
@@ -65,7 +67,8 @@ def outlying_pixels(variance_ratio: NDArray[np.floating], freedom: float) -> NDA
     by_chance = np.log(stats.chi2.isf(chance, freedom) / freedom)
     # A population with a tail towards much noise, as sCMOS sensors have it, is no row of defects
     by_population = stats.norm.isf(chance) * _population_spread(variance_ratio, freedom)
-    return np.asarray(variance_ratio > np.exp(np.hypot(by_chance, by_population)))
+    limit = np.exp(np.hypot(by_chance, by_population))
+    return map_of(lambda rows: variance_ratio[rows] > limit, variance_ratio.shape, bool)
 
 
 def _population_spread(variance_ratio: NDArray[np.floating], freedom: float) -> float:
@@ -89,27 +92,34 @@ def noisy_pixels(
     A pixel of five times the usual noise tells a twenty-fifth of what others tell. One that jumps between two levels
     is left out earlier, since its noise is not normal.
     """
-    ratio = variance_ratio / max(float(np.median(variance_ratio)), 1e-12)
-    return np.asarray(outlying & (ratio > np.where(telegraph, _USELESS_TELEGRAPH, _USELESS)))
+    middle = max(float(np.median(variance_ratio)), 1e-12)
+
+    def work(rows: slice) -> NDArray[np.bool_]:
+        limit = np.where(telegraph[rows], _USELESS_TELEGRAPH, _USELESS)
+        return np.asarray(outlying[rows] & (variance_ratio[rows] / middle > limit))
+
+    return map_of(work, outlying.shape, bool)
 
 
-def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple[NDArray[np.float64], float]:
+def variance_ratio(darks: Sequence[Series], noise_dn2: Sequence[float]) -> tuple[NDArray[np.float32], float]:
     """Return each pixel's variance over that of the model (row, column), and its degrees of freedom."""
     freedom = float(sum(series.frames - 1 for series in darks))
-    ratio = np.zeros(darks[0].within_dn2.shape)
-    for series, variance in zip(darks, noise_dn2, strict=True):
-        ratio += series.within_dn2 / variance
-    return ratio / max(freedom, 1.0), freedom
+
+    def work(rows: slice) -> Array:
+        ratios = [one.within_dn2[rows] / np.float64(v) for one, v in zip(darks, noise_dn2, strict=True)]
+        return np.asarray(np.sum(ratios, axis=0) / max(freedom, 1.0))
+
+    return map_of(work, darks[0].within_dn2.shape), freedom
 
 
 @dataclass(frozen=True)
 class PixelLevels:
     """Offset and dark signal of every pixel, arrays (row, column), with the variances of their errors."""
 
-    offset_dn: Array
-    dark_signal_dn_per_s: Array
-    offset_variance_dn2: Array
-    dark_signal_variance_dn2_per_s2: Array
+    offset_dn: NDArray[np.floating]
+    dark_signal_dn_per_s: NDArray[np.floating]
+    offset_variance_dn2: NDArray[np.floating]
+    dark_signal_variance_dn2_per_s2: NDArray[np.floating]
 
 
 @dataclass(frozen=True)
@@ -118,14 +128,19 @@ class LinePattern:
 
     Attributes
     ----------
-    offset_dn : array (row, column)
-        Sum of the patterns.
+    row_dn, column_dn : array (row,), array (column,)
+        Patterns, whose sum the offsets have.
     variance_dn2 : float
         Variance of its error.
     """
 
-    offset_dn: Array
+    row_dn: Array
+    column_dn: Array
     variance_dn2: float
+
+    def of(self, rows: slice) -> Array:
+        """Return the pattern of some rows, (row, column)."""
+        return np.add.outer(self.row_dn[rows], self.column_dn)
 
 
 def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
@@ -140,25 +155,22 @@ def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
     """
     most = max(darks, key=lambda one: one.frames)
     rows, columns = most.pattern_dn.shape
-    pattern, error = np.zeros((rows, columns)), 0.0
-    lines = (
-        (most.row_dn[:, None], most.row_noise_dn2, columns),
-        (most.column_dn[None, :], most.column_noise_dn2, rows),
-    )
+    patterns, error = [], 0.0
+    lines = (most.row_dn, most.row_noise_dn2, columns), (most.column_dn, most.column_noise_dn2, rows)
     for profile_dn, noise_dn2, averaged in lines:
         # A lone frame does not tell the noise of its lines
         chance = max(dsnu_dn2, 0.0) / averaged + noise_dn2 / most.frames
         total = float(profile_dn.var())
         kept = max(1 - chance / total, 0.0) if total > 0 and most.frames > 1 else 0.0
-        pattern = pattern + kept * profile_dn
+        patterns.append(kept * profile_dn)
         error += kept * chance if most.frames > 1 else total
-    return LinePattern(pattern, error)
+    return LinePattern(patterns[0], patterns[1], error)
 
 
 def pixel_levels(
     darks: Sequence[Series],
     values: Mapping[str, float],
-    noise_dn2: Sequence[Array | float],
+    noise_dn2: Sequence[Callable[[slice], Array | float]],
     pattern: LinePattern,
     hot: NDArray[np.bool_],
 ) -> PixelLevels:
@@ -170,8 +182,8 @@ def pixel_levels(
         Dark series, at least one.
     values : mapping
         `offset_dn`, `dark_signal_dn_per_s`, `dsnu_dn2`, `dcnu_dn2_per_s2` of the fit.
-    noise_dn2 : sequence of arrays (row, column) or of float
-        Noise of the pixels in each series.
+    noise_dn2 : sequence of callables
+        Return the noise of some rows of pixels (row, column) in each series, or one number for all.
     pattern : LinePattern
         What rows and columns share in the offsets.
     hot : array (row, column), bool
@@ -180,39 +192,34 @@ def pixel_levels(
     exposures = [series.conditions.dark_time_s for series in darks]
     # The floors stand for spreads that are zero or were not fitted.
     offset_prior = 1 / max(values["dsnu_dn2"] + pattern.variance_dn2, 1e-6)
-    signal_prior = np.where(
-        hot, 1e-12 if np.ptp(exposures) else 1e12, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)
-    )
-    # Precision of offset, of both, and of dark signal; and the deviations that they weigh
-    offset, signal = np.full(hot.shape, offset_prior), signal_prior
-    both, of_offset, of_signal = np.zeros(hot.shape), np.zeros(hot.shape), np.zeros(hot.shape)
-    for series, variance in zip(darks, noise_dn2, strict=True):
-        t, weight = series.conditions.dark_time_s, series.frames / np.asarray(variance)
-        # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
-        deviation = series.mean_dn
-        deviation -= deviation.mean(where=~hot)
-        deviation -= pattern.offset_dn
-        deviation *= weight
-        offset += weight
-        of_offset += deviation
-        if t:
-            both += weight * t
-            signal += weight * t**2
-            deviation *= t
-            of_signal += deviation
-    determinant = offset * signal - both**2
-    offset_dn = signal * of_offset - both * of_signal
-    signal_dn = offset * of_signal - both * of_offset
-    del both, of_offset, of_signal
-    for posterior, prior in (
-        (offset_dn, values["offset_dn"] + pattern.offset_dn),
-        (signal_dn, values.get("dark_signal_dn_per_s", 0.0)),
-    ):
-        posterior /= determinant
-        posterior += prior
-    signal /= determinant
-    offset /= determinant
-    return PixelLevels(offset_dn, signal_dn, signal, offset)
+    signal_priors = 1e-12 if np.ptp(exposures) else 1e12, 1 / max(values.get("dcnu_dn2_per_s2", 0.0), 1e-12)
+    # Jitter moves the mean of a whole series off the straight line; that is no pixel's offset.
+    levels = [mean_over(series.mean_of, ~hot) for series in darks]
+
+    def work(rows: slice) -> tuple[Array, ...]:
+        of_lines = pattern.of(rows)
+        # Precision of offset, of both, and of dark signal; and the deviations that they weigh
+        offset, signal = np.full(of_lines.shape, offset_prior), np.where(hot[rows], *signal_priors)
+        both, of_offset, of_signal = np.zeros((3, *of_lines.shape))
+        for series, variance, level in zip(darks, noise_dn2, levels, strict=True):
+            t, weight = series.conditions.dark_time_s, series.frames / np.asarray(variance(rows))
+            deviation = series.mean_of(rows)
+            deviation -= level
+            deviation -= of_lines
+            deviation *= weight
+            offset += weight
+            of_offset += deviation
+            if t:
+                both += weight * t
+                signal += weight * t**2
+                deviation *= t
+                of_signal += deviation
+        determinant = offset * signal - both**2
+        offset_dn = (signal * of_offset - both * of_signal) / determinant + values["offset_dn"] + of_lines
+        signal_dn = (offset * of_signal - both * of_offset) / determinant + values.get("dark_signal_dn_per_s", 0.0)
+        return offset_dn, signal_dn, signal / determinant, offset / determinant
+
+    return PixelLevels(*maps_of(work, hot.shape, (np.float32,) * 4))
 
 
 def quantum_efficiency(

@@ -12,7 +12,7 @@ log-normal law with 1 % of wide tails, and may become whatever the pixels show: 
 Rows and columns may be noisier as a whole (columns have amplifiers of their own); that part is taken out first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.maps.seams import find_seams
-from faintfield.calib.noise.series.statistics import Series, robust_sigma
-from faintfield.calib.noise.strips import over_strips
+from faintfield.calib.noise.series.statistics import Series, any_suspect, robust_sigma
+from faintfield.calib.noise.strips import map_of, maps_of, mean_over, over_strips, thinned, total_of, variance_over
 
 type Array = NDArray[np.float64]
 
@@ -56,8 +56,8 @@ class PixelReadNoise:
         Whether the pixels differ. If not, `se_dn` is the difference that would have gone unnoticed.
     """
 
-    read_noise_dn: Array
-    se_dn: Array
+    read_noise_dn: NDArray[np.floating]
+    se_dn: NDArray[np.floating]
     resolved: bool
 
 
@@ -79,15 +79,20 @@ def measure_read_noise(
     """
     shape = darks[0].within_dn2.shape
     freedom = np.array([series.frames - 1.0 for series in darks])
-    kept = np.full(shape, (1 - 1 / shape[0]) * (1 - 1 / shape[1]))
+    even = np.broadcast_to((1 - 1 / shape[0]) * (1 - 1 / shape[1]), shape)
     shot_dn2 = np.maximum(np.asarray(noise_dn2) - read_dn2, 0.0)
-    suspect = np.any([series.suspect for series in darks], axis=0)
-    found = _measure(darks, read_dn2, shot_dn2, kept, usable)
+    found = _measure(darks, read_dn2, shot_dn2, even, usable)
     if not found.resolved:
         return found
     # Now that the pixels' noise is known, so is what the means of rows and columns took from it and brought to it.
-    total = found.read_noise_dn**2 + freedom @ shot_dn2 / freedom.sum()
-    return _measure(darks, read_dn2, shot_dn2, kept_variance(total, ~suspect) / total, usable)
+    shot, regular = float(freedom @ shot_dn2 / freedom.sum()), ~any_suspect(darks)
+
+    def total(rows: slice) -> Array:
+        return np.asarray(np.square(found.read_noise_dn[rows], dtype=np.float64) + shot)
+
+    of_strip = kept_of(total, regular)
+    kept = map_of(lambda rows: (variance := total(rows), of_strip(rows, variance) / variance)[1], shape)
+    return _measure(darks, read_dn2, shot_dn2, kept, usable)
 
 
 def kept_variance(variance: Array, regular: NDArray[np.bool_]) -> Array:
@@ -100,46 +105,123 @@ def kept_variance(variance: Array, regular: NDArray[np.bool_]) -> Array:
     regular : array (row, column), bool
         Pixels of which the means are taken.
     """
-    for axis in (0, 1):
-        count = np.maximum(regular.sum(axis, keepdims=True), 1)
-        share = np.where(regular, 1 - 2 / count, 1.0)
-        variance = share * variance + variance.sum(axis, keepdims=True, where=regular) / count**2
-    return variance
+    return kept_of(lambda rows: variance[rows], regular)(slice(None), variance)
+
+
+def kept_of(variance_of: Callable[[slice], Array], regular: NDArray[np.bool_]) -> Callable[[slice, Array], Array]:
+    """Return `kept_variance` as a function of some rows and their variances, of which `variance_of` gives all."""
+    sums = total_of(lambda rows: variance_of(rows).sum(0, where=regular[rows]), regular.shape)
+    per_column, per_row = (np.maximum(regular.sum(axis), 1) for axis in (0, 1))
+
+    def kept(rows: slice, variance: Array) -> Array:
+        counts = regular[rows]
+        variance = np.where(counts, 1 - 2 / per_column, 1.0) * variance + sums / per_column**2
+        in_row = per_row[rows, None]
+        return np.asarray(
+            np.where(counts, 1 - 2 / in_row, 1.0) * variance + variance.sum(1, keepdims=True, where=counts) / in_row**2
+        )
+
+    return kept
+
+
+@dataclass(frozen=True)
+class _LineFactor:
+    """A factor on the variance of each pixel: a function of the sum of a number of its row and one of its column."""
+
+    of_rows: Array
+    of_columns: Array
+    function: Callable[[Array], Array]
+
+    def at(self, rows: slice | NDArray[np.intp], columns: slice | NDArray[np.intp] = slice(None)) -> Array:
+        """Return the factors of some rows (row, column), or of single pixels."""
+        of_rows = self.of_rows[rows]
+        return self.function((of_rows[:, None] if isinstance(rows, slice) else of_rows) + self.of_columns[columns])
+
+    @property
+    def varies(self) -> bool:
+        """Whether pixels differ."""
+        return bool(np.ptp(self.of_rows) > 0 or np.ptp(self.of_columns) > 0)
+
+
+@dataclass(frozen=True)
+class _Squares:
+    """Sums of squares of the pixels over the dark series.
+
+    Attributes
+    ----------
+    darks : sequence of Series
+        The series.
+    kept : array (row, column)
+        Share of its variance that each pixel shows.
+    which : array (series,), int
+        Series of equal shot noise are one: its place in the next two.
+    shot_dn2, freedom : array (group,)
+        Variance beside read noise, and degrees of freedom.
+    """
+
+    darks: Sequence[Series]
+    kept: NDArray[np.floating]
+    which: NDArray[np.intp]
+    shot_dn2: Array
+    freedom: Array
+
+    def at(self, *where: slice | NDArray[np.intp]) -> Array:
+        """Return the squares (…, group) of some rows, or of single pixels."""
+        kept = self.kept[where]
+        squares = np.zeros((*kept.shape, self.freedom.size))
+        for series, index in zip(self.darks, self.which, strict=True):
+            squares[..., index] += series.within_dn2[where] / kept
+        return squares
+
+    def ratio(self, rows: slice, read_dn2: float) -> Array:
+        """Return the variance of the pixels of some rows over the expected one."""
+        return np.asarray(self.at(rows) @ (1 / (read_dn2 + self.shot_dn2)) / self.freedom.sum())
 
 
 def _measure(
-    darks: Sequence[Series], read_dn2: float, shot_dn2: Array, kept: Array, usable: NDArray[np.bool_]
+    darks: Sequence[Series],
+    read_dn2: float,
+    shot_dn2: Array,
+    kept: NDArray[np.floating],
+    usable: NDArray[np.bool_],
 ) -> PixelReadNoise:
     """Return the posterior if `kept` is the share of its variance that each pixel shows, (row, column)."""
-    # Series of equal noise are one
     shot_dn2, which = np.unique(shot_dn2, return_inverse=True)
     freedom = np.bincount(which, [series.frames - 1.0 for series in darks])
+    squares = _Squares(darks, kept, which, shot_dn2, freedom)
     degrees = float(freedom.sum())
-    squares = np.zeros((*kept.shape, freedom.size))
-    for series, index in zip(darks, which, strict=True):
-        squares[..., index] += series.within_dn2 / kept
-    ratio = (squares / (read_dn2 + shot_dn2)).sum(-1) / degrees
+    ratio = map_of(lambda rows: squares.ratio(rows, read_dn2), kept.shape)
     chance = 2 / degrees
-    region = _region_factors(ratio, usable / chance)
+    region = _region_factors(ratio, usable, 1 / chance)
     shot = float(freedom @ shot_dn2) / degrees
     limit = chance * np.sqrt((2 + 12 / degrees) / usable.sum()) * stats.norm.isf(_MAX_CHANCE)
-    if (ratio / region).var(where=usable) - chance < limit:
-        common = _scaled(np.full(kept.shape, np.sqrt(read_dn2)), region, shot, read_dn2)
-        return PixelReadNoise(common, common * 0.5 * np.sqrt(limit), resolved=bool(np.ptp(region) > 0))
-    lines = np.exp(line_shifts(np.log(np.maximum(ratio, 1e-9)), usable))
+    if variance_over(lambda rows: ratio[rows] / region.at(rows), usable) - chance < limit:
+        common = map_of(lambda rows: _scaled(np.sqrt(read_dn2), region.at(rows), shot, read_dn2), kept.shape)
+        se_dn = map_of(lambda rows: common[rows] * 0.5 * np.sqrt(limit), kept.shape)
+        return PixelReadNoise(common, se_dn, resolved=region.varies)
+    lines = _LineFactor(
+        *line_shifts(map_of(lambda rows: np.log(np.maximum(ratio[rows], 1e-9)), kept.shape), usable), np.exp
+    )
     # A spot of noisier pixels shifts its rows, columns and regions, too; a number for each must explain more than it
     # may by chance (Akaike, IEEE Transactions on Automatic Control 19, 716, 1974).
-    ways = [(np.ones(kept.shape), 0)]
-    ways += [(it, number) for it, number in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if np.ptp(it) > 0]
-    fits = [_population(squares, ratio, factor, read_dn2, shot_dn2, freedom, usable) for factor, _ in ways]
+    even = _LineFactor(np.zeros(kept.shape[0]), np.zeros(kept.shape[1]), np.exp)
+    ways = [(even, 0)]
+    ways += [(it, number) for it, number in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if it.varies]
+    fits = [_population(squares, ratio, factor, read_dn2, usable) for factor, _ in ways]
     best = int(np.argmax([fit.log_likelihood - number for fit, (_, number) in zip(fits, ways, strict=True)]))
-    factor = ways[best][0]
-    mean, variance = _posterior(squares, factor, fits[best], shot_dn2, freedom)
-    read = _scaled(mean, factor, shot, read_dn2)
-    return PixelReadNoise(read, np.sqrt(variance) * mean * factor / read, resolved=True)
+    factor, posterior = ways[best][0], _posterior(fits[best], shot_dn2, freedom)
+
+    def work(rows: slice) -> tuple[Array, Array]:
+        factors = factor.at(rows)
+        mean, variance = posterior(squares.at(rows) / factors[..., None])
+        read = _scaled(mean, factors, shot, read_dn2)
+        return read, np.sqrt(variance) * mean * factors / read
+
+    read_dn, se_dn = maps_of(work, kept.shape, (np.float32, np.float32))
+    return PixelReadNoise(read_dn, se_dn, resolved=True)
 
 
-def _scaled(read_dn: Array, factor: Array, shot_dn2: float, read_dn2: float) -> Array:
+def _scaled(read_dn: Array | float, factor: Array, shot_dn2: float, read_dn2: float) -> Array:
     """Return the read noise of pixels in rows, columns or regions whose noise as a whole differs by a factor.
 
     Where a row is noisier, the factor holds for the sum of read and shot noise.
@@ -147,20 +229,21 @@ def _scaled(read_dn: Array, factor: Array, shot_dn2: float, read_dn2: float) -> 
     return np.asarray(np.sqrt(np.maximum(read_dn**2 * factor + shot_dn2 * (factor - 1), 0.01 * read_dn2)))
 
 
-def _region_factors(ratio: Array, weight: Array) -> Array:
-    """Return by which factor the variances of regions differ that are read apart, (row, column).
+def _region_factors(ratio: NDArray[np.floating], usable: NDArray[np.bool_], precision: float) -> _LineFactor:
+    """Return by which factor the variances of regions differ that are read apart.
 
     Nothing shrinks them. The population would draw the noise of a region towards that of all pixels if a pixel has few
     frames, and photon transfer would take what it drew away for gain.
     """
-    differs = np.zeros(ratio.shape)
-    for seam in find_seams(ratio, weight):
-        differs = differs + seam.map
-    return np.maximum(1 + differs / np.average(ratio, weights=weight), 0.05)
+    differs = {"rows": np.zeros(ratio.shape[0]), "columns": np.zeros(ratio.shape[1])}
+    mean = mean_over(lambda rows: ratio[rows], usable)
+    for seam in find_seams(ratio, usable, precision):
+        differs[seam.lines] = seam.effect / mean
+    return _LineFactor(differs["rows"], differs["columns"], lambda it: np.maximum(1 + it, 0.05))
 
 
-def line_shifts(values: Array, usable: NDArray[np.bool_]) -> Array:
-    """Return by how much whole rows and columns differ from the rest, (row, column), shrunk by what chance makes.
+def line_shifts(values: NDArray[np.floating], usable: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Return by how much whole rows and columns differ from the rest, (row,) and (column,), shrunk by chance.
 
     Parameters
     ----------
@@ -169,32 +252,41 @@ def line_shifts(values: Array, usable: NDArray[np.bool_]) -> Array:
     usable : array (row, column), bool
         Pixels that count.
     """
-    centre = np.median(values[usable])
-    rest = np.clip(values - centre, *(np.array([-1, 1]) * _CLIP_SIGMA * robust_sigma(values[usable])))
-    shifts = np.zeros_like(values)
+    some = thinned(values, usable)
+    centre, limit = float(np.median(some)), _CLIP_SIGMA * robust_sigma(some)
+    shifts = [np.zeros(size) for size in values.shape]
+
+    def rest(rows: slice) -> Array:
+        clipped = np.clip(np.subtract(values[rows], centre, dtype=np.float64), -limit, limit)
+        return np.asarray(clipped - shifts[0][rows, None] - shifts[1])
+
     for axis in (0, 1):
-        count = usable.sum(axis, keepdims=True)
-        means = rest.sum(axis, keepdims=True, where=usable) / np.maximum(count, 1)
+        count = usable.sum(axis)
+        sums = over_strips(lambda rows, axis=axis: rest(rows).sum(axis, where=usable[rows]), values.shape)  # type: ignore[misc]
+        total = np.sum(sums, axis=0) if axis == 0 else np.concatenate(sums)
+        means = total / np.maximum(count, 1)
         means -= means.mean(where=count > 0)
-        within = float(np.var(rest - means, where=usable))
+
+        def left(rows: slice, axis: int = axis, means: Array = means) -> Array:
+            return rest(rows) - (means if axis == 0 else means[rows, None])
+
+        within = variance_over(left, usable)
         chance = within / np.maximum(count, 1)
         lines = int((count > 0).sum())
         deviance = float(np.sum(means**2 / chance, where=count > 0)) if within > 0 else 0.0
         if lines > 1 and stats.chi2.sf(deviance, lines - 1) < _MAX_CHANCE:
             spread = max(float(means.var(where=count > 0) - chance.mean(where=count > 0)), 0.0)
-            means *= spread / (spread + chance)
-            shifts += means
-            rest -= means
-    return shifts
+            shifts[1 - axis] = means * spread / (spread + chance)
+    return shifts[0], shifts[1]
 
 
-def _grid(ratio: Array, read_dn2: float, degrees: float, usable: NDArray[np.bool_]) -> Array:
-    """Return the grid of ln r (step,): half as wide as chance scatters it, and as far as the pixels reach."""
+def _grid(low: float, high: float, read_dn2: float, degrees: float) -> Array:
+    """Return the grid of ln r (step,): half as wide as chance scatters it, and as far as ratios reach."""
     blur = np.sqrt(2 / degrees)
-    low, high = np.log(np.quantile(ratio[usable], (0.002, 1.0)).clip(1e-3, 1e4)) + np.array([-1, 1]) * blur
+    first, last = np.log(np.clip([low, high], 1e-3, 1e4)) + np.array([-1, 1]) * blur
     # Where shot noise is most of the noise, read noise may be anything down to nothing.
-    steps = int(np.clip(np.ceil((high - low + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
-    return np.asarray(np.log(read_dn2) + np.linspace(low - 1.0, high, steps))
+    steps = int(np.clip(np.ceil((last - first + 1.0) / max(0.5 * blur, 0.02)), 32, 300))
+    return np.asarray(np.log(read_dn2) + np.linspace(first - 1.0, last, steps))
 
 
 def _log_likelihood(squares: Array, grid: Array, shot_dn2: Array, freedom: Array) -> Array:
@@ -205,18 +297,43 @@ def _log_likelihood(squares: Array, grid: Array, shot_dn2: Array, freedom: Array
     return np.asarray(log)
 
 
-def _bins(ratio: Array, usable: NDArray[np.bool_], *, exact: bool) -> tuple[slice, NDArray[np.intp], Array]:
-    """Return which usable pixels tell the population, the bin of each, and the number of pixels in each bin.
+def _bins(
+    squares: _Squares, ratio: NDArray[np.floating], factor: _LineFactor, usable: NDArray[np.bool_]
+) -> tuple[Array, Array, float]:
+    """Return mean squares (bin, group) and number (bin,) of pixels that tell the population, and the sum of ln factor.
 
     Pixels of one variance tell the same if all frames are alike. If not, each is a bin of its own, and fewer do.
     """
-    if not exact:
-        pixel = slice(None, None, -(-int(usable.sum()) // _SAMPLE_PX))
-        each = np.arange(int(usable.sum()))[pixel]
-        return pixel, np.arange(each.size), np.ones(each.size)
-    log = np.log(np.maximum(ratio[usable], 1e-9))
-    _, member, counts = np.unique(np.round(log / _BIN), return_inverse=True, return_counts=True)
-    return slice(None), member, counts.astype(float)
+    if squares.freedom.size > 1:
+        row, column = _every_nth(usable, -(-int(usable.sum()) // _SAMPLE_PX))
+        factors = factor.at(row, column)
+        return squares.at(row, column) / factors[:, None], np.ones(row.size), float(np.log(factors).sum())
+    first, last = (int(np.rint(np.log(end) / _BIN)) for end in (1e-9, 1e9))
+
+    def work(rows: slice) -> tuple[Array, Array, float]:
+        used, factors = usable[rows], factor.at(rows)
+        log = np.log(np.clip(ratio[rows] / factors, 1e-9, 1e9))[used]
+        member = np.rint(log / _BIN).astype(np.int64) - first
+        counts = np.bincount(member, minlength=last - first + 1)
+        sums = np.bincount(member, squares.at(rows)[..., 0][used] / factors[used], minlength=counts.size)
+        return counts.astype(np.float64), sums, float(np.log(factors[used]).sum())
+
+    counts, sums, logs = (sum(parts) for parts in zip(*over_strips(work, usable.shape), strict=True))
+    full = counts > 0
+    return (sums[full] / counts[full])[:, None], counts[full], logs
+
+
+def _every_nth(usable: NDArray[np.bool_], step: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of every `step`-th usable pixel."""
+    before = np.concatenate([[0], np.cumsum(usable.sum(1))])
+
+    def work(rows: slice) -> NDArray[np.intp]:
+        row, column = np.nonzero(usable[rows])
+        first = -int(before[rows.start]) % step
+        return np.stack([rows.start + row[first::step], column[first::step]])
+
+    row, column = np.concatenate(over_strips(work, usable.shape), axis=1)
+    return row, column
 
 
 @dataclass(frozen=True)
@@ -229,60 +346,55 @@ class _Population:
 
 
 def _population(
-    squares: Array,
-    ratio: Array,
-    factor: Array,
-    read_dn2: float,
-    shot_dn2: Array,
-    freedom: Array,
-    usable: NDArray[np.bool_],
+    squares: _Squares, ratio: NDArray[np.floating], factor: _LineFactor, read_dn2: float, usable: NDArray[np.bool_]
 ) -> _Population:
-    """Return the population of squares (row, column, series) over `factor`."""
-    degrees = float(freedom.sum())
-    ratio = ratio / factor
-    grid = _grid(ratio, read_dn2, degrees, usable)
-    pixel, member, count = _bins(ratio, usable, exact=freedom.size == 1)
-    chosen = np.flatnonzero(usable)[pixel]
-    chosen_factor = factor.ravel()[chosen]
-    scaled = squares.reshape(-1, freedom.size)[chosen] / chosen_factor[:, None]
-    sums = [np.bincount(member, weights) for weights in scaled.T]
-    log = _log_likelihood(np.stack(sums, axis=1) / count[:, None], grid, shot_dn2, freedom)
+    """Return the population of the squares over `factor`."""
+    degrees = float(squares.freedom.sum())
+    some = thinned(ratio, usable, factor.at)
+
+    def highest(rows: slice) -> float:
+        return float((ratio[rows] / factor.at(rows)).max(where=usable[rows], initial=0.0))
+
+    grid = _grid(float(np.quantile(some, 0.002)), max(over_strips(highest, usable.shape)), read_dn2, degrees)
+    binned, count, log_factors = _bins(squares, ratio, factor, usable)
+    log = _log_likelihood(binned, grid, squares.shot_dn2, squares.freedom)
     peak = log.max(axis=1)
     likelihood = np.exp(log - peak[:, None])
-    spread2 = robust_sigma(np.log(np.maximum(ratio[usable], 1e-9))) ** 2 - 2 / degrees
+    spread2 = robust_sigma(np.log(np.maximum(some, 1e-9))) ** 2 - 2 / degrees
     middle = grid[np.argmax(count @ likelihood)]
     share = np.exp(-0.5 * (grid - middle) ** 2 / max(spread2, 0.2 / degrees))
     share = (1 - _TAIL) * share / share.sum() + _TAIL / grid.size
     for _ in range(_EM_STEPS):
         share = share * ((count / (likelihood @ share)) @ likelihood) / count.sum()
-    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * float(np.log(chosen_factor).sum())
+    total = float(count @ (np.log(likelihood @ share) + peak)) - 0.5 * degrees * log_factors
     return _Population(grid, share, total)
 
 
-def _posterior(
-    squares: Array, factor: Array, population: _Population, shot_dn2: Array, freedom: Array
-) -> tuple[Array, Array]:
-    """Return mean and variance of each pixel's read noise, (row, column), from squares (row, column, series)."""
+def _posterior(population: _Population, shot_dn2: Array, freedom: Array) -> Callable[[Array], tuple[Array, Array]]:
+    """Return a function from squares (row, column, group) to mean and variance of the read noise, (row, column)."""
     grid = population.grid
     sigma = np.exp(0.5 * grid)
-    log_share = np.log(np.maximum(population.share, 1e-300))
-    middle = float(population.share @ sigma)  # about which little is lost in single precision
+    variances = np.exp(grid) + shot_dn2[:, None]
+    # About the likeliest step little is lost in single precision, which is fast
+    centre = int(population.share.argmax())
+    slope, constant = -0.5 / variances, np.log(np.maximum(population.share, 1e-300)) - 0.5 * freedom @ np.log(variances)
+    slope, constant = (it - it[..., centre, None] for it in (slope, constant))
+    middle = float(population.share @ sigma)
     moments = np.power.outer(sigma - middle, np.arange(3)).astype(np.float32)
     finest = (0.5 * (grid[1] - grid[0])) ** 2 / 12  # of the mean squared: no finer than the grid tells
-    mean, variance = np.empty(squares.shape[:2]), np.empty(squares.shape[:2])
+    terms = np.concatenate([slope, constant[None]]).astype(np.float32)
 
-    def work(rows: slice) -> None:
-        flat = (squares[rows] / factor[rows, :, None]).reshape(-1, freedom.size)
+    def posterior(squares: Array) -> tuple[Array, Array]:
+        flat = np.ones((squares.shape[0] * squares.shape[1], freedom.size + 1), np.float32)
+        flat[:, :-1] = squares.reshape(-1, freedom.size)
         sums = np.empty((len(flat), 3))
         for start in range(0, len(flat), _CHUNK_PX):
-            log = _log_likelihood(flat[start : start + _CHUNK_PX], grid, shot_dn2, freedom)
-            log += log_share
+            log = flat[start : start + _CHUNK_PX] @ terms
             log -= log.max(axis=1, keepdims=True)
-            sums[start : start + _CHUNK_PX] = np.exp(log.astype(np.float32)) @ moments  # fast in single precision
-        total, first, second = sums.T.reshape(3, *mean[rows].shape)
+            sums[start : start + _CHUNK_PX] = np.exp(log, out=log) @ moments
+        total, first, second = sums.T.reshape(3, *squares.shape[:2])
         from_middle = first / total
-        mean[rows] = middle + from_middle
-        variance[rows] = np.maximum(second / total - from_middle**2, finest * mean[rows] ** 2)
+        mean = middle + from_middle
+        return mean, np.maximum(second / total - from_middle**2, finest * mean**2)
 
-    over_strips(work, mean.shape)
-    return mean, variance
+    return posterior

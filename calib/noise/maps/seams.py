@@ -6,10 +6,13 @@ their scatter. A gradient across the sensor and its bend are no seam; they are f
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+
+from faintfield.calib.noise.strips import over_strips
 
 type Array = NDArray[np.float64]
 
@@ -49,10 +52,9 @@ class Seam:
         """Largest difference between two regions."""
         return float(np.ptp(self.effect))
 
-    @property
-    def map(self) -> Array:
-        """The effect as an array that broadcasts to (row, column)."""
-        return self.effect[:, None] if self.lines == "rows" else self.effect[None, :]
+    def of(self, rows: slice) -> Array:
+        """Return the effect on some rows as an array that broadcasts to (row, column)."""
+        return self.effect[rows, None] if self.lines == "rows" else self.effect[None, :]
 
     def __str__(self) -> str:
         return {
@@ -62,7 +64,7 @@ class Seam:
         }[self.regions]
 
 
-def find_seams(values: Array, weight: Array) -> list[Seam]:
+def find_seams(values: NDArray[Any], weight: NDArray[Any], precision: float = 1.0) -> list[Seam]:
     """Return the seams of values (row, column): at most one of rows and one of columns.
 
     Parameters
@@ -70,25 +72,39 @@ def find_seams(values: Array, weight: Array) -> list[Seam]:
     values : array (row, column)
         A quantity of each pixel.
     weight : array (row, column)
-        Inverse variance of each value; 0 for pixels that do not count.
+        Inverse variance of each value over `precision`; 0 for pixels that do not count.
+    precision : float
+        What the weights are multiplied by.
     """
-    found = [_find_seam(*_profile(values, weight, lines), lines) for lines in ("rows", "columns")]
+    profiles = _profiles(values, weight, precision)
+    found = [_find_seam(*profiles[lines], lines) for lines in ("rows", "columns")]
     return [seam for seam in found if seam]
 
 
-def share_of_seam(seam: Seam, values: Array, weight: Array) -> tuple[float, float]:
+def share_of_seam(
+    seam: Seam, values: NDArray[Any], weight: NDArray[Any], precision: float = 1.0
+) -> tuple[float, float]:
     """Return how much of the effect of a seam other values (row, column) show, and its standard error."""
-    profile, total = _profile(values, weight, seam.lines)
+    profile, total = _profiles(values, weight, precision)[seam.lines]
     found, covariance, _ = _fit(np.stack([seam.effect, np.ones(profile.size)], axis=1), profile, total)
     return float(found[0]), float(np.sqrt(covariance[0, 0]))
 
 
-def _profile(values: Array, weight: Array, lines: str) -> tuple[Array, Array]:
-    """Return the weighted means of rows or columns, and their inverse variances (line,)."""
-    axis = 1 if lines == "rows" else 0
-    # A line without any pixel that counts tells next to nothing
-    total = np.maximum(weight.sum(axis=axis), 1e-9 * weight.max())
-    return (values * weight).sum(axis=axis) / total, total
+def _profiles(values: NDArray[Any], weight: NDArray[Any], precision: float) -> dict[str, tuple[Array, Array]]:
+    """Return the weighted means of rows and columns, and their inverse variances (line,)."""
+
+    def work(rows: slice) -> tuple[Array, Array, float]:
+        weights = weight[rows].astype(np.float64)
+        both = np.stack([weights * values[rows], weights])
+        return both.sum(2), both.sum(1), float(weights.max())
+
+    of_rows, of_columns, highest = zip(*over_strips(work, values.shape), strict=True)
+    profiles = {}
+    for lines, (mean, total) in (("rows", np.concatenate(of_rows, axis=1)), ("columns", np.sum(of_columns, axis=0))):
+        # A line without any pixel that counts tells next to nothing
+        counted = np.maximum(total, 1e-9 * max(highest))
+        profiles[lines] = mean / counted, counted * precision
+    return profiles
 
 
 def _find_seam(profile: Array, weight: Array, lines: str) -> Seam | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from faintfield.calib.noise.maps.read_noise import PixelReadNoise
 from faintfield.calib.noise.series.statistics import Series
+from faintfield.calib.noise.strips import map_of
 
 type Array = NDArray[np.float64]
 
@@ -44,15 +45,21 @@ def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: S
     frames = np.array([one.frames for one in darks])
     if not read.resolved or frames.sum() < _MIN_FRAMES:
         return np.zeros(read.read_noise_dn.shape, bool)
-    powers = [
-        np.sum([getattr(one, name) for one in darks], axis=0) for name in ("within_dn2", "cubes_dn3", "fourths_dn4")
-    ]
-    skew2, kurtosis = _shape(*(power / frames.sum() for power in powers))
     typical = np.median(read.read_noise_dn)
-    noisier = (read.read_noise_dn > _MIN_FACTOR * typical) & (read.read_noise_dn - _MIN_SIGMA * read.se_dn > typical)
     limit = _normal_quotient(frames, np.sqrt(noise_dn2))
-    lonely = kurtosis > _MAX_LONELY * frames.sum()
-    return np.asarray(noisier & ~lonely & ((skew2 + 1) / kurtosis > limit))
+
+    def work(rows: slice) -> NDArray[np.bool_]:
+        powers = [
+            np.sum([getattr(one, name)[rows] for one in darks], axis=0, dtype=np.float64)
+            for name in ("within_dn2", "cubes_dn3", "fourths_dn4")
+        ]
+        skew2, kurtosis = _shape(*(power / frames.sum() for power in powers))
+        read_dn, se_dn = read.read_noise_dn[rows], read.se_dn[rows]
+        noisier = (read_dn > _MIN_FACTOR * typical) & (read_dn - _MIN_SIGMA * se_dn > typical)
+        lonely = kurtosis > _MAX_LONELY * frames.sum()
+        return np.asarray(noisier & ~lonely & ((skew2 + 1) / kurtosis > limit))
+
+    return map_of(work, read.read_noise_dn.shape, bool)
 
 
 def _shape(second: Array, third: Array, fourth: Array) -> tuple[Array, Array]:

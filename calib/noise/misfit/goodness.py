@@ -10,7 +10,7 @@ from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_
 from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from faintfield.calib.noise.likelihood.moments import Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope
-from faintfield.calib.noise.misfit.scatter import BLOCKS, block_scatter, flat_noise_map, light_signal, noise_freedom
+from faintfield.calib.noise.misfit.scatter import flat_variances_of_nodes, light_signal, noise_freedom
 from faintfield.calib.noise.series.statistics import Series
 
 type Array = NDArray[np.float64]
@@ -51,7 +51,7 @@ class SeriesGoodness:
 
 
 def series_goodness(
-    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
+    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series]
 ) -> tuple[SeriesGoodness, ...]:
     """Return the goodness of fit of each series, darks first."""
     t = moments.darks.exposure_s
@@ -67,10 +67,10 @@ def series_goodness(
             found.append(SeriesGoodness(one, None, None, residuals[j]))
             continue
         excess = float(within[j] / ((one.frames - 1) * moments.freedom * noise[j])) - 1
-        rows, columns = used.shape
-        expected = noise[j] if one.conditions.kind == "dark" else flat_noise_map(fit, one)
+        sums = moments.noise[j]
+        expected = noise[j] if one.conditions.kind == "dark" else flat_variances_of_nodes(fit, sums)
         blocks, by_row, by_column = (
-            _scatter(one, expected, used, *shape) for shape in ((BLOCKS, BLOCKS), (rows, 1), (1, columns))
+            _scatter(*sums.scatter(groups, expected)) for groups in (sums.blocks, sums.rows, sums.columns)
         )
         se = float(np.sqrt(2 / max(freedom[j], 1.0)))
         found.append(
@@ -96,9 +96,8 @@ def _light_residuals(fit: NoiseFit, moments: Moments) -> list[float | None]:
     return found
 
 
-def _scatter(one: Series, noise_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int) -> Scatter:
-    """Return the scatter of a series' noise over blocks about its own mean."""
-    ratio, freedom = block_scatter(one, noise_dn2, used, rows, columns)
+def _scatter(ratio: Array, freedom: Array) -> Scatter:
+    """Return the scatter of a series' noise over groups of pixels about its own mean."""
     mean = np.average(ratio, weights=freedom)
     return Scatter(float(np.sum(0.5 * freedom * (ratio / mean - 1) ** 2)), ratio.size - 1)
 

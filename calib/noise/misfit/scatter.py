@@ -8,24 +8,20 @@ response. A fourth is that of the noise over blocks of pixels, which is wider th
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, flat_variances_dn2, level_variances_dn2
+from faintfield.calib.noise.likelihood.groups import SeriesNoise
 from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
 from faintfield.calib.noise.likelihood.moments import NO_EXCESS, Excess, Moments
 from faintfield.calib.noise.likelihood.response import charge_dn, charge_slope, grown_variance, scatter_of_levels
 from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 from faintfield.calib.noise.series.statistics import Series
-from faintfield.calib.noise.strips import over_strips
 
 type Array = NDArray[np.float64]
-
-# Blocks of pixels along each side of a frame.
-BLOCKS = 8
 
 # The levels of all dark series have a trend in common below this probability.
 _MAX_TREND_CHANCE = 0.01
@@ -51,59 +47,15 @@ def noise_freedom(moments: Moments) -> tuple[Array, Array]:
     return (darks.frames - 1) * moments.freedom, (flats.frames - 1) * moments.freedom * flats.evenness
 
 
-def block_scatter(
-    series: Series, expected_dn2: Array | float, used: NDArray[np.bool_], rows: int, columns: int
-) -> tuple[Array, Array]:
-    """Return the noise of rows × columns blocks over the expected one, and the degrees of freedom of each.
-
-    Both are arrays (block,); blocks with fewer than two pixels in use are left out.
-    """
-    count, measured = (_block_sums(values, used, rows, columns) for values in (used, series.within_dn2))
-    if isinstance(expected_dn2, np.ndarray):
-        expected = _block_sums(expected_dn2, used, rows, columns)
-    else:
-        expected = expected_dn2 * count
-    share = max(float(used.sum()) - sum(used.shape) + 1, 1.0) / float(used.sum())
-    enough = count > 1
-    freedom = (series.frames - 1) * count[enough] * share
-    return measured[enough] / (expected[enough] * (series.frames - 1) * share), np.asarray(freedom, float)
-
-
-def _block_sums(values: NDArray[Any], used: NDArray[np.bool_], rows: int, columns: int) -> Array:
-    """Return the sums (block,) of values (row, column) of the pixels in use over rows × columns blocks."""
-    row, column = (np.arange(size) * count // size for size, count in zip(used.shape, (rows, columns), strict=True))
-    # Small frames have blocks without pixels
-    first = np.flatnonzero(np.diff(column, prepend=-1))
-
-    def work(strip: slice) -> Array:
-        own = np.where(used[strip], values[strip], 0.0)
-        parts = own if columns == used.shape[1] else np.add.reduceat(own, first, axis=1)
-        begins = np.flatnonzero(np.diff(row[strip], prepend=-1))
-        return np.asarray(np.add.reduceat(parts, begins, axis=0))
-
-    blocks = np.zeros((rows, columns))
-    for block, part in zip(
-        over_strips(lambda strip: np.unique(row[strip]), used.shape), over_strips(work, used.shape), strict=True
-    ):
-        blocks[np.ix_(block, column[first])] += part
-    return blocks.ravel()
-
-
-def _dispersion(series: Sequence[Series], noise_dn2: Iterable[Array | float], used: NDArray[np.bool_]) -> float:
+def _dispersion(noise: Sequence[SeriesNoise], variances_dn2: Iterable[Array | float]) -> float:
     """Return how much wider than χ² the noise of blocks scatters, at least 1.
 
     What the blocks of all series have in common is a difference between pixels, not chance, and is taken out.
     """
-    if sum(one.frames > 1 for one in series) < 2:
+    several = [(one, v) for one, v in zip(noise, variances_dn2, strict=True) if one.frames > 1]
+    if len(several) < 2:
         return 1.0
-    ratios, freedoms = zip(
-        *(
-            block_scatter(one, v, used, BLOCKS, BLOCKS)
-            for one, v in zip(series, noise_dn2, strict=True)
-            if one.frames > 1
-        ),
-        strict=True,
-    )
+    ratios, freedoms = zip(*(one.scatter(one.blocks, v) for one, v in several), strict=True)
     ratio, weight = np.array(ratios), np.array(freedoms) / 2
     ratio = ratio / np.average(ratio, axis=1, weights=weight[0])[:, None]
     rest = ratio - np.average(ratio, axis=0, weights=weight[:, 0])
@@ -112,27 +64,18 @@ def _dispersion(series: Sequence[Series], noise_dn2: Iterable[Array | float], us
     return deviance / freedom if stats.chi2.sf(deviance, freedom) < _MAX_CHANCE else 1.0
 
 
-def flat_noise_map(fit: NoiseFit, one: Series) -> Array:
-    """Return the noise that the model expects of each pixel (row, column) of a flat, from its own mean."""
-    mean = np.maximum(one.mean_dn, fit.values["offset_dn"])
-    grid = np.linspace(float(mean.min()), float(mean.max()) + 1e-6, 64)
-    variances = flat_variances_dn2(fit.values, grid)
-
-    def work(rows: slice) -> None:
-        mean[rows] = np.interp(mean[rows], grid, variances)
-
-    over_strips(work, mean.shape)
-    return np.asarray(mean)
+def flat_variances_of_nodes(fit: NoiseFit, noise: SeriesNoise) -> Array:
+    """Return the noise that the model expects of pixels of a flat with the means `noise.nodes_dn`, as many."""
+    return np.array(flat_variances_dn2(fit.values, np.maximum(noise.nodes_dn, fit.values["offset_dn"])))
 
 
-def measure_excess(
-    fit: NoiseFit, moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_]
-) -> tuple[Excess, dict[str, Known]]:
+def measure_excess(fit: NoiseFit, moments: Moments, darks: Sequence[Series]) -> tuple[Excess, dict[str, Known]]:
     """Return the scatter beyond the model, and for `variance2`, `drift_dn2` and `light2` what is known of each."""
     dark_noise = dark_variances_dn2(fit.values, moments.darks.exposure_s)
+    of_darks, of_flats = moments.noise[: len(darks)], moments.noise[len(darks) :]
     excess = Excess(
-        darks=_dispersion(darks, dark_noise, used),
-        flats=_dispersion(flats, (flat_noise_map(fit, one) for one in flats), used),
+        darks=_dispersion(of_darks, dark_noise),
+        flats=_dispersion(of_flats, (flat_variances_of_nodes(fit, one) for one in of_flats)),
     )
     variance2, noise_known = _noise_scatter(fit, moments, excess)
     drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
@@ -232,9 +175,7 @@ def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known
     return found, Known(left, _share(chance, found))
 
 
-def fit_with_excess(
-    moments: Moments, darks: Sequence[Series], flats: Sequence[Series], used: NDArray[np.bool_], bends: int
-) -> tuple[NoiseFit, Moments]:
+def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tuple[NoiseFit, Moments]:
     """Fit, measure the scatter that the fit leaves, and fit again with it until it settles.
 
     Returns
@@ -247,7 +188,7 @@ def fit_with_excess(
     problem = GaussianProblem(moments, bends)
     fit, known = problem.fit(replace(NO_EXCESS, light2=_first_light2(moments, bends))), dict[str, Known]()
     for _ in range(_MAX_ROUNDS):
-        excess, known = measure_excess(fit, moments, darks, flats, used)
+        excess, known = measure_excess(fit, moments, darks)
         settled = _alike(excess, moments.excess)
         moments = replace(moments, excess=excess)
         if settled:

@@ -1,15 +1,24 @@
-"""Sums of powers of the frames of a series, which tell the mean and the central moments of every pixel in one pass."""
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, assignment"
+"""Moments of every pixel over the frames of a series: two passes over each frame, for its means and for the rest.
+
+The moments follow from those without the last frame (Welford, Technometrics 4, 419, 1962; for the higher ones Pébay,
+Sandia report SAND2008-6212). No sum of powers has to be known to more digits than its result, so that single precision
+holds them.
+"""
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from faintfield.calib.noise.strips import over_strips
+from faintfield.calib.noise.compiled import compiled
+from faintfield.calib.noise.room import new_map
 
-type Array = NDArray[np.float64]
+_NONE = np.iinfo(np.int64).min
 
 
-class PowerSums:
-    """Running sums of frames and their powers, arrays (row, column).
+class Moments:
+    """Mean of the frames so far and sums of the powers of deviations from it, arrays (row, column).
 
     Parameters
     ----------
@@ -20,31 +29,97 @@ class PowerSums:
     """
 
     def __init__(self, shape: tuple[int, ...], *, higher: bool) -> None:
-        self._sums = [np.zeros(shape) for _ in range(4 if higher else 2)]
+        self.mean = np.zeros(shape)
+        self.sums = [np.zeros(shape, np.float32) for _ in range(3 if higher else 1)]
 
-    def add(self, rows: slice, values: Array) -> None:
-        """Add some rows (row, column) of a frame."""
-        power = values
-        for index, total in enumerate(self._sums):
-            power = power * values if index else values
-            total[rows] += power
+    def add(self, frames: int, rows: slice, frame, regular: NDArray[np.bool_], of_rows, of_columns, top: float):
+        """Add some rows of a frame, which is the `frames`-th.
 
-    def central(self, frames: int) -> list[NDArray[np.float32]]:
-        """Return the mean over the frames and the sums of the second, third and fourth powers of deviations from it.
+        Parameters
+        ----------
+        frame, regular : array (row, column)
+            Its values, and the pixels that count.
+        of_rows, of_columns : array (row,), array (column,)
+            Sum of which is subtracted.
+        top : float
+            A value.
 
-        The last two are one zero unless higher powers were summed.
+        Returns
+        -------
+        tuple of (float, int, int)
+            Squares of the rest, and numbers of values at `top` or above and one below it; all of regular pixels.
         """
-        shape = self._sums[0].shape
-        found = [np.empty(shape, np.float32) for _ in self._sums]
+        mean, sums = self.mean[rows], [one[rows] for one in self.sums]
+        if len(sums) == 1:
+            return _add_two(frame, regular, of_rows, of_columns, float(frames), mean, sums[0], top)
+        return _add_four(frame, regular, of_rows, of_columns, float(frames), mean, *sums), 0, 0
 
-        def work(rows: slice) -> None:
-            mean, squares = self._sums[0][rows] / frames, self._sums[1][rows]
-            found[0][rows] = mean
-            found[1][rows] = np.maximum(squares - frames * mean**2, 0.0)
-            if len(self._sums) > 2:
-                cubes, fourths = (total[rows] for total in self._sums[2:])
-                found[2][rows] = cubes - 3 * mean * squares + 2 * frames * mean**3
-                found[3][rows] = fourths - 4 * mean * cubes + 6 * mean**2 * squares - 3 * frames * mean**4
-
-        over_strips(work, shape)
+    def maps(self) -> list[NDArray[np.float32]]:
+        """Return the mean and the sums of second, third and fourth powers; the last two are one zero if not summed."""
+        found: list[NDArray[np.float32]] = []
+        moments: list[NDArray[Any]] = [self.mean, *self.sums]
+        for moment in moments:
+            made = new_map(moment.shape)
+            made[...] = moment
+            found.append(made)
         return found + [np.zeros((1, 1), np.float32) for _ in range(4 - len(found))]
+
+
+@compiled
+def sum_lines(frame, regular, row_sums):
+    """Write the sums of the regular values of each row; return those of each column, the least and the highest value.
+
+    The highest is that of the regular pixels, very low if there are none.
+    """
+    column_sums = np.zeros(frame.shape[1], np.int64)
+    low = np.int64(frame[0, 0])
+    for row in range(frame.shape[0]):
+        total = np.int64(0)
+        for column in range(frame.shape[1]):
+            value = np.int64(frame[row, column])
+            low = min(low, value)
+            counted = value if regular[row, column] else np.int64(0)
+            total += counted
+            column_sums[column] += counted
+        row_sums[row] = total
+    high = _NONE
+    for row in range(frame.shape[0]):
+        for column in range(frame.shape[1]):
+            high = max(high, np.int64(frame[row, column]) if regular[row, column] else _NONE)
+    return column_sums, low, high
+
+
+@compiled
+def _add_two(frame, regular, of_rows, of_columns, frames, mean, squares, top):
+    total, at, below = 0.0, 0, 0
+    for row in range(frame.shape[0]):
+        for column in range(frame.shape[1]):
+            value = float(frame[row, column])
+            rest = value - of_rows[row] - of_columns[column]
+            counts = regular[row, column]
+            total += rest * rest if counts else 0.0
+            at += 1 if counts and value >= top else 0
+            below += 1 if counts and value == top - 1 else 0
+            delta = rest - mean[row, column]
+            step = delta / frames
+            mean[row, column] += step
+            squares[row, column] += delta * step * (frames - 1)
+    return total, at, below
+
+
+@compiled
+def _add_four(frame, regular, of_rows, of_columns, frames, mean, squares, cubes, fourths):
+    total = 0.0
+    for row in range(frame.shape[0]):
+        for column in range(frame.shape[1]):
+            rest = float(frame[row, column]) - of_rows[row] - of_columns[column]
+            total += rest * rest if regular[row, column] else 0.0
+            delta = rest - mean[row, column]
+            step = delta / frames
+            term = delta * step * (frames - 1)
+            second, third = float(squares[row, column]), float(cubes[row, column])
+            mean[row, column] += step
+            squares[row, column] = second + term
+            cubes[row, column] = third + step * (term * (frames - 2) - 3 * second)
+            fourths[row, column] += step * (step * (term * (frames * frames - 3 * frames + 3) + 6 * second) - 4 * third)
+    return total

@@ -7,7 +7,7 @@ level and banding would count as pixel noise.
 """
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from faintfield.calib.errors import BadFrame, LightLeak
 from faintfield.calib.noise.series.outliers import outlier
-from faintfield.calib.noise.series.powers import PowerSums
-from faintfield.calib.noise.strips import over_strips
+from faintfield.calib.noise.series.powers import Moments, sum_lines
+from faintfield.calib.noise.strips import over_strips, total_of
 
 # Robust standard deviations in the first frame of a series beyond which pixels are left out of row and column means:
 # the shot noise of a hot pixel would otherwise spread along its row.
@@ -141,13 +141,12 @@ class Series:
     @property
     def mean_dn(self) -> NDArray[np.float64]:
         """Mean over the frames (row, column), with level and profiles."""
-        mean, rows_dn = np.empty(self.pattern_dn.shape), self.row_dn + self.levels_dn.mean()
+        return self.mean_of(slice(None))
 
-        def work(rows: slice) -> None:
-            np.add(self.pattern_dn[rows], rows_dn[rows, None], out=mean[rows])
-            mean[rows] += self.column_dn
-
-        over_strips(work, mean.shape)
+    def mean_of(self, rows: slice) -> NDArray[np.float64]:
+        """Return some rows of `mean_dn`."""
+        mean = self.pattern_dn[rows] + (self.row_dn[rows] + self.levels_dn.mean())[:, None]
+        mean += self.column_dn
         return mean
 
     def clipped_share(self, ceiling_dn: float) -> float:
@@ -190,9 +189,6 @@ class SeriesSums:
             raise ValueError(f"{name}: {frame_dn.shape} pixels, where the series began with {self._suspect.shape}")
         digest = hashlib.blake2b(np.ascontiguousarray(frame_dn), digest_size=16).digest()
         sample = frame_dn.ravel()[self._sampled].astype(np.int32)
-        self._floor_dn = min(self._floor_dn, int(frame_dn.min()))
-        if self.conditions.kind == "flat":
-            self._count_top(frame_dn)
         self._frames.append((name, digest, sample, *self._add_residual(frame_dn)))
 
     def _begin(self, first_dn: NDArray[Any]) -> None:
@@ -202,40 +198,44 @@ class SeriesSums:
         self._suspect_at = np.nonzero(self._suspect)
         self._row_count, self._column_count = self._regular.sum(1), self._regular.sum(0)
         self._sampled = sample_index(first_dn.shape)
-        self._powers = PowerSums(first_dn.shape, higher=self.conditions.kind == "dark")
+        self._moments = Moments(first_dn.shape, higher=self.conditions.kind == "dark")
 
     def _add_residual(self, frame_dn: NDArray[Any]) -> tuple[Any, ...]:
         """Add a frame without its level, row and column means to the sums; return them and the spread of the rest."""
-        level, rows, columns = self._means(frame_dn)
+        level, rows, columns, highest = self._means(frame_dn)
+        top, frames = max(self._top_dn, min(highest, self.saturation_dn)), len(self._frames) + 1
 
-        def work(strip: slice) -> float:
-            rest = frame_dn[strip] - (level + rows[strip])[:, None]
-            rest -= columns
-            self._powers.add(strip, rest)
-            return float(np.square(rest)[self._regular[strip]].sum())
+        def work(strip: slice) -> NDArray[np.float64]:
+            found = self._moments.add(
+                frames, strip, frame_dn[strip], self._regular[strip], level + rows[strip], columns, top
+            )
+            return np.array(found, np.float64)
 
-        squares = sum(over_strips(work, frame_dn.shape))
+        squares, at, below = total_of(work, frame_dn.shape).tolist()
+        self._count_top(top, int(at), int(below))
         return level, rows, columns, squares / self._row_count.sum()
 
-    def _means(self, frame_dn: NDArray[Any]) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Return the mean level of the regular pixels, and the means of rows and columns about it and each other."""
-        (row, column), (height, width) = self._suspect_at, frame_dn.shape
-        suspect_dn = frame_dn[row, column].astype(np.float64)
-        rows, columns = (frame_dn.sum(axis, dtype=np.float64) for axis in (1, 0))
-        rows -= np.bincount(row, suspect_dn, height)
-        columns -= np.bincount(column, suspect_dn, width)
-        level = float(rows.sum() / self._row_count.sum())
-        rows = (rows - level * self._row_count) / np.maximum(self._row_count, 1)
-        taken = (level + rows).sum() - np.bincount(column, (level + rows)[row], width)
-        return level, rows, (columns - taken) / np.maximum(self._column_count, 1)
+    def _means(self, frame_dn: NDArray[Any]) -> tuple[float, NDArray[np.float64], NDArray[np.float64], float]:
+        """Return the level of the regular pixels, the means of rows and columns about it, and the highest value."""
+        rows = np.zeros(len(frame_dn), np.int64)
 
-    def _count_top(self, frame_dn: NDArray[Any]) -> None:
-        """Count the regular values at the highest so far, the stated end of the range at most, and one below it."""
-        highest = frame_dn.max(where=self._regular, initial=frame_dn.min())
-        top = max(self._top_dn, min(float(highest), self.saturation_dn))
-        suspect_dn = frame_dn[self._suspect_at]
-        at = int(np.count_nonzero(frame_dn >= top) - np.count_nonzero(suspect_dn >= top))
-        below = int(np.count_nonzero(frame_dn == top - 1) - np.count_nonzero(suspect_dn == top - 1))
+        def work(strip: slice) -> tuple[NDArray[np.int64], int, int]:
+            found: tuple[NDArray[np.int64], int, int] = sum_lines(frame_dn[strip], self._regular[strip], rows[strip])
+            return found
+
+        parts, lows, highs = zip(*over_strips(work, frame_dn.shape), strict=True)
+        self._floor_dn = min(self._floor_dn, *lows)
+        columns, total = np.sum(parts, axis=0), rows.sum()
+        level = float(total / self._row_count.sum())
+        means = (rows - level * self._row_count) / np.maximum(self._row_count, 1)
+        row, column = self._suspect_at
+        taken = (level + means).sum() - np.bincount(column, (level + means)[row], frame_dn.shape[1])
+        return level, means, (columns - taken) / np.maximum(self._column_count, 1), float(max(*highs, min(lows)))
+
+    def _count_top(self, top: float, at: int, below: int) -> None:
+        """Add the numbers of values of a flat at the highest so far, and one below it."""
+        if self.conditions.kind != "flat":
+            return
         if top == self._top_dn:
             at, below = at + self._at_top, below + self._below_top
         elif top == self._top_dn + 1:
@@ -254,7 +254,7 @@ class SeriesSums:
         """
         if not (frames := len(self._frames)):
             raise ValueError("a series needs at least one frame, got none")
-        mean, within, cubes, fourths = self._powers.central(frames)
+        mean, within, cubes, fourths = self._moments.maps()
         names, digests, samples, *per_frame = zip(*self._frames, strict=True)
         levels, rows, columns, spreads_dn2 = map(np.array, per_frame)
         series = Series(
@@ -291,6 +291,11 @@ def measure_series(
     for name, frame_dn in frames:
         sums.add(name, frame_dn)
     return sums.series()
+
+
+def any_suspect(series: Sequence[Series]) -> NDArray[np.bool_]:
+    """Return the pixels (row, column) that are suspect in any series."""
+    return np.asarray(np.logical_or.reduce([one.suspect for one in series]))
 
 
 def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:

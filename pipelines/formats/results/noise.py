@@ -3,14 +3,16 @@
 Keys stand in the file in the order of the fields; docs/noise.md explains the quantities.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from zipfile import ZipFile
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, Struct, UnsetType
+from numpy.lib.format import write_array
 from numpy.typing import NDArray
 
 from faintfield.calib.noise_model import BentResponse, NoiseModel
@@ -144,7 +146,7 @@ def read_noise(path: Path) -> NoiseRecord:
 
 
 def write_noise(
-    out: Path, record: NoiseRecord, maps: Mapping[str, NDArray[Any]], pages: Mapping[str, bytes]
+    out: Path, record: NoiseRecord, maps: Iterable[tuple[str, NDArray[Any]]], pages: Mapping[str, bytes]
 ) -> NoiseRecord:
     """Write noise.json, its maps and its pages of plots, and return the record with the hash of the maps.
 
@@ -152,15 +154,19 @@ def write_noise(
 
     Parameters
     ----------
-    maps : mapping of str to array (row, column)
-        By the name in noise_maps.npz.
+    maps : iterable of (str, array (row, column))
+        Each with its name in noise_maps.npz; they are written one by one.
     pages : mapping of str to bytes
         Pages of plots, PNG or HTML, by file name.
     """
     with exclusive(out):
         remove(out / NOISE_FILE)
         with writing(out / NOISE_MAPS) as file:
-            np.savez(file, allow_pickle=False, **dict(maps))  # noise hardly shrinks, and compression would take minutes
+            # As numpy.savez does, which takes all at once; noise hardly shrinks, and compression would take minutes
+            with ZipFile(file, "w") as members:
+                for name, values in maps:
+                    with members.open(f"{name}.npy", "w", force_zip64=True) as member:
+                        write_array(member, values, allow_pickle=False)
         for name, page in pages.items():
             write_whole(out / name, page)
         record = msgspec.structs.replace(record, maps_sha256=sha256(out / NOISE_MAPS))

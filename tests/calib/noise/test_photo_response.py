@@ -15,7 +15,7 @@ def measured(response: Array, noise_dn2: float = 1.0, seed: int = 1) -> Response
     """Measure the response to a signal of 10 000 DN with noise."""
     rng = np.random.default_rng([seed, 1])
     signal = 1e4 * response + np.sqrt(noise_dn2) * rng.standard_normal(response.shape)
-    return measure_response([signal], [noise_dn2], np.ones(response.shape, bool))
+    return measure_response(signal, noise_dn2, np.ones(response.shape, bool))
 
 
 def spread(seed: int, shape: tuple[int, int] = SHAPE) -> Array:
@@ -36,7 +36,7 @@ def test_the_given_part_is_that_of_the_running_mean_as_a_matrix() -> None:
     shape, usable = (17, 19), np.ones((17, 19), bool)
     units = np.eye(usable.size).reshape(-1, *shape)
     rest = np.array([unit - _running_mean(unit, usable, 15) for unit in units])
-    np.testing.assert_allclose(_kept_share(usable), np.square(rest).sum(axis=0), rtol=1e-9)
+    np.testing.assert_allclose(_kept_share(usable)(slice(None)), np.square(rest).sum(axis=0), rtol=1e-9)
 
 
 @pytest.mark.parametrize("times", [4.0, 10.0])

@@ -98,9 +98,10 @@ def test_subtracting_means_of_rows_and_columns_mixes_variances_as_matrices_do() 
 def test_rows_that_do_not_differ_are_not_shifted() -> None:
     rng = np.random.default_rng(11)
     values = rng.standard_normal(SHAPE)
-    assert not line_shifts(values, np.ones(SHAPE, bool)).any()
+    assert not any(shifts.any() for shifts in line_shifts(values, np.ones(SHAPE, bool)))
     own = 0.5 * rng.standard_normal((SHAPE[0], 1))
-    shifts = line_shifts(values + own, np.ones(SHAPE, bool))
+    of_rows, of_columns = line_shifts(values + own, np.ones(SHAPE, bool))
+    shifts = np.add.outer(of_rows, of_columns)
     assert np.std(shifts - own) < 1.3 * (1 / 0.5**2 + SHAPE[1]) ** -0.5, "the error of the posterior mean"
 
 
@@ -118,7 +119,7 @@ def test_a_seam_is_found_beside_a_gradient(lines: str, regions: str) -> None:
     assert (found.lines, found.regions) == (lines, regions)
     assert found.difference == pytest.approx(0.5, abs=4 * found.se)
     assert not find_seams(smooth + noise, np.ones(SHAPE)), "a gradient is no seam"
-    share, se = share_of_seam(found, 0.7 * found.map + noise, np.ones(SHAPE))
+    share, se = share_of_seam(found, 0.7 * found.of(slice(None)) + noise, np.ones(SHAPE))
     assert share == pytest.approx(0.7, abs=4 * se)
 
 

@@ -1,5 +1,7 @@
 """Defects and shrinkage of single pixels against their formulas."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -67,22 +69,24 @@ def test_hot_pixels_lie_five_robust_deviations_above_the_median_rise_from_the_sh
 def test_the_levels_of_a_pixel_are_the_posterior_means_of_its_own_linear_model() -> None:
     taken = [series(0.1, 10, 1), series(10.0, 8, 2), series(60.0, 5, 3)]
     values = {"offset_dn": 100.0, "dark_signal_dn_per_s": 0.4, "dsnu_dn2": 9.0, "dcnu_dn2_per_s2": 0.002}
-    noise_dn2: list[NDArray[np.float64] | float] = [48.0 + np.arange(480.0).reshape(24, 20), 56.0, 96.0]
-    pattern = LinePattern(np.linspace(-3, 3, 20)[None, :] + np.zeros((24, 1)), 1.5)
+    own_dn2 = np.arange(480.0).reshape(24, 20)
+    noise_dn2: list[Callable[[slice], NDArray[np.float64] | float]]
+    noise_dn2 = [lambda rows: 48.0 + own_dn2[rows], lambda rows: 56.0, lambda rows: 96.0]
+    pattern = LinePattern(np.zeros(24), np.linspace(-3, 3, 20), 1.5)
     hot = np.zeros((24, 20), bool)
     hot[3, 4] = True
     found = pixel_levels(taken, values, noise_dn2, pattern, hot)
     t = np.array([0.1, 10.0, 60.0])
     design = np.stack([np.ones(3), t], axis=1)
-    means = np.array([one.mean_dn - one.mean_dn.mean(where=~hot) for one in taken]) - pattern.offset_dn
+    means = np.array([one.mean_dn - one.mean_dn.mean(where=~hot) for one in taken]) - pattern.of(slice(None))
     for place, prior in (((5, 6), np.diag([1 / 10.5, 1 / 0.002])), ((3, 4), np.diag([1 / 10.5, 1e-12]))):
         weights = np.diag(np.array([10, 8, 5]) / [48.0 + 20 * place[0] + place[1], 56.0, 96.0])
         covariance = np.linalg.inv(design.T @ weights @ design + prior)
         expected = np.array([100.0, 0.4]) + covariance @ design.T @ weights @ means[:, *place]
-        assert found.offset_dn[place] == pytest.approx(expected[0] + pattern.offset_dn[place], rel=1e-9)
-        assert found.dark_signal_dn_per_s[place] == pytest.approx(expected[1], rel=1e-9)
-        assert found.offset_variance_dn2[place] == pytest.approx(covariance[0, 0], rel=1e-9)
-        assert found.dark_signal_variance_dn2_per_s2[place] == pytest.approx(covariance[1, 1], rel=1e-9)
+        assert found.offset_dn[place] == pytest.approx(expected[0] + pattern.column_dn[place[1]], rel=1e-6)
+        assert found.dark_signal_dn_per_s[place] == pytest.approx(expected[1], rel=1e-6)
+        assert found.offset_variance_dn2[place] == pytest.approx(covariance[0, 0], rel=1e-6)
+        assert found.dark_signal_variance_dn2_per_s2[place] == pytest.approx(covariance[1, 1], rel=1e-6)
 
 
 def test_the_pattern_of_columns_is_shrunk_by_the_chance_of_its_means() -> None:
@@ -96,18 +100,17 @@ def test_the_pattern_of_columns_is_shrunk_by_the_chance_of_its_means() -> None:
     chance = 16 / 64 + 9 / 64 / 8
     kept = 4 / (4 + chance)
     profile = own + offsets.mean(axis=0)
-    np.testing.assert_allclose(found.offset_dn[0], (kept * (profile - profile.mean()))[0], atol=0.4)
+    np.testing.assert_allclose(found.column_dn, (kept * (profile - profile.mean()))[0], atol=0.4)
     assert found.variance_dn2 == pytest.approx(kept * chance, rel=0.2)
-    assert np.ptp(found.offset_dn, axis=0).max() < 1.0, "rows share next to nothing"
+    assert np.ptp(found.row_dn) < 1.0, "rows share next to nothing"
 
 
 def test_without_a_second_exposure_a_hot_pixel_has_the_common_dark_signal() -> None:
     taken = [series(1.0, 10, 1)]
     hot = np.zeros((24, 20), bool)
     hot[3, 4] = True
-    found = pixel_levels(
-        taken, {"offset_dn": 100.0, "dsnu_dn2": 9.0}, [48.0], LinePattern(np.zeros((24, 20)), 0.0), hot
-    )
+    pattern = LinePattern(np.zeros(24), np.zeros(20), 0.0)
+    found = pixel_levels(taken, {"offset_dn": 100.0, "dsnu_dn2": 9.0}, [lambda rows: 48.0], pattern, hot)
     assert found.dark_signal_dn_per_s[3, 4] == pytest.approx(0.0, abs=1e-6)
 
 
@@ -124,7 +127,7 @@ def test_the_response_is_vignetting_times_what_pixels_differ_beyond_noise() -> N
     ]
     usable = np.ones(true.shape, bool)
     usable[100, 100] = False
-    found = measure_response(signals, [noise_dn2, 0.5 * noise_dn2], usable)
+    found = measure_response(signals[0] + signals[1], 1.5 * noise_dn2, usable)
     assert np.argwhere(found.dead).tolist() == [[20, 30]]
     assert found.prnu == pytest.approx(prnu, abs=3 * found.prnu_se)
     # The scatter of the quotients of signal and vignetting is that of PRNU and noise together

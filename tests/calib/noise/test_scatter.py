@@ -1,7 +1,7 @@
 """Intervals grow by the scatter that the series show, and quantities that the series deny have no value."""
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -10,8 +10,8 @@ from scipy import stats
 
 from benchmarks.noise_coverage import CASES, record
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
+from faintfield.calib.noise.likelihood.groups import group_noise
 from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
-from faintfield.calib.noise.misfit.scatter import block_scatter
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 CHIP = {"gain_dn_per_e": 0.5, "read_noise_e": 8.0, "dsnu_e": 3.0, "shape": (40, 40)}
@@ -141,27 +141,32 @@ def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
     sigma[:16] = 3.0
     frames = [(str(k), np.rint(1000 + 20 * sigma * rng.standard_normal((32, 32))).astype(int)) for k in range(30)]
     series = measure_series(frames, Conditions("dark", 1.0))
-    ratio, freedom = block_scatter(series, 400.0, np.ones((32, 32), bool), 2, 1)
+    noise = group_noise(series, np.ones((32, 32), bool), 0.0, (2, 1))
+    ratio, freedom = noise.scatter(noise.blocks, 400.0)
     # Means of columns are subtracted, which carries a little noise from one half to the other.
     assert ratio == pytest.approx([9.0, 1.0], rel=0.15)
     assert freedom == pytest.approx([29 * 512 * (1024 - 63) / 1024] * 2)
 
 
-@pytest.mark.parametrize("blocks", [(8, 8), (41, 1), (1, 30), (3, 7), (3, 40)])
-def test_blocks_are_those_of_single_pixels(blocks: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("kind", ["dark", "flat"])
+@pytest.mark.parametrize("blocks", [(8, 8), (3, 7), (3, 40)])
+def test_groups_are_those_of_single_pixels(kind: Literal["dark", "flat"], blocks: tuple[int, int]) -> None:
     rng = np.random.default_rng(4)
-    frames = [(str(k), np.rint(rng.normal(100, 5, (41, 30)))) for k in range(4)]
-    series, used = measure_series(frames, Conditions("dark", 1.0)), rng.random((41, 30)) < 0.8
-    monkeypatch.setattr("faintfield.calib.noise.strips._STRIP_PX", 100)
-    expected = rng.uniform(20, 30, used.shape)
-    ratio, freedom = block_scatter(series, expected, used, *blocks)
-    of_row, of_column = (np.arange(size) * count // size for size, count in zip(used.shape, blocks, strict=True))
+    level = np.add.outer(np.linspace(100, 900, 41), np.linspace(0, 100, 30))
+    frames = [(str(k), np.rint(rng.normal(level, 5)).astype(np.uint16)) for k in range(4)]
+    series, used = measure_series(frames, Conditions(kind, 1.0)), rng.random((41, 30)) < 0.8
+    noise = group_noise(series, used, 150.0, blocks)
+    # Darks share one noise; that of a flat is straight between the nodes, and no pixel counts as darker than the floor
+    variances = 25.0 if kind == "dark" else 3.0 + 0.1 * noise.nodes_dn
+    expected = np.full((41, 30), 25.0) if kind == "dark" else 3.0 + 0.1 * np.maximum(series.mean_dn, 150.0)
     share = (used.sum() - sum(used.shape) + 1) / used.sum()
-    found = []
-    for row, column in np.ndindex(blocks):
-        inside = used & np.outer(of_row == row, of_column == column)
-        if inside.sum() > 1:
-            found.append(
-                (series.within_dn2[inside].sum() / expected[inside].sum() / 3 / share, 3 * inside.sum() * share)
-            )
-    np.testing.assert_allclose(np.stack([ratio, freedom], axis=1), found, rtol=1e-5)
+    for groups, shape in ((noise.blocks, blocks), (noise.rows, (41, 1)), (noise.columns, (1, 30))):
+        ratio, freedom = noise.scatter(groups, variances)
+        of_row, of_column = (np.arange(size) * count // size for size, count in zip(used.shape, shape, strict=True))
+        found = []
+        for row, column in np.ndindex(shape):
+            inside = used & np.outer(of_row == row, of_column == column)
+            if inside.sum() > 1:
+                squares = series.within_dn2[inside].sum() / expected[inside].sum() / 3 / share
+                found.append((squares, 3 * inside.sum() * share))
+        np.testing.assert_allclose(np.stack([ratio, freedom], axis=1), found, rtol=1e-5)
