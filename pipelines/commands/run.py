@@ -1,21 +1,29 @@
 """`faintfield run`: everything after the capture of a session, only what is out of date."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from faintfield.pipelines.arguments import Count, NotNegative, Positive
-from faintfield.pipelines.choices import LensName, Method, PriorName
+from faintfield.pipelines.arguments import Positive
+from faintfield.pipelines.choices import LensName
 from faintfield.pipelines.commands.geometry import geometry
 from faintfield.pipelines.commands.noise import noise
-from faintfield.pipelines.commands.reconstruct import reconstruct_and_report, surface_and_report
+from faintfield.pipelines.commands.reconstruct import open_set, reconstruct_and_report, surface_and_report
 from faintfield.pipelines.errors import MissingFile, WrongUsage
+from faintfield.pipelines.reconstruction.options import DEFAULTS, OF_PLANES, PLACES, Options
 
 if TYPE_CHECKING:
-    from faintfield.pipelines.reconstruction.request import Request
+    from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
+    from faintfield.pipelines.reconstruction.request import Selection
     from faintfield.pipelines.reconstruction.steps import RunOutcome, Step
-    from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest
+    from faintfield.pipelines.reconstruction.surface_request import SurfaceSelection
+    from faintfield.pipelines.reconstruction.sweep import Runner
 
+
+# The calibrated session, and the folder of its results.
+type Opened = Callable[[], tuple[ElementalSet, Path]]
 
 type Result = RunOutcome
 
@@ -24,90 +32,61 @@ def run(
     session: Path,
     /,
     *,
-    depth_mm: list[Positive] | None = None,
-    sweep_mm: str | None = None,
-    surface: bool = False,
-    depth_range_mm: str | None = None,
-    method: list[Method] | None = None,
-    penalty_weight: NotNegative | None = None,
-    prior: PriorName | None = None,
-    passes: Count | None = None,
-    pitch_mm: Positive | None = None,
+    options: Options = DEFAULTS,
     lens: LensName = "opencv5",
     limit_px: Positive = 0.5,
 ) -> Result:
     """Do everything after the capture: noise, geometry, reconstruction, report; skip what is up to date.
 
     A result is up to date while its input files (by hash), its options and the versions of the software are those that
-    it records. If a step fails, the results of the others are kept.
+    it records. If a step fails, the results of the others are kept. Options of the reconstruction are those of
+    `reconstruct`; planes are by default at the depths under [scene] in the rig.toml.
 
     Parameters
     ----------
     session
         Folder of the session.
-    depth_mm
-        Depth of a plane; repeat it for further planes. By default, the depths under [scene] in the rig.toml.
-    sweep_mm
-        FIRST:LAST:COUNT: COUNT planes in equal steps of depth, with a curve of focus against depth.
-    surface
-        Also reconstruct one picture that is sharp everywhere, with the depth of each pixel, as `reconstruct --surface`
-        does; its files are in reconstructions/surface.
-    depth_range_mm
-        NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
-    method
-        Method of reconstruction, as for `reconstruct`; repeat it for further methods.
-    penalty_weight
-        β of the paper; by default pmlem chooses it by cross-validation, pmlem-osl from the noise level.
-    prior
-        What is expected of a picture, as for `reconstruct`: auto by default, tv for sweeps.
-    passes
-        Largest number of passes over the data.
-    pitch_mm
-        Distance between samples of a plane; by default one detector pixel of the reference view.
     lens
         Distortion model, as for `geometry`.
     limit_px
         Largest accepted standard deviation of the transfer between views, as for `geometry`.
     """
-    from faintfield.pipelines.reconstruction.given_sweeps import swept_depths
-    from faintfield.pipelines.reconstruction.request import (
-        DEFAULT_METHOD,
-        Request,
-        check_prior,
-        chosen_prior,
-        distinct_depths,
-    )
-    from faintfield.pipelines.reconstruction.solutions import Settings
+    # Of `reconstruct`, three options have no place here: --out, as results lie in the session; --geometry, which is
+    # measured; and --scene, as the page is that of the dark scene. The bright one is reconstructed by `reconstruct`
+    from faintfield.pipelines.reconstruction.cluster import make_runner
+    from faintfield.pipelines.reconstruction.request import distinct_depths, select_planes
     from faintfield.pipelines.reconstruction.steps import run_steps
-    from faintfield.pipelines.reconstruction.surface_request import SurfaceRequest, select_surface
+    from faintfield.pipelines.reconstruction.surface_request import select_surface
     from faintfield.rig.session.changes import present_settings
     from faintfield.rig.session.session import has_session
 
     if not has_session(session):
         raise MissingFile(f"{session}: holds no session; name the folder of one, or capture it first")
-    swept = swept_depths(sweep_mm) if sweep_mm else []
-    depths = distinct_depths([*(depth_mm or ([] if swept else present_settings(session).scene.depth_mm)), *swept])
-    settings = Settings(penalty_weight, passes)
-    relief = select_surface(surface, depth_range_mm, None, settings)
-    if not depths and (relief is None or method or pitch_mm or prior):
+    if not options.given(PLACES):
+        options = replace(options, depth_mm=[*present_settings(session).scene.depth_mm])
+    surface = select_surface(options)
+    planes = None
+    if options.given(PLACES):
+        planes = select_planes(options)
+        # A session is in mm: what is wrong with its depths is found before it is calibrated
+        distinct_depths([*planes.depths_mm, *planes.own, *planes.swept_mm, *planes.own_swept])
+    elif surface is None or options.given(OF_PLANES):
         raise WrongUsage(
             "no plane is asked for; give --depth-mm or --sweep-mm FIRST:LAST:COUNT, or state [scene] depth_mm in the "
             "rig.toml before a capture, or give --surface without options of planes"
         )
-    methods = method or [DEFAULT_METHOD]
-    of_planes = replace(settings, prior=chosen_prior(prior, methods, settings, sweeps=bool(swept)))
-    check_prior(methods, of_planes)
-    planes = Request(depths, methods, of_planes, pitch_mm, bool(swept)) if depths else None
-    asked = None if relief is None else SurfaceRequest(relief.range_mm, settings=settings)
-    return run_steps(session, session_steps(session, planes, lens, limit_px, asked))
+    runner = make_runner(options.workers, options.scheduler)
+    return run_steps(session, session_steps(session, planes, surface, runner, lens=lens, limit_px=limit_px))
 
 
 def session_steps(
     session: Path,
-    planes: "Request | None",
+    planes: "Selection | None",
+    surface: "SurfaceSelection | None" = None,
+    runner: "Runner | None" = None,
+    *,
     lens: LensName = "opencv5",
     limit_px: float = 0.5,
-    surface: "SurfaceRequest | None" = None,
 ) -> "list[Step]":
     """Return the steps from a captured session to the planes and the surface that are asked for, in order."""
     from faintfield.pipelines.formats.results.geometry import DEFAULT_DEPTHS_MM, GEOMETRY_FILE
@@ -120,21 +99,23 @@ def session_steps(
 
     # Depths of the rig, not of the request: the geometry stays the same for other planes
     gated_mm = list(present_settings(session).scene.depth_mm or DEFAULT_DEPTHS_MM)
+    opened = cache(lambda: open_set(session))  # not before it is calibrated
+    made = [*_steps_of_planes(session, opened, planes, runner), *_steps_of_surface(session, opened, surface)]
 
     return [
         Step(
             "noise",
-            results={NOISE_FILE: {}},
+            results={NOISE_FILE: dict},
             make=lambda: noise(session),
             inputs=lambda: _frames(session, "dark", "flat"),
         ),
         Step(
             "geometry",
-            results={GEOMETRY_FILE: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
+            results={GEOMETRY_FILE: lambda: {"lens": lens, "depth_mm": gated_mm, "limit_px": limit_px}},
             make=lambda: geometry(session, lens=lens, depth_mm=gated_mm, limit_px=limit_px),
             inputs=lambda: _frames(session, "charuco"),
         ),
-        *(made := [*_steps_of_planes(session, planes), *_steps_of_surface(session, surface)]),
+        *made,
         Step(
             "report",
             results={f"{RECONSTRUCTIONS}/{REPORT_FILE}": None},
@@ -144,47 +125,67 @@ def session_steps(
     ]
 
 
-def _steps_of_planes(session: Path, request: "Request | None") -> "list[Step]":
+def _steps_of_planes(
+    session: Path, opened: "Opened", selection: "Selection | None", runner: "Runner | None"
+) -> "list[Step]":
     """Return the step from a calibrated session to its planes, if any are asked for."""
+    from faintfield.pipelines.formats.reading import read_content
     from faintfield.pipelines.formats.results.overview import OVERVIEW_FILE
-    from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE
-    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
-    from faintfield.pipelines.reconstruction.request import folder_of_method
+    from faintfield.pipelines.formats.results.records import RECONSTRUCTION_FILE, ReconstructionRecord
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene
+    from faintfield.pipelines.formats.units import record_of
+    from faintfield.pipelines.reconstruction.request import folder_of_method, resolve
     from faintfield.pipelines.reconstruction.steps import Step
 
-    if request is None:
+    if selection is None:
         return []
-    folders = {name: folder_of_method(Path(RECONSTRUCTIONS), name, request.methods) for name in request.methods}
+    folders = {folder_of_method(Path(RECONSTRUCTIONS), name, selection.methods): name for name in selection.methods}
+
+    def options(folder: Path) -> object:
+        earlier = record_of(read_content(session / folder / RECONSTRUCTION_FILE), ReconstructionRecord)
+        loaded, out = opened()
+        return resolve(selection, loaded, out, earlier).options(folders[folder], loaded.poses)
+
+    def make() -> object:
+        loaded, out = opened()
+        return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
+
     return [
         Step(
             "reconstruct",
-            results={
-                str(folder / RECONSTRUCTION_FILE): request.options(name, "measured") for name, folder in folders.items()
-            }
+            results={str(folder / RECONSTRUCTION_FILE): partial(options, folder) for folder in folders}
             | {f"{RECONSTRUCTIONS}/{OVERVIEW_FILE}": None},
-            make=lambda: reconstruct_and_report(load_session(session), session / RECONSTRUCTIONS, request),
+            make=make,
             needs=("noise", "geometry"),
             inputs=lambda: files_of_scene(session, "dark_scene"),
         )
     ]
 
 
-def _steps_of_surface(session: Path, request: "SurfaceRequest | None") -> "list[Step]":
+def _steps_of_surface(session: Path, opened: "Opened", selection: "SurfaceSelection | None") -> "list[Step]":
     """Return the step from a calibrated session to its surface, if one is asked for."""
     from faintfield.pipelines.formats.results.surface import SURFACE_FILE
-    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene, load_session
+    from faintfield.pipelines.formats.sets.session_set import RECONSTRUCTIONS, files_of_scene
     from faintfield.pipelines.reconstruction.steps import Step
     from faintfield.pipelines.reconstruction.surface_request import SURFACE_FOLDER
 
-    if request is None:
+    if selection is None:
         return []
-    out = session / RECONSTRUCTIONS
+
+    def options() -> object:
+        loaded, _ = opened()
+        return selection.resolve(loaded).options(loaded.poses)
+
+    def make() -> object:
+        loaded, out = opened()
+        return surface_and_report(loaded, out / SURFACE_FOLDER, selection.resolve(loaded), page_in=out)
+
     return [
         Step(
             "surface",
             command="reconstruct",
-            results={f"{RECONSTRUCTIONS}/{SURFACE_FOLDER}/{SURFACE_FILE}": request.options("measured")},
-            make=lambda: surface_and_report(load_session(session), out / SURFACE_FOLDER, request, page_in=out),
+            results={f"{RECONSTRUCTIONS}/{SURFACE_FOLDER}/{SURFACE_FILE}": options},
+            make=make,
             needs=("noise", "geometry"),
             inputs=lambda: files_of_scene(session, "dark_scene"),
         )

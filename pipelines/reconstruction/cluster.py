@@ -1,8 +1,7 @@
-"""Tasks of a sweep on dask.distributed: in processes of this machine, or by the workers of a scheduler."""
+"""Tasks of a sweep in processes of this machine, or on dask.distributed by the workers of a scheduler."""
 
-import logging
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,7 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.large_arrays import mapped
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout, load_channel
+from faintfield.pipelines.reconstruction.processes import in_processes
 from faintfield.pipelines.reconstruction.sweep import Runner, run_serially
 from faintfield.pipelines.reconstruction.tasks import Channel, PlaneTask, do_task
 from faintfield.recon.likelihood.images import ElementalImages
@@ -41,13 +41,20 @@ def make_runner(workers: int | None, scheduler: str | None) -> Runner:
         return run_serially
     if workers is not None and scheduler is not None:
         raise WrongUsage("--workers starts processes here, --scheduler names one that has its own; give one of them")
-    _distributed()
+    if scheduler is not None:
+        _distributed()
 
     def run(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
         if not tasks:
             return
-        with _client(workers, scheduler) as client, _shared_folder(out) as shared:
-            yield from _as_done(client, loaded, shared, tasks)
+        with _shared_folder(out) as shared:
+            if scheduler is None:
+                jobs = list(_jobs(loaded, shared, tasks))
+                for job, messages in in_processes(workers or 1, _do, jobs):
+                    yield job.task, messages
+            else:
+                with _client(scheduler) as client:
+                    yield from _as_done(client, _jobs(loaded, shared, tasks))
 
     return run
 
@@ -59,24 +66,15 @@ def _distributed() -> Any:
     except ImportError as failure:
         raise MissingPackage(
             "dask.distributed is not installed; it is an extra: pip install 'faintfield[cluster]', or leave out "
-            "--workers and --scheduler"
+            "--scheduler"
         ) from failure
     return distributed
 
 
 @contextmanager
-def _client(workers: int | None, scheduler: str | None) -> Iterator[Any]:
-    """Connect to the workers; start them if they are those of this machine."""
+def _client(scheduler: str) -> Iterator[Any]:
+    """Connect to the workers of a scheduler."""
     distributed = _distributed()
-    if scheduler is None:
-        options = {"dashboard_address": "127.0.0.1:0", "memory_limit": 0, "silence_logs": logging.CRITICAL}
-        one_thread = {"NUMBA_NUM_THREADS": "1"}
-        with (
-            distributed.LocalCluster(workers, threads_per_worker=1, env=one_thread, **options) as cluster,
-            distributed.Client(cluster) as client,
-        ):
-            yield client
-        return
     try:
         client = distributed.Client(scheduler)
     except (OSError, ValueError) as failure:
@@ -97,41 +95,6 @@ def _shared_folder(out: Path) -> Iterator[Path]:
         )
     with folder as name:
         yield Path(name)
-
-
-def _as_done(
-    client: Any, loaded: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]
-) -> Generator[tuple[PlaneTask, list[str]]]:
-    """Submit the tasks and yield each when it is done; those of a worker that dies go to another."""
-    distributed = _distributed()
-    colours: dict[str, _Colour] = {}
-    pending: dict[Any, PlaneTask] = {}
-    try:
-        for task in tasks:
-            for layout in task.layouts:
-                if layout.name not in colours:
-                    colours[layout.name] = _share(loaded, layout, shared)
-            elsewhere = replace(
-                task, files=tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
-            )
-            needed = [colours[layout.name] for layout in task.layouts]
-            pending[client.submit(_do, needed, elsewhere, pure=False)] = task
-        for future in distributed.as_completed(list(pending)):
-            messages = future.result()
-            future.release()  # otherwise it would be computed again if its worker died
-            yield pending.pop(future), messages
-    except distributed.KilledWorker as failure:
-        raise ClusterFailed(f"{failure.allowed_failures + 1} workers died of the same plane; {_LOST}") from failure
-    except FileNotFoundError as failure:
-        raise ClusterFailed(
-            f"a worker does not find {failure.filename}; give --out a folder that all workers see under the same path"
-        ) from failure
-    except CancelledError as failure:
-        raise ClusterFailed(f"the scheduler went away with {len(pending)} tasks to be done; {_LOST}") from failure
-    finally:
-        client.cancel(list(pending))
-        if client.status == "running":
-            client.run(_opened.cache_clear)
 
 
 @dataclass(frozen=True)
@@ -163,6 +126,50 @@ class _Colour:
     def pixels(self, dtype: DTypeLike) -> Path:
         """Return the path of the pixels of a data type: float32 electrons, or whether each is valid."""
         return self.path.with_suffix(f".{np.dtype(dtype).name}")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A task with the files of its colours."""
+
+    task: PlaneTask
+    colours: tuple[_Colour, ...]
+
+
+def _jobs(loaded: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]) -> Iterator[_Job]:
+    """Return what workers do for each task; the images of a colour are written when the first task needs them."""
+    colours: dict[str, _Colour] = {}
+    for task in tasks:
+        for layout in task.layouts:
+            if layout.name not in colours:
+                colours[layout.name] = _share(loaded, layout, shared)
+        elsewhere = tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
+        yield _Job(replace(task, files=elsewhere), tuple(colours[layout.name] for layout in task.layouts))
+
+
+def _as_done(client: Any, jobs: Iterable[_Job]) -> Generator[tuple[PlaneTask, list[str]]]:
+    """Submit the jobs and yield the task of each when it is done; those of a worker that dies go to another."""
+    distributed = _distributed()
+    pending: dict[Any, PlaneTask] = {}
+    try:
+        for job in jobs:
+            pending[client.submit(_do, job, pure=False)] = job.task
+        for future in distributed.as_completed(list(pending)):
+            messages = future.result()
+            future.release()  # otherwise it would be computed again if its worker died
+            yield pending.pop(future), messages
+    except distributed.KilledWorker as failure:
+        raise ClusterFailed(f"{failure.allowed_failures + 1} workers died of the same plane; {_LOST}") from failure
+    except FileNotFoundError as failure:
+        raise ClusterFailed(
+            f"a worker does not find {failure.filename}; give --out a folder that all workers see under the same path"
+        ) from failure
+    except CancelledError as failure:
+        raise ClusterFailed(f"the scheduler went away with {len(pending)} tasks to be done; {_LOST}") from failure
+    finally:
+        client.cancel(list(pending))
+        if client.status == "running":
+            client.run(_opened.cache_clear)
 
 
 def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
@@ -202,7 +209,7 @@ def _opened(colour: _Colour) -> Channel:
     return Channel(loaded, colour.layout, ElementalImages(electrons, valid=valid, **maps))
 
 
-def _do(colours: Sequence[_Colour], task: PlaneTask) -> list[str]:
+def _do(job: _Job) -> list[str]:
     """Do a task on a worker."""
-    by_name = {colour.layout.name: colour for colour in colours}
-    return do_task(task, lambda layout: _opened(by_name[layout.name]))
+    by_name = {colour.layout.name: colour for colour in job.colours}
+    return do_task(job.task, lambda layout: _opened(by_name[layout.name]))

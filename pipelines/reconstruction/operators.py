@@ -1,6 +1,6 @@
 """The samples of planes, and the operator H of a plane or of several, from the poses, lens and response of a set."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,12 +8,13 @@ from numpy.typing import NDArray
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray, ray_from_surface
 from faintfield.pipelines.formats.frames import Lattice
-from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane
+from faintfield.pipelines.formats.plane_poses import Place, TiltedPlane, depth_of
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.recon.errors import GeometryMismatch
-from faintfield.recon.likelihood.images import ElementalImages, binned
+from faintfield.recon.likelihood.images import ElementalImages, Image, binned
 from faintfield.recon.operator.grid import PlaneGrid
+from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.operator.surface_operator import SurfaceOperator
@@ -141,22 +142,19 @@ class OperatorFactory:
         matrices = np.repeat(matrices, self._phases, axis=0)
         return SurfaceOperator(matrices, self._rays, grid, inverse_depth, **self._shared())
 
-    def of_scene(
-        self, grids: Mapping[Place, PlaneGrid], transmission: NDArray[np.float32] | None = None
-    ) -> SceneOperator:
+    def of_scene(self, grids: Mapping[Place, PlaneGrid], opacities: Sequence[Image] | None = None) -> SceneOperator:
         """Return H of all planes together, in the order of `grids`.
 
         Parameters
         ----------
         grids : mapping of Place to PlaneGrid
             The samples of each plane.
-        transmission : float array (plane, view, row, column), optional
-            Share of each plane's light that reaches each pixel; 1 by default.
+        opacities : sequence of float array (row, column), optional
+            What each plane hides of those behind it, 0 to 1; nothing by default.
         """
         homographies = np.stack([self._homographies(place) for place in grids])
-        return SceneOperator(
-            homographies, self._rays, list(grids.values()), transmission=transmission, **self._shared()
-        )
+        occluders = None if opacities is None else Occluders(opacities, [depth_of(place) for place in grids])
+        return SceneOperator(homographies, self._rays, list(grids.values()), occluders=occluders, **self._shared())
 
     def _homographies(self, place: Place) -> NDArray[np.float64]:
         """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""

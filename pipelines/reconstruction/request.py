@@ -1,9 +1,8 @@
-"""What `reconstruct` is asked for: its options select planes, are checked, and are resolved for a set."""
+"""What `reconstruct` and `run` are asked for: their options select planes, are checked, and are resolved for a set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 from msgspec import UNSET
 
@@ -16,12 +15,14 @@ from faintfield.pipelines.formats.results.records import (
     Method,
     Poses,
     ReconstructionOptions,
+    ReconstructionRecord,
 )
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.formats.sets.stated import plane_stem
-from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, sweep_of_range
+from faintfield.pipelines.reconstruction.autofocus import best_focus, found_range_mm, searched_range_mm, sweep_of_range
 from faintfield.pipelines.reconstruction.given_sweeps import swept, swept_depths
 from faintfield.pipelines.reconstruction.operators import check_in_front
+from faintfield.pipelines.reconstruction.options import PLACES, Options
 from faintfield.pipelines.reconstruction.solutions import PriorName, Settings
 
 DEFAULT_METHOD: Method = "pmlem"
@@ -73,6 +74,8 @@ class Request:
         Planes given by a pose.
     found : BestFocusRecord, optional
         How the depths were found, if they were.
+    auto_sweep : int, optional
+        How many depths `--sweep auto` found, the last ones; None if it was not asked for.
     """
 
     depths_mm: list[float]
@@ -84,14 +87,16 @@ class Request:
     disparities_px: dict[float, float] = field(default_factory=dict)
     tilted: list[TiltedPlane] = field(default_factory=list)
     found: BestFocusRecord | None = None
+    auto_sweep: int | None = None
 
     def of_plane(self, method: Method, place: Place) -> "Request":
         """Return the part of the request that one plane depends on: all planes for methods that solve them together."""
+        alone = replace(self, with_depth_map=False, auto_sweep=None)
         if method in JOINT_METHODS:
-            return replace(self, with_depth_map=False)
+            return alone
         if isinstance(place, TiltedPlane):
-            return replace(self, with_depth_map=False, depths_mm=[], tilted=[place])
-        return replace(self, with_depth_map=False, depths_mm=[place], tilted=[])
+            return replace(alone, depths_mm=[], tilted=[place])
+        return replace(alone, depths_mm=[place], tilted=[])
 
     def options(self, method: Method, poses: Poses) -> ReconstructionOptions:
         """Return the options that the results of a method record."""
@@ -108,6 +113,7 @@ class Request:
             passes=self.settings.passes,
             pitch_mm=self.pitch_mm,
             focus=self.with_focus,
+            auto_sweep=UNSET if self.auto_sweep is None else self.auto_sweep,
             depth_map=("px" if self.disparities_px else "mm") if self.with_depth_map else None,
             plane_pose={plane.name: [*plane.rt_ref_plane, *(plane.size_mm or ())] for plane in self.tilted},
             poses=poses,
@@ -153,70 +159,65 @@ class Selection:
     auto_sweep: bool = False
 
 
-def select_planes(
-    depth: Sequence[float | Literal["auto"]],
-    sweep: str | None,
-    depth_mm: Sequence[float | Literal["auto"]],
-    sweep_mm: str | None,
-    disparity_px: Sequence[float],
-    sweep_px: str | None,
-    plane_pose: Sequence[Path],
-    *,
-    depth_map: bool,
-    methods: list[Method],
-    settings: Settings,
-    pitch_mm: float | None,
-) -> Selection:
-    """Return the planes that the options of `reconstruct` select.
+def settings_of(options: Options) -> Settings:
+    """Return the settings that options give, the prior of a surface unless they name one."""
+    weight = None if options.penalty_weight == "auto" else options.penalty_weight
+    return Settings(
+        *(weight, options.passes, options.likelihood, options.penalty, options.uncertainty),
+        *(options.prior or "tv", options.proposal),
+    )
+
+
+def select_planes(options: Options) -> Selection:
+    """Return the planes that options select.
 
     Raises
     ------
     WrongUsage, InputError
         They select none, contradict one another, would have no effect, or name a file that cannot be read.
     """
-    if not (depth or sweep or depth_mm or sweep_mm or disparity_px or sweep_px or plane_pose):
+    if not options.given(PLACES):
         raise WrongUsage(
             "no plane is asked for; give --depth auto, --sweep auto, --depth-mm, --sweep-mm FIRST:LAST:COUNT, "
             "--disparity-px, --sweep-px or --plane-pose"
         )
-    auto = "auto" in [*depth, *depth_mm]
-    if auto and (sweep == "auto" or depth_map):
-        option = (
-            "--sweep auto makes all planes of a range" if sweep == "auto" else "--depth-map compares those of a sweep"
-        )
-        raise WrongUsage(f"{option}, and --depth-mm auto leaves few; give --sweep alone")
+    own, depths_mm = options.depth or [], options.depth_mm or []
+    auto = "auto" in [*own, *depths_mm]
+    methods = _methods(options)
+    settings = settings_of(options)
+    if options.prior is None:
+        sweeps = bool(options.sweep or options.sweep_mm or options.sweep_px) and not auto
+        settings = replace(settings, prior=_default_prior(methods, settings, sweeps=sweeps))
     selection = Selection(
-        depths_mm=[depth for depth in depth_mm if depth != "auto"],
-        swept_mm=swept_depths(sweep_mm) if sweep_mm else [],
-        disparities_px=list(disparity_px),
-        swept_px=swept("--sweep-px", sweep_px, "-3.5:0.8:40") if sweep_px else [],
-        tilted=read_plane_poses(plane_pose),
+        depths_mm=[depth for depth in depths_mm if depth != "auto"],
+        swept_mm=swept_depths(options.sweep_mm) if options.sweep_mm else [],
+        disparities_px=options.disparity_px or [],
+        swept_px=swept("--sweep-px", options.sweep_px, "-3.5:0.8:40") if options.sweep_px else [],
+        tilted=read_plane_poses(options.plane_pose or []),
         auto=auto,
-        own=[value for value in depth if value != "auto"],
-        own_swept=swept("--sweep", sweep, "400:900:64") if sweep and sweep != "auto" else [],
-        auto_sweep=sweep == "auto",
-        depth_map=depth_map,
+        own=[depth for depth in own if depth != "auto"],
+        own_swept=swept("--sweep", options.sweep, "400:900:64") if options.sweep not in (None, "", "auto") else [],
+        auto_sweep=options.sweep == "auto",
+        depth_map=options.depth_map,
         methods=methods,
         settings=settings,
-        pitch_mm=pitch_mm,
+        pitch_mm=options.pitch_mm,
     )
+    _check_depths(selection)
     _check_methods(selection, methods, settings)
     check_prior(methods, settings)
     return selection
 
 
-def selected_methods(given: list[Method], *, joint: bool, occlusion: bool) -> list[Method]:
-    """Return the methods given by name or by an option of their own, the default if there are none."""
-    by_option: dict[Method, bool] = {"joint": joint, "occlusion": occlusion}
-    return [*given, *(name for name, wanted in by_option.items() if wanted)] or [DEFAULT_METHOD]
+def _methods(options: Options) -> list[Method]:
+    """Return the methods given by name or by an option of their own, each once; the default if there are none."""
+    by_option: dict[Method, bool] = {"joint": options.joint, "occlusion": options.occlusion}
+    given = [*(options.method or []), *(name for name, wanted in by_option.items() if wanted)]
+    return list(dict.fromkeys(given)) or [DEFAULT_METHOD]
 
 
-def chosen_prior(
-    given: PriorName | None, methods: Sequence[Method], settings: Settings, *, sweeps: bool = False
-) -> PriorName:
-    """Return the prior as given; else auto, or tv where a prior has no effect or, in a sweep, would take long."""
-    if given is not None:
-        return given
+def _default_prior(methods: Sequence[Method], settings: Settings, *, sweeps: bool) -> PriorName:
+    """Return auto, or tv where a prior has no effect or, in a sweep, would take long."""
     helps = settings.penalty == "tv" and settings.penalty_weight != 0 and bool(_WITH_PRIOR & set(methods))
     return "auto" if helps and not sweeps else "tv"
 
@@ -236,6 +237,25 @@ def check_prior(methods: list[Method], settings: Settings) -> None:
         raise WrongUsage(f"{option} starts from total variation, not from --penalty {settings.penalty}; leave one out")
 
 
+def _check_depths(selection: Selection) -> None:
+    """Refuse depths beside those that are found, and too few for a depth map (WrongUsage)."""
+    if selection.auto and (selection.auto_sweep or selection.depth_map):
+        option = (
+            "--sweep auto makes all planes of a range"
+            if selection.auto_sweep
+            else "--depth-map compares those of a sweep"
+        )
+        raise WrongUsage(f"{option}, and --depth-mm auto leaves few; give --sweep alone")
+    single = [*selection.own, *selection.depths_mm, *selection.disparities_px]
+    if selection.auto and single:
+        raise WrongUsage("--depth-mm auto finds all depths; give others in a call of their own")
+    count = len({*single, *selection.own_swept, *selection.swept_mm, *selection.swept_px})
+    if selection.depth_map and not selection.auto_sweep and count < _MIN_DEPTHS_OF_A_MAP:
+        raise WrongUsage(
+            f"--depth-map compares depths, and {count} are given; give at least {_MIN_DEPTHS_OF_A_MAP}, by --sweep"
+        )
+
+
 def _check_methods(selection: Selection, methods: list[Method], settings: Settings) -> None:
     """Refuse options that contradict one another or would have no effect (WrongUsage)."""
     if selection.tilted and "occlusion" in methods:
@@ -249,10 +269,13 @@ def _check_methods(selection: Selection, methods: list[Method], settings: Settin
         raise WrongUsage(f"{option} is for pmlem, joint and occlusion, not for {' and '.join(methods)}; leave it out")
 
 
-def resolve(selection: Selection, loaded: ElementalSet, out: Path) -> Request:
+def resolve(
+    selection: Selection, loaded: ElementalSet, out: Path, earlier: ReconstructionRecord | None = None
+) -> Request:
     """Return the request for a set: disparities become depths, and `auto` the depths that are found.
 
-    `out` is for a temporary file while depths are searched.
+    `out` is for a temporary file while depths are searched. Nothing is searched if the record of an `earlier` result is
+    given: depths are then those that it has by the same search, or none.
 
     Raises
     ------
@@ -266,29 +289,38 @@ def resolve(selection: Selection, loaded: ElementalSet, out: Path) -> Request:
     depths = [*selection.depths_mm, *selection.swept_mm, *of_disparity]
     found = None
     if selection.auto:
-        if selection.depths_mm or selection.disparities_px:
-            raise WrongUsage(
-                "--depth-mm auto finds all depths; give others in a call of their own, with the same --out"
-            )
-        found = best_focus(loaded, out, (min(depths), max(depths)) if depths else None)
-        depths, of_disparity = found.depth_mm, {}
-    elif selection.auto_sweep:
-        depths = [*depths, *sweep_of_range(loaded, found_range_mm(loaded, out))]
-    if selection.depth_map and (count := len(distinct_depths(depths, loaded))) < _MIN_DEPTHS_OF_A_MAP:
-        raise WrongUsage(
-            f"--depth-map compares depths, and {count} are given; give at least {_MIN_DEPTHS_OF_A_MAP}, by --sweep"
-        )
+        range_mm = (min(depths), max(depths)) if depths else None
+        if earlier is None:
+            found = best_focus(loaded, out, range_mm)
+        else:
+            found = _found_earlier(earlier, range_mm or searched_range_mm(loaded))
+        depths, of_disparity = found.depth_mm if found else [], {}
+    swept_mm: list[float] = []
+    if selection.auto_sweep:
+        if earlier is None:
+            swept_mm = sweep_of_range(loaded, found_range_mm(loaded, out))
+        elif earlier.options.auto_sweep and earlier.options.depth_mm:
+            swept_mm = earlier.options.depth_mm[-earlier.options.auto_sweep :]
+        depths = [*depths, *swept_mm]
     return Request(
-        depths,
+        distinct_depths(depths, loaded),
         selection.methods,
         selection.settings,
         selection.pitch_mm,
-        with_focus=bool(selection.swept_mm or selection.swept_px or selection.auto_sweep) and found is None,
+        with_focus=bool(selection.swept_mm or selection.swept_px or selection.auto_sweep) and not selection.auto,
         with_depth_map=selection.depth_map,
         disparities_px=of_disparity if len(of_disparity) == len(depths) else {},
         tilted=selection.tilted,
         found=found,
+        auto_sweep=len(swept_mm) if selection.auto_sweep else None,
     )
+
+
+def _found_earlier(earlier: ReconstructionRecord, range_mm: tuple[float, float]) -> BestFocusRecord | None:
+    """Return the depths of an earlier search of a range, None if that of a result was another."""
+    found = earlier.best_focus
+    near_mm, far_mm = sorted(range_mm)
+    return found if found and found.searched_mm[0] == (near_mm, far_mm) else None
 
 
 def _refuse_mm(selection: Selection, loaded: ElementalSet) -> None:

@@ -25,8 +25,9 @@ class Step:
     ----------
     name : str
         Its name in messages.
-    results : dict of str to mapping or msgspec.Struct
-        The options of each result file, if it is up to date; None if it records none.
+    results : dict of str to callable
+        Returns the options of each result file, a mapping or Struct, if it is up to date; None if it records none. It
+        is called when the file exists and the steps that this one needs are done.
     make : callable
         Does it.
     needs : tuple of str
@@ -38,7 +39,7 @@ class Step:
     """
 
     name: str
-    results: Mapping[str, object | None]
+    results: Mapping[str, Callable[[], object] | None]
     make: Callable[[], object]
     needs: tuple[str, ...] = ()
     inputs: Callable[[], Sequence[str]] = tuple
@@ -130,7 +131,7 @@ def _out_of_date(session: Path, step: Step, hashes: Hashes) -> str | None:
         if options is None:
             continue
         try:
-            now = provenance(step.command or step.name, options, inputs)
+            now = provenance(step.command or step.name, options(), inputs)
             difference = first_difference(read_content(session / file), now)
         except (MissingFile, *JSON_FAILURES):
             return f"{file} is damaged"

@@ -1,7 +1,7 @@
-"""What `reconstruct --surface` is asked for."""
+"""What `--surface` is asked for."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from msgspec import UNSET
@@ -10,7 +10,8 @@ from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.results.records import Poses
 from faintfield.pipelines.formats.results.surface import SurfaceOptions
 from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
-from faintfield.pipelines.reconstruction.request import check_prior
+from faintfield.pipelines.reconstruction.options import Options
+from faintfield.pipelines.reconstruction.request import check_prior, settings_of
 from faintfield.pipelines.reconstruction.solutions import Settings
 
 # Folder of the surface among the results of a session.
@@ -90,22 +91,16 @@ class SurfaceSelection:
         return SurfaceRequest((near_mm, far_mm), "px", self.settings, self.filtered)
 
 
-def select_surface(
-    wanted: bool,
-    depth_range_mm: str | None,
-    disparity_range_px: str | None,
-    settings: Settings,
-    *,
-    filtered: bool = True,
-) -> SurfaceSelection | None:
-    """Return the surface that options select, None if none is `wanted`.
+def select_surface(options: Options) -> SurfaceSelection | None:
+    """Return the surface that options select, None if they ask for none.
 
     Raises
     ------
     WrongUsage
         A range is no range, two are given, or one although no surface is wanted; or a prior does not suit.
     """
-    if not wanted:
+    depth_range_mm, disparity_range_px = options.depth_range_mm, options.disparity_range_px
+    if not options.surface:
         if depth_range_mm or disparity_range_px:
             raise WrongUsage("a range of depths or disparities is that of a surface; add --surface")
         return None
@@ -118,8 +113,9 @@ def select_surface(
             f"--depth-range-mm {depth_range_mm}: depths are positive, and at most {_FARTHEST_MM:.0f} mm; give "
             "NEAR:FAR, such as 400:1500"
         )
+    settings = replace(settings_of(options), uncertainty=False)  # of planes: a surface has its own always
     check_prior(["pmlem"], settings)
-    return SurfaceSelection(range_mm, range_px, settings, filtered)
+    return SurfaceSelection(range_mm, range_px, settings, filtered=options.prior is None)
 
 
 def _ends(option: str, given: str, example: str) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from faintfield.pipelines.commands.simulate import simulate
 from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile, write_set
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
+from faintfield.pipelines.reconstruction.options import Options
 from faintfield.rig.simulation.experiment import paper_experiment
 from tests.simulated_boards import simulate_board_set
 
@@ -38,7 +39,7 @@ def test_measured_poses_are_as_good_as_true_ones_and_nominal_ones_are_not(tmp_pa
 
 
 def mean_square_error(scene: Path, out: Path, measured_in: Path | None, poses: str) -> float:
-    result = reconstruct(scene, out=out, depth_mm=[500.0], method=["pmlem-osl"], geometry=measured_in)
+    result = reconstruct(scene, options=Options(depth_mm=[500.0], method=["pmlem-osl"]), out=out, geometry=measured_in)
     assert result.metrics is not None
     (row,) = result.metrics.planes
     assert row.poses == poses

@@ -11,7 +11,8 @@ from faintfield.pipelines.formats.results.records import Metrics
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.paper.demo import true_set, write_truth
 from faintfield.pipelines.reconstruction.accuracy import assess
-from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+from faintfield.pipelines.reconstruction.options import Options
+from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, select_planes
 from faintfield.pipelines.reconstruction.run import reconstruct_set
 from faintfield.pipelines.reconstruction.steps import run_steps
 from tests.pipelines.sessions import captured, rig_toml
@@ -38,12 +39,11 @@ RIGS = {
 def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Path) -> None:
     camera, checks = RIGS[name]
     session = captured(tmp_path, rig_toml(camera=f"{camera}\n{_BRIGHT_ENOUGH}", checks=checks))
-    request = Request([_DEPTH_MM], [DEFAULT_METHOD])
-    run_steps(session, session_steps(session, request))
+    run_steps(session, session_steps(session, select_planes(Options(depth_mm=[_DEPTH_MM], prior="tv"))))
     truth = write_truth(tmp_path / "truth", session, 1.0)
     plane = session / "reconstructions" / f"{plane_name(_DEPTH_MM)}.tiff"
     measured = error(assess(load_session(session), {(DEFAULT_METHOD, _DEPTH_MM): plane}, truth))
-    exact = reconstruct_set(true_set(session, truth), tmp_path / "true", request).out
+    exact = reconstruct_set(true_set(session, truth), tmp_path / "true", Request([_DEPTH_MM], [DEFAULT_METHOD])).out
     best = error(assess(true_set(session, truth), {(DEFAULT_METHOD, _DEPTH_MM): Path(exact) / plane.name}, truth))
     # Of a mosaic, a quarter of the pixels see each of two colours
     assert measured < (0.04 if "mosaic" in camera else 0.02)

@@ -21,6 +21,7 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.board_set import load_board_set
 from faintfield.pipelines.formats.sets.session_set import load_session
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.options import Options
 from faintfield.rig.errors import SessionCorrupt
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.session.verify import verify
@@ -58,7 +59,7 @@ def test_the_geometry_of_a_session_is_where_its_camera_was(session: Path) -> Non
 
 
 def test_what_was_measured_goes_out_to_other_programs(session: Path, tmp_path: Path) -> None:
-    run(session, depth_mm=[700.0], passes=5)
+    run(session, options=Options(depth_mm=[700.0], passes=5))
     export_mrcal(session, tmp_path / "mrcal")
     export_colmap(session, tmp_path / "colmap")
     entries = json.loads((session / "geometry.json").read_text())["nodes"]
@@ -81,10 +82,10 @@ def test_a_session_without_boards_is_told_from_one_whose_frames_are_gone(recorde
 def test_what_is_missing_is_named_with_the_command_that_makes_it(recorded: Path, tmp_path: Path) -> None:
     session = Path(shutil.copytree(recorded, tmp_path / "copy"))
     with pytest.raises(MissingFile, match=r"geometry.json: no such file; run `faintfield geometry"):
-        reconstruct(session, depth_mm=[500.0])
+        reconstruct(session, options=Options(depth_mm=[500.0]))
     (session / "geometry.json").write_text("{}")
     with pytest.raises(MissingFile, match=r"noise.json: no such file; run `faintfield noise"):
-        reconstruct(session, depth_mm=[500.0])
+        reconstruct(session, options=Options(depth_mm=[500.0]))
     with pytest.raises(BadValue, match=r"no bright frame of the centre node \[1, 1\]"):
         load_session(session, "bright")
     next((session / "frames").glob("*_dark_scene_0_r0_c2_*")).unlink()
@@ -96,7 +97,7 @@ class TestRun:
     """`faintfield run`: only what is out of date, by hash."""
 
     def ran(self, session: Path, depth_mm: float = 500.0) -> list[str]:
-        return [step.step for step in run(session, depth_mm=[depth_mm], passes=5).steps if step.ran]
+        return [step.step for step in run(session, options=Options(depth_mm=[depth_mm], passes=5)).steps if step.ran]
 
     def test_exactly_the_dependent_steps_run_again(self, recorded: Path, tmp_path: Path) -> None:
         session = Path(shutil.copytree(recorded, tmp_path / "copy"))
@@ -187,14 +188,16 @@ class TestRun:
         with monkeypatch.context() as patch:
             patch.setattr("faintfield.pipelines.pages.report.write_report", interrupted)
             with pytest.raises(KeyboardInterrupt):
-                run(copy, depth_mm=[700.0], passes=4)
-        assert [step.step for step in run(copy, depth_mm=[700.0], passes=4).steps if step.ran] == ["report"]
+                run(copy, options=Options(depth_mm=[700.0], passes=4))
+        assert [step.step for step in run(copy, options=Options(depth_mm=[700.0], passes=4)).steps if step.ran] == [
+            "report"
+        ]
 
     def test_another_lens_is_another_geometry(self, session: Path, tmp_path: Path) -> None:
         copy = Path(shutil.copytree(session, tmp_path / "copy"))
-        assert run(copy, depth_mm=[700.0], passes=5, lens="opencv4").steps[1].ran
+        assert run(copy, options=Options(depth_mm=[700.0], passes=5), lens="opencv4").steps[1].ran
         assert json.loads((copy / "geometry.json").read_text())["lens"]["model"] == "opencv4"
-        assert not run(copy, depth_mm=[700.0], passes=5, lens="opencv4").steps[1].ran
+        assert not run(copy, options=Options(depth_mm=[700.0], passes=5), lens="opencv4").steps[1].ran
 
     def test_what_fails_leaves_the_rest_and_says_how_to_go_on(
         self, recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -217,12 +220,12 @@ class TestRun:
 
     def test_a_folder_without_a_session_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(MissingFile, match="holds no session"):
-            run(tmp_path, depth_mm=[500.0])
+            run(tmp_path, options=Options(depth_mm=[500.0]))
 
 
 def test_a_session_is_verified_with_its_results(recorded: Path, session: Path, tmp_path: Path) -> None:
     assert verify_all(recorded).results is None
-    run(session, depth_mm=[700.0], passes=5)
+    run(session, options=Options(depth_mm=[700.0], passes=5))
     found = verify_all(session)
     assert found.session is not None
     assert found.results is not None

@@ -15,6 +15,7 @@ from faintfield.pipelines.commands.verify import verify
 from faintfield.pipelines.errors import WrongUsage
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.sessions import captured, rig_toml
 from tests.pipelines.surfaces import FOUND_MM, Searches
@@ -26,7 +27,7 @@ RANGE = "400:900"
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session with noise, geometry and one plane, to be read only."""
     session = captured(tmp_path_factory.mktemp("calibrated"), rig_toml())
-    run(session, depth_mm=[700.0], method=["backprojection"], penalty_weight=0.5, passes=2)
+    run(session, options=Options(depth_mm=[700.0], method=["backprojection"], penalty_weight=0.5, passes=2))
     return session
 
 
@@ -38,7 +39,8 @@ def session(calibrated: Path, tmp_path: Path) -> Path:
 
 def _ran(session: Path, *, depth_mm: list[float] | None = None, depth_range_mm: str = RANGE) -> list[str]:
     planes: dict[str, Any] = {"depth_mm": depth_mm, "method": ["backprojection"]} if depth_mm else {}
-    outcome = run(session, surface=True, depth_range_mm=depth_range_mm, penalty_weight=0.5, passes=2, **planes)
+    asked = Options(surface=True, depth_range_mm=depth_range_mm, penalty_weight=0.5, passes=2, **planes)
+    outcome = run(session, options=asked)
     return [step.step for step in outcome.steps if step.ran]
 
 
@@ -76,7 +78,7 @@ def test_a_surface_alone_is_enough(seen: Searches, session: Path) -> None:
 
 
 def test_run_and_reconstruct_make_the_same_surface(seen: Searches, session: Path) -> None:
-    reconstruct(session, surface=True, depth_range_mm=RANGE, penalty_weight=0.5, passes=2)
+    reconstruct(session, options=Options(surface=True, depth_range_mm=RANGE, penalty_weight=0.5, passes=2))
     assert _ran(session) == []
     assert not (session / "reconstructions" / "surface" / "report.html").exists()
 
@@ -112,8 +114,8 @@ def test_planes_are_kept_if_no_surface_is_found(seen: Searches, session: Path, m
 
 def test_options_without_effect_are_wrong_usage(calibrated: Path) -> None:
     with pytest.raises(WrongUsage, match="add --surface"):
-        run(calibrated, depth_mm=[500.0], depth_range_mm=RANGE)
+        run(calibrated, options=Options(depth_mm=[500.0], depth_range_mm=RANGE))
     with pytest.raises(WrongUsage, match="or give --surface"):
         run(calibrated)
     with pytest.raises(WrongUsage, match="without options of planes"):
-        run(calibrated, surface=True, method=["mlem"])
+        run(calibrated, options=Options(surface=True, method=["mlem"]))

@@ -1,0 +1,127 @@
+"""Options of planes and surfaces, of `reconstruct` and of `run`, apart from the code that makes these: for help."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+
+from faintfield.pipelines.arguments import Count, NotNegativeOrAuto, Positive
+from faintfield.pipelines.choices import Method, PriorName
+from faintfield.recon.names import LikelihoodName, PenaltyName
+
+# Options that say where planes are, and all that a surface does not know.
+PLACES = ("depth", "sweep", "depth_mm", "sweep_mm", "disparity_px", "sweep_px", "plane_pose")
+OF_PLANES = (
+    *PLACES,
+    *("depth_map", "method", "joint", "occlusion", "uncertainty", "pitch_mm", "workers", "scheduler"),
+)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to reconstruct, and how.
+
+    Parameters
+    ----------
+    depth
+        Depth of a plane in the unit of the set (mm, relative, or px of disparity); repeat it for further planes. auto:
+        find the depths of the objects by comparing the views, in the range of a sweep if given, else in that which
+        the import found, else at all depths that the views share; refused if shuffled views agree as well.
+    sweep
+        FIRST:LAST:COUNT in the unit of the set: COUNT planes in equal steps, with a curve of focus against depth. auto:
+        the range in which the views agree, in steps of half a pixel of the outermost view, at most 96 planes.
+    depth_mm
+        Depth of a plane in mm, for sets with a scale; or auto, as above.
+    sweep_mm
+        FIRST:LAST:COUNT in mm, for sets with a scale.
+    disparity_px
+        Plane by disparity instead of depth: how many pixels a point of the plane moves from one node to the next, right
+        or down; negative for near points, unless the pictures are aligned on a nearer plane.
+    sweep_px
+        FIRST:LAST:COUNT: a sweep in equal steps of disparity instead of depth, such as -3.5:0.8:40.
+    plane_pose
+        TOML file of planes of any pose, each with a name and either rt_ref_plane or point_mm and normal.
+    depth_map
+        Also compute, in the range of the sweep, the depth of each pixel, the probability that it is right, and an
+        all-in-focus picture.
+    surface
+        Instead of planes (`run`: beside them), reconstruct one picture of the scene from the reference view, sharp
+        everywhere, with the depth of each pixel and how sure both are: picture.tiff, depth_mm.tiff, surface.ply and
+        others, see docs/results.md. For a session, its folder is reconstructions/surface by default.
+    depth_range_mm
+        NEAR:FAR: range of the surface's depths, such as 400:1500. By default it is found by comparing the views.
+    disparity_range_px
+        NEAR:FAR: the same by disparity, such as -3.6:1; depths are then written as disparities, disparity_px.tiff.
+    method
+        pmlem (the default; iterates to a certified optimum), joint or occlusion (pmlem for all planes together),
+        pmlem-osl or mlem (the iterations of the paper), or backprojection; repeat it for further methods.
+    joint
+        Short for --method joint: solve all planes together, so that no plane shows the blur of objects in another.
+    occlusion
+        Short for --method occlusion: solve all planes together, with nearer objects hiding farther ones.
+    penalty_weight
+        β of the paper, in the unit of the number of views. auto: for pmlem, the weight that best predicts held-out
+        views; for pmlem-osl, a weight computed from the noise level.
+    penalty
+        Penalty of pmlem on differences between neighbouring samples: total variation (tv), total variation with small
+        differences squared (huber-tv), squared differences (quadratic), or none.
+    likelihood
+        Noise model of a pixel. auto: poisson-gaussian (exact) for read noise below 3 electrons, shifted-poisson
+        (faster) above. poisson ignores read noise; least-squares assumes Gaussian noise of fixed variance.
+    uncertainty
+        Save the standard deviation of each sample beside the planes of pmlem, joint and occlusion; see
+        docs/results.md for how often its intervals hold.
+    prior
+        What is expected of a picture. tv: little, and total variation alone decides. patches: that small patches of it
+        repeat. learned: what a small network was trained with. auto: whichever of these predicts held-out views best,
+        mixed. Less noise and more detail remain, and the data keep the last word: see docs/physics.md. By default auto
+        for pmlem, joint and occlusion, but tv for sweeps, which take several times as long with auto. A
+        surface without this option has the picture of tv with detail added by a filter of patches.
+    proposal
+        Save, beside each plane or the picture of a surface, what the prior proposed, and in standard deviations how far
+        the data moved it.
+    passes
+        Largest number of passes over the data.
+    pitch_mm
+        Distance between samples of a plane; by default one detector pixel of the reference view.
+    workers
+        Number of processes, of one thread each, that make the planes.
+    scheduler
+        Address of a dask scheduler whose workers make the planes; they must see OUT under the same path. Needs the
+        extra faintfield[cluster].
+    """
+
+    depth: Annotated[list[float | Literal["auto"]] | None, Parameter(allow_leading_hyphen=True)] = None
+    sweep: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
+    depth_mm: list[float | Literal["auto"]] | None = None
+    sweep_mm: str | None = None
+    disparity_px: list[float] | None = None
+    sweep_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
+    plane_pose: list[Path] | None = None
+    depth_map: bool = False
+    surface: bool = False
+    depth_range_mm: str | None = None
+    disparity_range_px: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
+    method: list[Method] | None = None
+    joint: bool = False
+    occlusion: bool = False
+    penalty_weight: NotNegativeOrAuto = "auto"
+    penalty: PenaltyName = "tv"
+    likelihood: LikelihoodName | Literal["auto"] = "auto"
+    uncertainty: bool = False
+    prior: PriorName | None = None
+    proposal: bool = False
+    passes: Count | None = None
+    pitch_mm: Positive | None = None
+    workers: Count | None = None
+    scheduler: str | None = None
+
+    def given(self, names: Sequence[str]) -> list[str]:
+        """Return those of some options that are given, as a user writes them."""
+        return [f"--{name.replace('_', '-')}" for name in names if getattr(self, name)]
+
+
+DEFAULTS = Options()

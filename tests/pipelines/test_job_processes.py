@@ -1,0 +1,200 @@
+"""Jobs in processes of this machine: as many as asked for, each job done once, and nothing left over."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from faintfield.pipelines.errors import ClusterFailed
+from faintfield.pipelines.reconstruction.processes import in_processes
+from faintfield.recon import compiling
+from tests.patience import HANG_S
+
+
+def _wait_until(reached: Callable[[], bool]) -> None:
+    """Poll, for things that another process does."""
+    give_up = time.monotonic() + HANG_S
+    while not reached():
+        assert time.monotonic() < give_up
+        time.sleep(0.01)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def _own_id(_: object) -> int:
+    return os.getpid()
+
+
+def _meet(folder: Path, name: str) -> int:
+    """Return when another process is at a job, too."""
+    (folder / name).touch()
+    _wait_until(lambda: len([*folder.iterdir()]) == 2)
+    return os.getpid()
+
+
+def _die(folder: Path, times: int, job: int) -> int:
+    """Die at job 1, as nothing can be caught; the first times only."""
+    if job == 1 and len(deaths := [*folder.iterdir()]) < times:
+        (folder / str(len(deaths))).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return job**2
+
+
+def _refuse(job: int) -> int:
+    if job == 1:
+        raise ValueError(f"no {job}")
+    return job
+
+
+def _unsendable(_: object) -> object:
+    raise _Unsendable(lambda: None)
+
+
+class _Unsendable(Exception):
+    """A failure that cannot be pickled."""
+
+
+def _announce(_: object) -> None:
+    for announce in compiling.on_compiling:
+        announce()
+
+
+def _sleep_for_good(folder: Path, _: object) -> None:
+    (folder / str(os.getpid())).touch()
+    signal.pause()
+
+
+def _python(code: str, folder: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run code in an interpreter of its own."""
+    found = {**os.environ, "PYTHONPATH": os.pathsep.join(it for it in sys.path if it), **environment}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=found, capture_output=True, text=True, timeout=HANG_S
+    )
+
+
+def test_one_process_does_all_jobs_in_their_order() -> None:
+    found = list(in_processes(1, _own_id, range(5)))
+    assert [job for job, _ in found] == [0, 1, 2, 3, 4]
+    assert len({process for _, process in found}) == 1
+    assert os.getpid() not in {process for _, process in found}
+
+
+def test_two_processes_work_at_the_same_time(tmp_path: Path) -> None:
+    assert len({process for _, process in in_processes(2, partial(_meet, tmp_path), ["one", "other"])}) == 2
+
+
+def test_no_more_processes_than_jobs_and_none_without_jobs() -> None:
+    begun = in_processes(64, _own_id, range(2))
+    next(begun)
+    assert len(multiprocessing.active_children()) <= 2
+    assert len(list(begun)) == 1
+    assert list(in_processes(2, _own_id, [])) == []
+
+
+def test_a_process_has_one_thread_and_ours_keeps_all() -> None:
+    """In an interpreter of its own, since it has one process that all others are copied from, with its environment."""
+    code = (
+        "import os, numba\n"
+        "from faintfield.pipelines.reconstruction.processes import in_processes\n"
+        "before = dict(os.environ), numba.config.NUMBA_NUM_THREADS\n"
+        "asked = \"__import__('numba').config.NUMBA_NUM_THREADS\", "
+        "\"__import__('os').environ['OPENBLAS_NUM_THREADS']\"\n"
+        "print([result for _, result in in_processes(1, eval, asked)])\n"
+        "assert (dict(os.environ), numba.config.NUMBA_NUM_THREADS) == before"
+    )
+    done = _python(code, OPENBLAS_NUM_THREADS="2")
+    assert done.stdout == "[1, '1']\n", done.stderr
+
+
+def test_the_job_of_a_process_that_dies_is_done_by_another(tmp_path: Path) -> None:
+    found = list(in_processes(2, partial(_die, tmp_path, 3), range(6)))
+    assert sorted(found) == [(job, job**2) for job in range(6)]
+    assert len([*tmp_path.iterdir()]) == 3
+
+
+def test_four_deaths_of_one_job_end_the_work(tmp_path: Path) -> None:
+    with pytest.raises(ClusterFailed, match="4 processes died of the same plane"):
+        list(in_processes(2, partial(_die, tmp_path, 100), range(3)))
+    assert len([*tmp_path.iterdir()]) == 4
+
+
+def test_a_failure_comes_with_its_traceback_and_ends_the_processes() -> None:
+    with pytest.raises(ValueError, match="no 1") as failure:
+        list(in_processes(1, _refuse, range(3)))
+    assert "in _refuse" in failure.value.__notes__[0]
+    assert not multiprocessing.active_children()
+
+
+def test_an_abandoned_work_leaves_no_process() -> None:
+    begun = in_processes(2, _own_id, range(4))
+    _, process = next(begun)
+    begun.close()
+    assert not multiprocessing.active_children()
+    assert not _alive(process)
+
+
+def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(compiling, "on_compiling", [lambda: said.append("compiling")])
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.processes.on_compiling", compiling.on_compiling)
+    assert len(list(in_processes(2, _announce, range(4)))) == 4
+    assert said == ["compiling"]
+
+
+def test_processes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
+    script = (
+        "from functools import partial; from pathlib import Path; from tests.pipelines import test_job_processes as t\n"
+        f"if __name__ == '__main__': list(t.in_processes(2, partial(t._sleep_for_good, Path({str(tmp_path)!r})), 'ab'))"
+    )
+    command = subprocess.Popen([sys.executable, "-c", script])
+    try:
+        _wait_until(lambda: len([*tmp_path.iterdir()]) == 2)
+    finally:
+        command.kill()
+        command.wait()
+    processes = [int(path.name) for path in tmp_path.iterdir()]
+    _wait_until(lambda: not any(_alive(process) for process in processes))
+
+
+def test_no_module_of_the_current_folder_is_run(tmp_path: Path) -> None:
+    """In a process of its own, since a session has one process that all others are copied from."""
+    (tmp_path / "numba.py").write_text("open('run', 'w')")
+    code = (
+        "import sys; sys.path[:] = [it for it in sys.path if it]\n"
+        "from faintfield.pipelines.reconstruction.processes import in_processes\n"
+        "if __name__ == '__main__': print(list(in_processes(1, abs, [-3])))"
+    )
+    done = _python(code, tmp_path)
+    assert done.stdout == "[(-3, 3)]\n", done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_whose_name_is_too_long_for_a_socket_is_named(tmp_path: Path) -> None:
+    folder = tmp_path / ("long" * 30)
+    folder.mkdir()
+    code = (
+        "from faintfield.pipelines.errors import ClusterFailed\n"
+        "from faintfield.pipelines.reconstruction.processes import in_processes\n"
+        "try: list(in_processes(1, abs, [-3]))\n"
+        "except ClusterFailed as failure: print(failure)"
+    )
+    done = _python(code, TMPDIR=str(folder))
+    assert "TMPDIR" in done.stdout, done.stderr
+
+
+def test_what_cannot_be_sent_is_told_as_it_is() -> None:
+    with pytest.raises(RuntimeError, match="_Unsendable"):
+        list(in_processes(1, _unsendable, [0, 1]))
