@@ -17,6 +17,7 @@ COMMANDS: dict[Group, tuple[str, ...]] = {
     _AT_THE_RIG: (
         "init rig.toml",
         "check rig.toml --remember",
+        "plan rig.toml --light-e 0.97 --sigma-e 0.3 --exposures-ms 50 100 --grids 5x5 7x7",
         "board boards.pdf --paper A3 --boards 3",
         "capture rig.toml session --page",
         "verify session",

@@ -54,7 +54,8 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     from faintfield.pipelines.formats.toml_files import write_toml
     from faintfield.pipelines.pages.report import write_report
     from faintfield.pipelines.paper.demo import FULL, QUICK, demo_metrics, demo_rig, true_set, write_truth
-    from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request
+    from faintfield.pipelines.reconstruction.options import Options
+    from faintfield.pipelines.reconstruction.request import DEFAULT_METHOD, Request, select_planes
     from faintfield.pipelines.reconstruction.steps import run_steps
     from faintfield.pipelines.simulation.synthetic_set import NOISE_FREE
 
@@ -67,7 +68,8 @@ def demo(out: Path = Path("demo"), /, *, quick: bool = False, snr: Positive = 0.
     )
     capture(out / "rig.toml", session, yes=True)
     depths = list(settings.scene.depth_mm)
-    run_steps(session, session_steps(session, Request(depths, _METHODS)))
+    asked = Options(depth_mm=[*depths], method=_METHODS, prior="tv")
+    run_steps(session, session_steps(session, select_planes(asked)))
     inform("looking up the truth, and reconstructing with it and without any measured poses, for comparison")
     truth = write_truth(out / "truth", session, snr)
     reconstruct_and_report(load_set(truth / NOISE_FREE), out / "noise-free", Request(depths, ["backprojection"]))

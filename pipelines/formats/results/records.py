@@ -247,6 +247,7 @@ class ReconstructionOptions(Struct, frozen=True):
     passes: int | UnsetType | None = UNSET
     pitch_mm: float | UnsetType | None = UNSET
     focus: bool | UnsetType = UNSET
+    auto_sweep: Count | UnsetType = UNSET
     depth_map: Literal["mm", "px", "relative"] | UnsetType | None = UNSET
     plane_pose: dict[str, list[float]] | UnsetType = UNSET
     poses: Poses = "stated"

@@ -1,0 +1,1 @@
+"""What a capture will show, before it is made."""

@@ -1,0 +1,156 @@
+"""The light of a scene before the capture: stated, or estimated from a frame."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from faintfield.pipelines.errors import BadValue, WrongUsage
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.planning.known import Sensor
+
+# Two-sided 95 % of the normal distribution.
+_WITHIN = 1.96
+
+# Largest part of saturated pixels whose light is still that of the others.
+_MOST_SATURATED = 0.01
+
+# Part of a frame's larger side around its middle that is taken of a flat, to either side.
+_OF_FLAT = 20
+
+
+@dataclass(frozen=True)
+class Light:
+    """Light of the scene in electrons per pixel and second, and where it is from."""
+
+    e_per_s: Measured
+    source: str
+
+
+@dataclass(frozen=True)
+class GivenLight:
+    """The light as options give it: exactly one of the first four.
+
+    Attributes
+    ----------
+    e, e_per_s : float, optional
+        Electrons per pixel in one frame, or in a second.
+    flat, test_frame : Path, optional
+        A frame of even light, and one of the scene.
+    exposure_s : float, optional
+        That of the frame; by default what its file states.
+    region_px : (int, int, int, int), optional
+        Left column, upper row, width and height of the object in the frame; by default the middle of a flat, or all
+        of a test frame.
+    """
+
+    e: float | None = None
+    e_per_s: float | None = None
+    flat: Path | None = None
+    test_frame: Path | None = None
+    exposure_s: float | None = None
+    region_px: tuple[int, int, int, int] | None = None
+
+    def resolve(self, exposure_s: float, sensor: Sensor) -> Light:
+        """Return the light.
+
+        Parameters
+        ----------
+        exposure_s : float
+            Exposure of the frame that `e` is of.
+        sensor : Sensor
+            That took the frame.
+
+        Raises
+        ------
+        WrongUsage
+            None or several are given.
+        InputError
+            The frame cannot be used, or shows no light.
+        """
+        given = [it for it in (self.e, self.e_per_s, self.flat, self.test_frame) if it is not None]
+        if len(given) != 1:
+            raise WrongUsage(
+                f"{len(given)} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or "
+                "--test-frame"
+            )
+        if (path := self.flat or self.test_frame) is not None:
+            return _light_of_frame(path, self, sensor)
+        if (self.exposure_s, self.region_px) != (None, None):
+            raise WrongUsage("--frame-exposure-ms and --region-px are those of a frame; give --test-frame or --flat")
+        per_s = self.e_per_s if self.e is None else self.e / exposure_s
+        return Light(Measured(per_s), "as stated")
+
+
+def _light_of_frame(path: Path, given: GivenLight, sensor: Sensor) -> Light:
+    """Return the light of a frame, with its interval: by the noise of its pixels, and by that of the calibration."""
+    frame = read_frame(path)
+    exposure_s = given.exposure_s or frame.exposure_s
+    if exposure_s is None:
+        raise BadValue(f"{path}: states no exposure time; give --frame-exposure-ms")
+    if frame.pixels_dn.ndim != 2:
+        raise BadValue(f"{path}: is a colour picture; give a grey or raw frame as the sensor counts it")
+    height, width = frame.pixels_dn.shape
+    model, unusable = sensor.of_frame((width, height), str(path))
+    where = _region(path, given, width, height)
+    usable = ~unusable[where]
+    saturated = model.saturated(frame.pixels_dn)[where] & usable
+    if not usable.any() or saturated.sum() > _MOST_SATURATED * usable.sum():
+        raise BadValue(
+            f"{path}: {saturated.sum()} of {usable.sum()} usable pixels are saturated, at most "
+            f"{_MOST_SATURATED:.0%} may be; expose it for less than {1e3 * exposure_s:g} ms"
+        )
+    usable &= ~saturated
+    count = int(usable.sum())
+    shape = frame.pixels_dn.shape
+    dark_e = np.broadcast_to(model.background_e(exposure_s), shape)[where][usable]
+    electrons = model.electrons(frame.pixels_dn)[where][usable]
+    light_e = float(np.mean(electrons, dtype=np.float64) - np.mean(dark_e))
+    known_e2 = float(np.mean(dark_e) + np.mean(model.read_variance_e2()))
+    variance_e2 = (max(light_e, 0.0) + known_e2) / count + _variance_of_calibration(sensor, light_e, exposure_s)
+    margin_e = _WITHIN * variance_e2**0.5
+    low_e, high_e = light_e - margin_e, light_e + margin_e
+    if low_e <= 0:
+        raise BadValue(
+            f"{path}: shows {light_e:.3g} e⁻ per pixel (95 %: {low_e:.3g} to {high_e:.3g}), which may be none; "
+            f"expose it for longer than {1e3 * exposure_s:g} ms"
+        )
+    part = "its middle" if given.flat is not None and given.region_px is None else f"{count} pixels"
+    measured = "" if sensor.record is not None else ", the sensor's numbers taken as exact"
+    source = f"{path.name}, {1e3 * exposure_s:g} ms, mean of {part}{measured}"
+    ends = low_e / exposure_s, high_e / exposure_s
+    return Light(Measured(light_e / exposure_s, margin_e / _WITHIN / exposure_s, ends), source)
+
+
+def _region(path: Path, given: GivenLight, width: int, height: int) -> tuple[slice, slice]:
+    """Return rows and columns of a frame that count."""
+    if given.region_px is not None:
+        left, upper, wide, high = given.region_px
+        if min(left, upper) < 0 or min(wide, high) < 1 or left + wide > width or upper + high > height:
+            raise BadValue(
+                f"{path}: --region-px {left} {upper} {wide} {high} is not within its {width} x {height} px; give left "
+                "column, upper row, width and height"
+            )
+        return slice(upper, upper + high), slice(left, left + wide)
+    if given.flat is None:
+        return slice(None), slice(None)
+    near = max(width, height) // _OF_FLAT + 1
+    row, column = height // 2, width // 2
+    return slice(max(row - near, 0), row + near), slice(max(column - near, 0), column + near)
+
+
+def _variance_of_calibration(sensor: Sensor, light_e: float, exposure_s: float) -> float:
+    """Return the variance in e⁻² of a mean `(dn − offset)/gain − D t` by its calibration, with the frame's jitter."""
+    record, gain = sensor.record, sensor.gain_dn_per_e.value
+    if record is None or gain is None:
+        return 0.0
+    charge_e = light_e + (record.dark_current_e_per_s.value or 0.0) * exposure_s
+    slopes = {"offset_dn": -1 / gain, "gain_dn_per_e": -charge_e / gain, "dark_current_e_per_s": -exposure_s}
+    jitter_e = (record.frame_jitter_dn.value or 0.0) / gain
+    names = record.covariance.names
+    if slopes.keys() <= {*names}:
+        slope = np.array([slopes.get(name, 0.0) for name in names])
+        return float(slope @ np.array(record.covariance.matrix) @ slope) + jitter_e**2
+    errors = [slope * (getattr(record, name).se or 0.0) for name, slope in slopes.items()]
+    return float(np.square(errors).sum()) + jitter_e**2

@@ -1,0 +1,388 @@
+"""Predict what a capture will show, of a rig.toml and of others like it: exposures, grids, frames at a node."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.errors import WrongUsage
+from faintfield.pipelines.formats.results.noise_fit import Measured
+from faintfield.pipelines.formats.results.prediction import (
+    Alternative,
+    DepthPrediction,
+    FeaturePrediction,
+    PredictionRecord,
+)
+from faintfield.pipelines.planning.known import KnownLens, KnownPace, Sensor, plan_over
+from faintfield.pipelines.planning.light import Light
+from faintfield.recon.metrics import expected_snr_from_powers
+from faintfield.recon.prediction import (
+    depth_resolution_mm,
+    depth_sigma_mm,
+    information_of_views,
+    sample_sigma_e,
+    smallest_contrast,
+)
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
+from faintfield.rig.plan import MAX_EXPOSURE_S, CapturePlan, Grid, centre_node, check_frame_count, grid_nodes
+from faintfield.rig.settings import RigSettings
+from faintfield.rig.stages.protocol import Point
+
+# Longest table; more rows are a typing error.
+_MAX_ROWS = 500
+
+_NO_DEPTH = "no depth; give --depth-mm, or depth_mm under [scene] of the rig.toml"
+
+
+class View(NamedTuple):
+    """What is added up to one view: all frames of a node."""
+
+    exposure_s: float
+    frames: int
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is asked for.
+
+    Attributes
+    ----------
+    depths_mm : sequence of float
+        Depths of planes; none if not known.
+    sides_px : sequence of float
+        Sides of features.
+    blur_px : float, optional
+        Standard deviation of the lens's blur.
+    rose_k : float
+        Standard deviations by which a visible feature stands out.
+    exposures_s, grids, frames : sequence
+        Of the table: exposure times, rows and columns, and frames at a node; those of the rig.toml if empty.
+    sigma_e : float, optional
+        Largest σ of a sample that is wanted, in electrons of a frame of the rig.toml.
+    """
+
+    depths_mm: Sequence[float]
+    sides_px: Sequence[float]
+    blur_px: float | None
+    rose_k: float
+    exposures_s: Sequence[float]
+    grids: Sequence[tuple[int, int]]
+    frames: Sequence[int]
+    sigma_e: float | None
+
+
+def grids_of(words: Sequence[str]) -> list[tuple[int, int]]:
+    """Return rows and columns of words such as 5x7."""
+    found = []
+    for word in words:
+        parts = re.fullmatch(r"(\d{1,4})x(\d{1,4})", word)
+        if parts is None or min(int(part) for part in parts.groups()) < 1:
+            raise WrongUsage(f"--grids {word}: is no grid; give ROWSxCOLUMNS, such as 5x7")
+        found.append((int(parts[1]), int(parts[2])))
+    return found
+
+
+def scene_view(settings: RigSettings, exposures_s: Sequence[float]) -> tuple[float, View]:
+    """Return the exposure of one frame of the dark scene, and the view that the frames of a node add up to.
+
+    Raises
+    ------
+    WrongUsage
+        The rig.toml has no dark scene, and no exposure is asked for.
+    """
+    taken = [
+        exposure_s
+        for step in settings.steps()
+        if step.kind == "dark_scene"
+        for exposure_s in step.exposure_s * step.frames_per_node
+    ]
+    if not taken and not exposures_s:
+        raise WrongUsage("the rig.toml has no dark_scene step; add one, or give --exposures-ms")
+    taken = taken or [exposures_s[0]]
+    return taken[0], View(sum(taken), len(taken))
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Predicts from what is known.
+
+    Attributes
+    ----------
+    settings, sensor, lens, pace, light
+        What is known of the rig and the scene; for the pace a reason if it is not known.
+    question : Question
+        What is asked for.
+    """
+
+    settings: RigSettings
+    sensor: Sensor
+    lens: KnownLens
+    pace: KnownPace | str
+    light: Light
+    question: Question
+
+    @cached_property
+    def pixel_share(self) -> float:
+        """Part of the pixels that have the scarcest colour."""
+        measured = self.sensor.record.mosaic if self.sensor.record is not None else None
+        filters = "".join(self.settings.mosaic or measured or "X")
+        return min(filters.count(letter) for letter in filters) / len(filters)
+
+    def record(self, rig: str, exposure_s: float, view: View) -> PredictionRecord:
+        """Return the whole prediction; `exposure_s` is that of a frame, `view` all frames of a node."""
+        grid, question = self.settings.grid, self.question
+        rows = self._alternatives(exposure_s, view)
+        reaching = [row for row in rows if _reaches(row, question.sigma_e)]
+        return PredictionRecord(
+            rig=rig,
+            rows=grid.rows,
+            columns=grid.columns,
+            pitch_mm=grid.pitch_mm,
+            exposure_s=exposure_s,
+            total_exposure_s=view.exposure_s,
+            frames_per_node=view.frames,
+            noise_from=self.sensor.source,
+            read_noise_e=self.sensor.read_noise_e,
+            dark_current_e_per_s=self.sensor.dark_current_e_per_s,
+            light_from=self.light.source,
+            light_e=_with(lambda light: light * exposure_s, self.light.e_per_s),
+            photons=_with(
+                lambda light, qe: light * exposure_s / qe, self.light.e_per_s, self.sensor.quantum_efficiency
+            ),
+            pixel_share=self.pixel_share,
+            snr=self._snr(view),
+            snr_linear=_finite(
+                self._from_light(view, lambda light, _, noise: light / noise**2 if noise > 0 else math.inf)
+            ),
+            vignetting=None if self.lens.response is not None else "no flats in the noise calibration",
+            rose_k=question.rose_k,
+            depths=[self._depth(view, grid, depth_mm) for depth_mm in question.depths_mm or (None,)],
+            time_s=self._duration(grid, None, None)[0],
+            alternatives=rows,
+            wanted_sigma_e=question.sigma_e,
+            cheapest=min(reaching, key=lambda row: row.time_s.value or 0.0, default=None),
+        )
+
+    def _from_light(self, view: View, compute: Callable[[float, float, float], float]) -> Measured:
+        """Return a number computed from light, dark electrons and read noise of a view, all in electrons."""
+
+        def of_view(light_e_per_s: float, read_noise_e: float, dark_e_per_s: float) -> float:
+            dark_e = max(dark_e_per_s, 0.0) * view.exposure_s
+            gain = self.sensor.gain_dn_per_e.value
+            rounding_e2 = 0.0 if gain is None else 1 / (12 * gain**2)
+            noise_e = (view.frames * (read_noise_e**2 + rounding_e2)) ** 0.5
+            return compute(light_e_per_s * view.exposure_s, dark_e, noise_e)
+
+        return _with(of_view, self.light.e_per_s, self.sensor.read_noise_e, self.sensor.dark_current_e_per_s)
+
+    def _snr(self, view: View) -> Measured:
+        """Return eq. (4) of a view of a uniform object."""
+
+        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
+            if dark_e == noise_e == 0:
+                return math.inf
+            return expected_snr_from_powers(np.array([light_e]), dark_e, noise_e)
+
+        return _finite(self._from_light(view, compute))
+
+    def _depth(self, view: View, grid: Grid, depth_mm: float | None) -> DepthPrediction:
+        """Return the prediction of a plane."""
+        centres_mm, response = self._views(grid, depth_mm)
+        depth = Measured(depth_mm) if depth_mm is not None else Measured(None, why=_NO_DEPTH)
+        scale = _with(lambda z, f: z / f, depth, self.lens.f_px)
+        blur_px = self._blur()
+        aperture_mm = grid.pitch_mm * (max(grid.rows, grid.columns) - 1)
+        step = Measured(None, why="one node has no aperture")
+        if aperture_mm > 0:
+            step = _with(lambda z, f: depth_resolution_mm(z, f, aperture_mm), depth, self.lens.f_px)
+        return DepthPrediction(
+            depth_mm=depth_mm,
+            views=int(np.count_nonzero(response)),
+            seen_by_all_mm=self._seen_by_all_mm(grid, scale.value),
+            sigma_e=self._sigma(view, response),
+            mm_per_px=scale,
+            blur_mm=_with(lambda blur, mm: blur * mm, blur_px, scale),
+            depth_step_mm=step,
+            features=[
+                self._feature(view, centres_mm, response, side_px, depth, scale) for side_px in self.question.sides_px
+            ],
+        )
+
+    def _feature(
+        self,
+        view: View,
+        centres_mm: NDArray[np.float64],
+        response: NDArray[np.float64],
+        side_px: float,
+        depth: Measured,
+        scale: Measured,
+    ) -> FeaturePrediction:
+        """Return what is predicted of a square."""
+        blur_px = self.question.blur_px or 0.0
+        contrast = self._contrast(view, response, side_px)
+
+        def depth_sigma(light_e: float, dark_e: float, noise_e: float) -> float:
+            information = self.pixel_share * information_of_views(light_e, dark_e, noise_e, response)
+            black = {"side_px": side_px, "difference_e": light_e, "blur_px": blur_px}
+            return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
+
+        unknown = next((it for it in (depth, self.lens.f_px) if it.value is None), None)
+        if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
+            unknown = Measured(None, why="one view tells no depth")
+        if unknown is None and contrast.value is not None and contrast.value > 1:
+            unknown = Measured(None, why="even a black square is not visible")
+        return FeaturePrediction(
+            side_px=side_px,
+            side_mm=_with(lambda mm: side_px * mm, scale),
+            smallest_contrast=contrast,
+            depth_sigma_mm=unknown or self._from_light(view, depth_sigma),
+        )
+
+    def _contrast(self, view: View, response: NDArray[np.float64], side_px: float) -> Measured:
+        """Return the contrast from which a square is visible."""
+        k, blur_px = self.question.rose_k, self.question.blur_px or 0.0
+
+        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
+            information = self._information(light_e, dark_e, noise_e, response)
+            return smallest_contrast(side_px, light_e, information, k=k, blur_px=blur_px)
+
+        return self._from_light(view, compute)
+
+    def _sigma(self, view: View, response: NDArray[np.float64], exposure_s: float | None = None) -> Measured:
+        """Return σ of a sample in electrons of a view, or of an exposure."""
+        count = int(np.count_nonzero(response))
+        unit = 1.0 if exposure_s is None else exposure_s / view.exposure_s
+
+        def compute(light_e: float, dark_e: float, noise_e: float) -> float:
+            return unit * sample_sigma_e(self._information(light_e, dark_e, noise_e, response), count)
+
+        return self._from_light(view, compute)
+
+    def _information(self, light_e: float, dark_e: float, noise_e: float, response: NDArray[np.float64]) -> float:
+        """Return the information of all views about a sample."""
+        return self.pixel_share * float(information_of_views(light_e, dark_e, noise_e, response).sum())
+
+    def _views(self, grid: Grid, depth_mm: float | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the cameras' places (view, 2) relative to the reference camera, and the response of each view."""
+        nodes = np.array(grid_nodes(grid.rows, grid.columns)) - centre_node(grid.rows, grid.columns)
+        centres_mm = grid.pitch_mm * nodes[:, ::-1].astype(float)
+        return centres_mm, self.lens.responses(centres_mm, depth_mm)
+
+    def _seen_by_all_mm(self, grid: Grid, mm_per_px: float | None) -> tuple[float, float] | None:
+        """Return width and height of the part of a plane that all views see."""
+        if mm_per_px is None or self.lens.size_px is None:
+            return None
+        width, height = self.lens.size_px
+        wide = width * mm_per_px - (grid.columns - 1) * grid.pitch_mm
+        high = height * mm_per_px - (grid.rows - 1) * grid.pitch_mm
+        return max(wide, 0.0), max(high, 0.0)
+
+    def _blur(self) -> Measured:
+        """Return the lens's blur in pixels."""
+        if self.question.blur_px is not None:
+            return Measured(self.question.blur_px)
+        return Measured(None, why="nothing measures the lens's blur, none is assumed; --blur-px states it")
+
+    def _alternatives(self, exposure_s: float, view: View) -> list[Alternative]:
+        """Return the rows of the table."""
+        question, grid = self.question, self.settings.grid
+        exposures_s = question.exposures_s or (exposure_s,)
+        grids = question.grids or ((grid.rows, grid.columns),)
+        alike = math.isclose(view.exposure_s, view.frames * exposure_s)
+        frames = question.frames or (view.frames if alike else 1,)
+        if (count := len(exposures_s) * len(grids) * len(frames)) > _MAX_ROWS:
+            raise WrongUsage(f"the table has {count} rows, at most {_MAX_ROWS}; give fewer exposures, grids or frames")
+        return [self._alternative(*row, exposure_s) for row in product(grids, exposures_s, frames)]
+
+    def _alternative(self, shape: tuple[int, int], exposure_s: float, frames: int, reference_s: float) -> Alternative:
+        """Return a row of the table."""
+        if not 0 < exposure_s <= MAX_EXPOSURE_S:
+            raise WrongUsage(
+                f"--exposures-ms {1e3 * exposure_s:g}: an exposure lasts {1e3 * MAX_EXPOSURE_S:g} ms at most; give "
+                "shorter ones"
+            )
+        try:
+            check_frame_count(shape[0] * shape[1] * frames)
+            grid = _about_the_centre(self.settings.grid, shape)
+            total_s, scene_s, why_not = self._duration(grid, exposure_s, frames)
+        except ValueError as failure:
+            raise WrongUsage(str(failure)) from failure
+        view = View(frames * exposure_s, frames)
+        responses = [self._views(grid, depth_mm)[1] for depth_mm in self.question.depths_mm or (None,)]
+        fewest = min(responses, key=lambda response: float(np.square(response).sum()))
+        return Alternative(
+            exposure_s=exposure_s,
+            rows=shape[0],
+            columns=shape[1],
+            frames_per_node=frames,
+            snr=self._snr(view),
+            sigma_e=self._sigma(view, fewest, reference_s),
+            smallest_contrast=self._contrast(view, fewest, self.question.sides_px[0]),
+            scene_s=scene_s,
+            time_s=total_s,
+            why_not=why_not,
+        )
+
+    def _duration(
+        self, grid: Grid, exposure_s: float | None, frames: int | None
+    ) -> tuple[Measured, Measured, str | None]:
+        """Return the duration of the session and of its dark scene, and why it cannot be done."""
+        pace = self.pace
+        plan = plan_over(self.settings, grid, exposure_s, frames)
+        if isinstance(pace, str):
+            unknown = Measured(None, why=pace)
+            return unknown, unknown, None
+        plan = msgspec.structs.replace(plan, settle_s=self.settings.settle.wait_s, readout_s=pace.readout_s)
+        scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
+        whole, part = (Measured(it.duration_s(pace.motion, pace.feed_mm_per_s)) for it in (plan, scene))
+        return whole, part, _why_not(plan, pace)
+
+
+def _why_not(plan: CapturePlan, pace: KnownPace) -> str | None:
+    """Return why the stage cannot go along a plan's path."""
+    try:
+        plan.check(pace.workspace)
+    except (OutsideTravel, KeepOutCrossed) as failure:
+        return str(failure)
+    return None
+
+
+def _about_the_centre(grid: Grid, shape: tuple[int, int]) -> Grid:
+    """Return a grid of other rows and columns, of the same pitch and with the same centre node."""
+    rows, columns = shape
+    row, column = centre_node(rows, columns)
+    centre = grid.centre().target
+    origin_mm = Point(centre.x_mm - column * grid.pitch_mm, centre.y_mm - row * grid.pitch_mm)
+    return msgspec.structs.replace(grid, rows=rows, columns=columns, origin_mm=origin_mm)
+
+
+def _reaches(row: Alternative, sigma_e: float | None) -> bool:
+    """Return whether a row reaches a σ, as far as is known, and can be done in a known time."""
+    found = row.sigma_e.value
+    known = sigma_e is not None and found is not None and row.time_s.value is not None
+    return known and row.why_not is None and found <= sigma_e  # type: ignore[operator]
+
+
+def _finite(snr: Measured) -> Measured:
+    """Return an SNR, unknown if there is no noise to compare with."""
+    return Measured(None, why="there is no noise to compare with") if snr.value == math.inf else snr
+
+
+def _with(compute: Callable[..., float], first: Measured, *others: Measured) -> Measured:
+    """Return a number computed from others, with the interval that the first one's gives it; unknown if any is."""
+    for it in (first, *others):
+        if it.value is None:
+            return it
+    rest = [it.value for it in others]
+    value = compute(first.value, *rest)
+    if first.ci95 is None:
+        return Measured(value)
+    low, high = sorted(compute(end, *rest) for end in first.ci95)
+    return Measured(value, ci95=(low, high))

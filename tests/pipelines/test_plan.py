@@ -1,0 +1,323 @@
+"""`faintfield plan`: its numbers against formulas written out here, `check`, and frames of known light."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+
+from faintfield.rig.simulation.sensor import SimulatedSensor
+from tests.pipelines.by_hand import write_by_hand
+from tests.pipelines.test_noise_json import FITTED
+
+type Command = Callable[..., CompletedProcess[str]]
+type Predict = Callable[..., dict[str, Any]]
+
+# The paper's camera, by default that of the simulated rig, which rounds to half an electron.
+READ_E2, DARK_E, ROUNDING_E2 = 12.0, 0.02, 1 / 48
+
+SIMULATED = """
+stage = { protocol = "simulated" }
+camera = { backend = "simulated", size_px = [640, 480]MORE }
+grid = { rows = 5, columns = 5, pitch_mm = 20.0, origin_mm = [-250.0, -250.0] }
+scene = { depth_mm = [500.0] }
+step = [{ kind = "dark_scene", exposure_s = 0.1 }, { kind = "noise_reference", exposure_s = 0.1 }]
+"""
+
+# A rig whose stage does not answer, and of whose camera nothing is known.
+REAL = """
+stage = { protocol = "grbl", port = "/dev/no-such-port" }
+camera = { backend = "folder", folder = "incoming" }
+grid = { rows = 3, columns = 3, pitch_mm = 50.0, origin_mm = [-250.0, -250.0] }
+step = [{ kind = "dark_scene", exposure_s = 0.1, frames_per_node = 4 }]
+"""
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    path.write_text(SIMULATED.replace("MORE", ""))
+    return path
+
+
+@pytest.fixture
+def real(tmp_path: Path) -> Path:
+    path = tmp_path / "real.toml"
+    path.write_text(REAL)
+    return path
+
+
+@pytest.fixture
+def predict(done: Command) -> Predict:
+    """Return the prediction of a call."""
+
+    def call(*words: object) -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(done("--json", "plan", *words).stdout)
+        return found
+
+    return call
+
+
+def sigma_of(light_e: float, views: int, read_e2: float, dark_e: float, response: float = 1.0) -> float:
+    """σ of a sample where all views see it alike."""
+    interpolation = (1 + (views - 1) * 4 / 9) / views
+    return math.sqrt(interpolation * (response * light_e + dark_e + read_e2) / (views * response**2))
+
+
+def test_snr_and_photons_are_those_of_the_papers_camera(rig: Path, predict: Predict) -> None:
+    found = predict(rig, "--light-e", 0.97)
+    power_of_dark = DARK_E**2 + DARK_E + READ_E2 + ROUNDING_E2
+    power = (0.97 + DARK_E) ** 2 + 0.97 + DARK_E + READ_E2 + ROUNDING_E2
+    assert found["snr"]["value"] == pytest.approx(power / power_of_dark - 1, rel=1e-9)
+    assert found["snr_linear"]["value"] == pytest.approx(0.97 / (READ_E2 + ROUNDING_E2), rel=1e-9)
+    assert found["photons"]["value"] == pytest.approx(1.94)
+    per_s = predict(rig, "--light-e-per-s", 9.7)
+    assert per_s["snr"]["value"] == pytest.approx(found["snr"]["value"], rel=1e-9)
+
+
+def test_sigma_is_that_of_views_behind_a_lens_with_vignetting(rig: Path, predict: Predict) -> None:
+    found = predict(rig, "--light-e", 0.97)["depths"][0]
+    information = 0.0
+    for right, down in np.ndindex(5, 5):
+        squared = ((20 * (right - 2)) ** 2 + (20 * (down - 2)) ** 2) / 500**2
+        response = 1 / (1 + squared) ** 2
+        information += response**2 / (response * 0.97 + DARK_E + READ_E2 + ROUNDING_E2)
+    assert found["views"] == 25
+    assert found["sigma_e"]["value"] == pytest.approx(math.sqrt((1 + 24 * 4 / 9) / 25 / information), rel=3e-3)
+
+
+def test_pixels_and_parallax_are_those_of_the_lens(rig: Path, predict: Predict) -> None:
+    found = predict(rig, "--light-e", 1, "--blur-px", 0.5, "--feature-mm", 5)["depths"][0]
+    assert found["mm_per_px"]["value"] == pytest.approx(500 / 800)
+    assert found["blur_mm"]["value"] == pytest.approx(0.25 * 500 / 400)
+    assert found["depth_step_mm"]["value"] == pytest.approx(500**2 / (800 * 80))
+    assert found["seen_by_all_mm"] == pytest.approx([640 * 0.625 - 80, 480 * 0.625 - 80])
+    assert found["features"][0]["side_px"] == pytest.approx(8.0)
+
+
+def test_views_that_look_past_the_middle_do_not_count(rig: Path, predict: Predict) -> None:
+    near = predict(rig, "--light-e", 1, "--depth-mm", 100)["depths"][0]
+    assert near["views"] == 4 * 3  # 160 px per node, from the axis at (323, 238) in 640 x 480
+    assert near["seen_by_all_mm"][1] == 0
+
+
+def test_the_contrast_is_roses_for_a_large_square(rig: Path, predict: Predict) -> None:
+    options = ("--light-e", 0.97, "--feature-px", 100, "--depth-mm", 1e7, "--rose-k", 3)
+    feature = predict(rig, *options)["depths"][0]["features"][0]
+    noise_e = math.sqrt((0.97 + DARK_E + READ_E2 + ROUNDING_E2) / 25) / (100 - 1 / 3)
+    assert feature["smallest_contrast"]["value"] == pytest.approx(3 * noise_e / 0.97, rel=1e-3)
+
+
+def test_a_square_that_cannot_be_seen_has_no_depth(rig: Path, predict: Predict) -> None:
+    feature = predict(rig, "--light-e", 0.01, "--feature-px", 2)["depths"][0]["features"][0]
+    assert feature["smallest_contrast"]["value"] > 1
+    assert feature["depth_sigma_mm"] == {"value": None, "why": "even a black square is not visible"}
+
+
+def test_the_time_is_that_of_check(rig: Path, predict: Predict, done: Command) -> None:
+    checked = json.loads(done("--json", "check", rig).stdout)
+    found = predict(rig, "--light-e", 1)
+    assert found["time_s"]["value"] == pytest.approx(checked["duration_s"], rel=1e-12)
+    (row,) = found["alternatives"]
+    assert row["time_s"]["value"] == pytest.approx(checked["duration_s"], rel=1e-12)
+    assert row["scene_s"]["value"] < 0.6 * row["time_s"]["value"]
+
+
+def test_rows_are_in_electrons_of_one_frame_and_frames_add_up(rig: Path, predict: Predict) -> None:
+    words = ("--light-e", 0.5, "--exposures-ms", 100, 200, "--frames", 1, 2, 4, "--depth-mm", 1e7)
+    rows = {(row["exposure_s"], row["frames_per_node"]): row for row in predict(rig, *words)["alternatives"]}
+    sigma = {key: row["sigma_e"]["value"] for key, row in rows.items()}
+    assert sigma[0.1, 1] == pytest.approx(sigma_of(0.5, 25, READ_E2 + ROUNDING_E2, DARK_E), rel=1e-6)
+    assert sigma[0.1, 4] == pytest.approx(sigma[0.1, 1] / 2, rel=1e-6)
+    longer = sigma_of(1.0, 25, READ_E2 + ROUNDING_E2, 2 * DARK_E) / 2
+    assert sigma[0.2, 1] == pytest.approx(longer, rel=1e-6)
+    times = [rows[0.1, frames]["time_s"]["value"] for frames in (1, 2)]
+    assert times[1] - times[0] == pytest.approx(2 * 25 * (0.1 + 0.05))  # the scene's, and the noise reference's
+
+
+def test_the_cheapest_is_the_shortest_session_that_reaches_sigma_and_can_be_done(rig: Path, predict: Predict) -> None:
+    words = ("--light-e", 0.97, "--grids", "3x3", "5x5", "7x7", "41x41", "--frames", 1, 2, 8)
+    found = predict(rig, *words, "--sigma-e", 0.35)
+    rows = found["alternatives"]
+    assert {row["rows"] for row in rows if row["why_not"]} == {41}
+    able = [row for row in rows if not row["why_not"] and row["sigma_e"]["value"] <= 0.35]
+    assert found["cheapest"] == min(able, key=lambda row: row["time_s"]["value"])
+    assert (found["cheapest"]["rows"], found["cheapest"]["frames_per_node"]) == (3, 8)
+    assert predict(rig, *words, "--sigma-e", 0.01)["cheapest"] is None
+
+
+def test_other_grids_stand_about_the_same_centre(rig: Path, predict: Predict) -> None:
+    rig.write_text(SIMULATED.replace("MORE", "").replace("[-250.0, -250.0]", "[-100.0, -100.0]"))
+    rows = predict(rig, "--light-e", 1, "--grids", "5x5", "7x7", "9x9")["alternatives"]
+    assert [bool(row["why_not"]) for row in rows] == [False, False, True]  # 7 x 7 ends at zero, the end of the travel
+
+
+def test_the_scarcest_colour_of_a_mosaic_has_a_quarter_of_the_pixels(rig: Path, predict: Predict) -> None:
+    grey = predict(rig, "--light-e", 0.97)
+    rig.write_text(SIMULATED.replace("MORE", ', mosaic = ["RG", "GB"]'))
+    coloured = predict(rig, "--light-e", 0.97)
+    assert coloured["pixel_share"] == 0.25
+    assert coloured["snr"] == grey["snr"]
+    sigmas = [it["depths"][0]["sigma_e"]["value"] for it in (grey, coloured)]
+    assert sigmas[1] == pytest.approx(2 * sigmas[0])
+
+
+def test_what_is_not_known_is_said_to_be_unknown(real: Path, faintfield: Command) -> None:
+    ended = faintfield("--json", "plan", real, "--light-e", 1)
+    assert ended.returncode == 0, ended.stderr
+    found = json.loads(ended.stdout)
+    (plane,) = found["depths"]
+    unknown = (found["snr"], plane["sigma_e"], found["time_s"], found["photons"], plane["mm_per_px"])
+    for number, reason in zip(unknown, ("--noise", "--noise", "no-such-port", "--noise", "--depth-mm"), strict=True):
+        assert number["value"] is None
+        assert reason in number["why"]
+        assert f"unknown: {number['why']}" in ended.stderr
+    assert "vignetting: unknown" in ended.stderr
+
+
+def test_numbers_of_a_data_sheet_can_be_stated(real: Path, predict: Predict) -> None:
+    stated = ("--read-noise-e", 2.0, "--dark-current-e-per-s", 0)
+    found = predict(real, "--light-e", 1, *stated)
+    assert found["frames_per_node"] == 4
+    noise = found["depths"][0]["sigma_e"]["value"]  # in electrons of all four frames
+    assert noise == pytest.approx(sigma_of(4.0, 9, 4 * 2.0**2, 0.0), rel=1e-6)
+    assert found["photons"]["value"] is None
+
+
+def test_without_any_noise_there_is_no_snr_but_sigma_is_that_of_counts(real: Path, predict: Predict) -> None:
+    found = predict(real, "--light-e", 1, "--read-noise-e", 0, "--dark-current-e-per-s", 0)
+    for snr in (found["snr"], found["snr_linear"]):
+        assert snr == {"value": None, "why": "there is no noise to compare with"}
+    assert found["depths"][0]["sigma_e"]["value"] == pytest.approx(sigma_of(4.0, 9, 0.0, 0.0), rel=1e-6)
+
+
+def test_a_calibration_gives_its_numbers_or_why_it_has_none(real: Path, tmp_path: Path, predict: Predict) -> None:
+    write_by_hand(tmp_path / "noise.json", FITTED | {"size_px": [400, 300], "quantum_efficiency": 0.5})
+    found = predict(real, "--light-e", 1, "--fx-px", 500, "--depth-mm", 500)
+    assert found["noise_from"] == str(tmp_path / "noise.json")
+    assert found["photons"]["value"] == 2
+    assert found["depths"][0]["views"] == 9
+    expected = sigma_of(4.0, 9, 4 * (9 + ROUNDING_E2), 4 * 0.02)
+    assert found["depths"][0]["sigma_e"]["value"] == pytest.approx(expected, rel=1e-6)
+    lacking = FITTED | {"dark_current_e_per_s": {"value": None, "why": "all exposures are equally long"}}
+    write_by_hand(tmp_path / "other.json", lacking)
+    found = predict(real, "--light-e", 1, "--noise", tmp_path / "other.json")
+    assert found["snr"] == {"value": None, "why": "all exposures are equally long"}
+
+
+def write_frame(path: Path, light_e: float, exposure_s: float, shape: tuple[int, int] = (60, 80)) -> Path:
+    """Take a frame of even light by the paper's camera."""
+    photons = np.full(shape, light_e / 0.5)
+    tifffile.imwrite(path, SimulatedSensor().expose(photons, exposure_s, np.random.default_rng(5)))
+    return path
+
+
+def test_the_light_of_a_test_frame_is_an_estimate_with_its_interval(
+    rig: Path, tmp_path: Path, predict: Predict
+) -> None:
+    frame = write_frame(tmp_path / "test.tiff", 30.0, 2.0)
+    found = predict(rig, "--test-frame", frame, "--frame-exposure-ms", 2000)
+    low, high = found["light_e"]["ci95"]
+    assert low < 30.0 * 0.1 / 2 < high
+    margin_e = 1.96 * math.sqrt((30.0 + 0.4 + READ_E2 + ROUNDING_E2) / 4800)
+    assert (high - low) / 2 == pytest.approx(margin_e * 0.1 / 2, rel=0.02)
+    for number in (found["snr"], found["depths"][0]["sigma_e"], found["alternatives"][0]["smallest_contrast"]):
+        assert number["ci95"][0] < number["value"] < number["ci95"][1]
+
+
+def test_the_interval_has_the_error_of_the_calibration(real: Path, tmp_path: Path, predict: Predict) -> None:
+    write_by_hand(tmp_path / "noise.json", FITTED)
+    frame = write_frame(tmp_path / "test.tiff", 30.0, 2.0)
+    words = (real, "--test-frame", frame, "--frame-exposure-ms", 2000)
+    alone = predict(*words)["light_e"]
+    counted = (30.0 + 0.4 + 9 + ROUNDING_E2) / 4800
+    calibrated = (0.1 / 2) ** 2 + (30.4 * 0.01 / 2) ** 2 + (0.01 * 2) ** 2
+    margin_e = (alone["ci95"][1] - alone["ci95"][0]) / 2 * 20
+    assert margin_e == pytest.approx(1.96 * math.sqrt(counted + calibrated), rel=0.02)
+    names = ["offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s"]
+    matrix = np.diag([0.1**2, 0.01**2, 0.0, 0.01**2])
+    matrix[0, 1] = matrix[1, 0] = 0.9 * 0.1 * 0.01
+    write_by_hand(tmp_path / "noise.json", FITTED | {"covariance": {"names": names, "matrix": matrix.tolist()}})
+    together = predict(*words)["light_e"]["ci95"]
+    calibrated += 2 * 0.9 * (0.1 / 2) * (30.4 * 0.01 / 2)
+    assert (together[1] - together[0]) * 10 == pytest.approx(1.96 * math.sqrt(counted + calibrated), rel=0.02)
+
+
+def test_a_flat_is_measured_in_its_middle_and_a_test_frame_where_it_is_asked(
+    rig: Path, tmp_path: Path, predict: Predict
+) -> None:
+    pixels = np.full((60, 80), 100, np.uint16)
+    pixels[25:35, 35:45] = 300
+    tifffile.imwrite(tmp_path / "flat.tiff", pixels)
+    exposure = ("--frame-exposure-ms", 100)
+    bright = 100.0 - DARK_E
+    assert predict(rig, "--flat", tmp_path / "flat.tiff", *exposure)["light_e"]["value"] == pytest.approx(bright)
+    region = ("--region-px", 35, 25, 10, 10)
+    found = predict(rig, "--test-frame", tmp_path / "flat.tiff", *exposure, *region)
+    assert found["light_e"]["value"] == pytest.approx(bright)
+    whole = predict(rig, "--test-frame", tmp_path / "flat.tiff", *exposure)
+    assert whole["light_e"]["value"] == pytest.approx(100 * 100 / 4800 - DARK_E)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "0 lights are given"),
+        (("--light-e", 1, "--light-e-per-s", 1), "2 lights are given"),
+        (("--light-e", 1, "--frame-exposure-ms", 5), "are those of a frame"),
+        (("--light-e", 1, "--grids", "5"), "--grids 5: is no grid"),
+        (("--light-e", 1, "--grids", "0x5"), "is no grid"),
+        (("--light-e", 1, "--grids", "900x900"), "at most"),
+        (("--light-e", 1, "--exposures-ms", 1e9), "an exposure lasts"),
+        (("--light-e", 1, "--frames", *range(1, 600)), "the table has 599 rows, at most 500"),
+        (("--light-e", 0), "Must be at least"),
+    ],
+)
+def test_wrong_usage_is_told(words: tuple[object, ...], said: str, rig: Path, faintfield: Command) -> None:
+    ended = faintfield("plan", rig, *words)
+    assert ended.returncode == 2, ended.stderr
+    assert said in " ".join(ended.stderr.split())
+
+
+def test_mm_need_a_depth_and_a_lens(real: Path, faintfield: Command) -> None:
+    ended = faintfield("plan", real, "--light-e", 1, "--feature-mm", 3)
+    assert ended.returncode == 2
+    assert "--depth-mm" in ended.stderr
+
+
+@pytest.mark.parametrize(
+    ("light_e", "words", "said"),
+    [
+        (0.0, ("--frame-exposure-ms", 100), "which may be none; expose it for longer than 100 ms"),
+        (1e5, ("--frame-exposure-ms", 100), "are saturated, at most 1% may be; expose it for less than 100 ms"),
+        (30.0, (), "states no exposure time; give --frame-exposure-ms"),
+        (30.0, ("--frame-exposure-ms", 100, "--region-px", 70, 0, 20, 20), "is not within its 80 x 60 px"),
+    ],
+)
+def test_frames_that_tell_no_light_are_refused(
+    light_e: float, words: tuple[object, ...], said: str, rig: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    frame = write_frame(tmp_path / "test.tiff", light_e, 0.1)
+    ended = faintfield("plan", rig, "--test-frame", frame, *words)
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert said in ended.stderr
+
+
+def test_a_frame_of_an_unknown_camera_tells_no_electrons(real: Path, tmp_path: Path, faintfield: Command) -> None:
+    frame = write_frame(tmp_path / "test.tiff", 30.0, 0.1)
+    ended = faintfield("plan", real, "--test-frame", frame, "--frame-exposure-ms", 100)
+    assert ended.returncode == 1
+    assert "its DN tell no electrons" in ended.stderr
+
+
+def test_a_session_without_a_dark_scene_needs_exposures(rig: Path, faintfield: Command, predict: Predict) -> None:
+    rig.write_text(SIMULATED.replace("MORE", "").replace("dark_scene", "bright"))
+    ended = faintfield("plan", rig, "--light-e", 1)
+    assert ended.returncode == 2
+    assert "no dark_scene step" in ended.stderr
+    assert predict(rig, "--light-e", 1, "--exposures-ms", 50)["exposure_s"] == 0.05
