@@ -17,7 +17,7 @@ demo: $(VENV)/compiled ## the whole experiment, simulated; the last line is the 
 	$(BIN)/faintfield demo $(OUT)
 
 test: $(VENV)/compiled ## all tests, on two cores
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .
