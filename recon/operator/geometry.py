@@ -46,7 +46,7 @@ def scene_geometry(
     if plane_from_ray.shape != (planes, views, 3, 3) or rays.shape != (lattices, *detector, 2) or 0 in (planes, views):
         raise GeometryMismatch(
             f"homographies {plane_from_ray.shape} of {planes} planes and rays {rays.shape} do not fit; "
-            "give (plane, view, 3, 3), (row, column, 2)"
+            "give (plane, view, 3, 3), (lattice, row, column, 2)"
         )
     flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)

@@ -73,6 +73,11 @@ class SceneGeometry(NamedTuple):
     reach: NDArray[np.intp]
 
 
+def size_of(geometry: SceneGeometry) -> int:
+    """Return the number of samples of all planes."""
+    return int((geometry.layout[:, 1] * geometry.layout[:, 2]).sum())
+
+
 class PixelModel(NamedTuple):
     """The statistics of the numbers that pixels read, as the kernels read them.
 

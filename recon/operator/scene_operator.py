@@ -14,8 +14,7 @@ from faintfield.recon.operator import kernels
 from faintfield.recon.operator.geometry import Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
-from faintfield.recon.operator.placement import make_workspace
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.operator.sweeps import CompiledSweeps, Sweeps
 
 type ViewSelection = Sequence[int] | NDArray[np.integer] | None
 
@@ -54,6 +53,8 @@ class SceneOperator:
         Number of threads; as many as the process may use by default. The last digits of sums depend on it.
     surface : (array (view, 3, 3), Relief), optional
         For `recon.operator.surface_operator.SurfaceOperator`: what bends the only plane to a surface.
+    sweeps : class, optional
+        What passes over the pixels, on which processor: see `recon.operator.sweeps`.
 
     Raises
     ------
@@ -79,13 +80,14 @@ class SceneOperator:
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
         surface: Surface | None = None,
+        sweeps: type[Sweeps] = CompiledSweeps,
     ) -> None:
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
         grids = tuple(grids)
         self.workers = workers or int(numba.config.NUMBA_NUM_THREADS)
         rays = rays[np.newaxis] if rays.ndim == 3 else rays
         geometry = scene_geometry(plane_from_ray, rays, grids, flat, valid, lattice_of_view, self.dtype, surface)
-        self._hiding = hiding_of(occluders, grids, self.dtype)
+        self._make_sweeps, self._hiding = sweeps, hiding_of(occluders, grids, self.dtype)
         self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
         self._kept_maps: dict[float, Image] | None = None
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
@@ -97,9 +99,9 @@ class SceneOperator:
     def _see(self, geometry: kernels.SceneGeometry, grids: tuple[PlaneGrid, ...]) -> None:
         """Take the planes that the views see, and find which pixels see them."""
         self._geometry, self.grids = geometry, grids
-        self._size = sum(grid.shape[0] * grid.shape[1] for grid in grids)
-        self.samples_shape: tuple[int, ...] = (self._size,)
-        self._sweep(kernels.REACH, self.all_views, self.all_views)
+        self._sweeps = self._make_sweeps(geometry, self._hiding, self.workers)
+        self.samples_shape: tuple[int, ...] = (kernels.size_of(geometry),)
+        self._sweeps.run(kernels.REACH, self.all_views, self.all_views)
         self._check_seen()
 
     def forward(self, samples: Image, views: ViewSelection = None) -> Image:
@@ -109,23 +111,24 @@ class SceneOperator:
         image_of_view = np.zeros(self.images_shape[0], np.intp)
         image_of_view[chosen] = np.arange(len(chosen))
         samples = self._checked("samples", samples, self.samples_shape)
-        self._sweep(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=seen)
+        self._sweeps.run(kernels.FORWARD, chosen, image_of_view, samples=samples, seen=seen)
         return seen
 
     def adjoint(self, images: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images (view, row, column), summed over `views`."""
         images = self._checked("images", images, self.images_shape)
-        return self._sweep(kernels.ADJOINT, self._views(views), self.all_views, images=images)[1]
+        return self._adjoint(images, self._views(views), self.all_views)
 
     def adjoint_of_view(self, image: Image, view: int) -> Image:
         """Return Hᵀ g (samples) of the image (row, column) of one view, as if all others were zero."""
         image = self._checked("an image", image, self.images_shape[1:])
-        return self._sweep(kernels.ADJOINT, self._views([view]), np.zeros_like(self.all_views), images=image)[1]
+        return self._adjoint(image, self._views([view]), np.zeros_like(self.all_views))
 
     def adjoint_of_forward(self, samples: Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ H f (samples), with no array as large as the images."""
         samples = self._checked("samples", samples, self.samples_shape)
-        return self._sweep(kernels.NORMAL, self._views(views), self.all_views, samples=samples)[1]
+        sums = self._sweeps.run(kernels.NORMAL, self._views(views), self.all_views, samples=samples)[1]
+        return sums.reshape(self.samples_shape)
 
     def adjoint_of_precision(
         self,
@@ -152,20 +155,21 @@ class SceneOperator:
             Return `H_zᵀ[ (H_z 1)/(H f + b + σ²) ]` of each plane z instead.
         """
         likelihood = images.likelihood
-        known = _read_only(self._map(images.known_variance_e2()))
+        known = self._map(images.known_variance_e2())
         level = likelihood.level_e if likelihood.name == "least-squares" else min_light_e
         operation = kernels.PRECISION_OF_EACH if of_each else kernels.PRECISION
-        return self._sweep(
+        _, sums = self._sweeps.run(
             operation,
             self._views(views),
             self.all_views,
             samples=self._checked("samples", samples, self.samples_shape),
             pixels=kernels.PixelModel(likelihood.model, known, known, level),
-        )[1]
+        )
+        return sums.reshape(self.samples_shape)
 
     def adjoint_of_map(self, value: float | Image, views: ViewSelection = None) -> Image:
         """Return Hᵀ g (samples) of images that all equal one map, broadcastable to (lattice, row, column)."""
-        return self._sweep(kernels.ADJOINT, self._views(views), self.lattice_of_view, images=self._map(value))[1]
+        return self._adjoint(self._map(value), self._views(views), self.lattice_of_view)
 
     def sensitivity(self, views: ViewSelection = None) -> Image:
         """Return s = Hᵀ 1 (samples): without flat field, the number of views that see each sample."""
@@ -212,11 +216,12 @@ class SceneOperator:
         r is the ratio of `recon.likelihood.pixel_models`: the gradient of the negative log-likelihood is s − Hᵀ r.
         Terms that do not depend on f are left out.
         """
-        return self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views)
+        value, sums = self._likelihood(kernels.VALUE_AND_RATIO, samples, images, views)
+        return value, sums.reshape(self.samples_shape)
 
     def adjoint_of_ratio(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> Image:
         """Return Hᵀ r (samples) alone: for shifted Poisson data Hᵀ[ (g + σ²)₊ / (H f + b + σ²) ], as in eq. (2)."""
-        return self._likelihood(kernels.RATIO, samples, images, views)[1]
+        return self._likelihood(kernels.RATIO, samples, images, views)[1].reshape(self.samples_shape)
 
     def negative_log_likelihood(self, samples: Image, images: ElementalImages, views: ViewSelection = None) -> float:
         """Return the negative log-likelihood alone, without terms that do not depend on f, in a sweep that only reads.
@@ -256,6 +261,10 @@ class SceneOperator:
                     "and that not all pixels are masked (saturated, hot)"
                 )
 
+    def _adjoint(self, images: Image, views: NDArray[np.intp], image_of_view: NDArray[np.intp]) -> Image:
+        """Return Hᵀ (samples) of images that have been checked."""
+        return self._sweeps.run(kernels.ADJOINT, views, image_of_view, images=images)[1].reshape(self.samples_shape)
+
     def _likelihood(
         self, operation: int, samples: Image, images: ElementalImages, views: ViewSelection
     ) -> tuple[float, Image]:
@@ -265,44 +274,15 @@ class SceneOperator:
         likelihood = images.likelihood
         pixels = kernels.PixelModel(
             likelihood.model,
-            _read_only(self._map(images.background_e)),
-            _read_only(self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0)),
+            self._map(images.background_e),
+            self._map(images.read_variance_e2 if likelihood.knows_read_noise else 0.0),
             likelihood.level_e,
         )
         samples = self._checked("samples", samples, self.samples_shape)
         electrons = self._checked("images", images.electrons, self.images_shape)
-        return self._sweep(
+        return self._sweeps.run(
             operation, self._views(views), self.all_views, samples=samples, images=electrons, pixels=pixels
         )
-
-    def _sweep(
-        self,
-        operation: int,
-        views: NDArray[np.intp],
-        image_of_view: NDArray[np.intp],
-        *,
-        samples: Image | None = None,
-        images: Image | None = None,
-        seen: Image | None = None,
-        pixels: kernels.PixelModel | None = None,
-    ) -> tuple[float, Image]:
-        """Run one kernel on all workers; return the sums of their values and of their accumulators."""
-        scatters, nothing = operation in kernels.SCATTERING, _read_only(np.zeros(1, self.dtype))
-        sums = [np.zeros(self._size if scatters else 1, self.dtype) for _ in range(self.workers)]
-        planes, data = (nothing if array is None else _read_only(array) for array in (samples, images))
-        pixels = pixels or kernels.PixelModel(0, nothing, nothing, 0.0)
-
-        def work(worker: int) -> float:
-            written = np.zeros(1, self.dtype) if seen is None else seen.reshape(-1)
-            arrays = (planes, written, sums[worker], data, _read_only(image_of_view))
-            space = make_workspace(len(self.grids), self.dtype)
-            share = (_read_only(views), worker, self.workers)
-            return float(kernels.sweep(operation, *arrays, pixels, self._geometry, self._hiding, space, *share))
-
-        values = run_in_threads(work, range(self.workers))
-        for other in sums[1:]:
-            sums[0] += other
-        return sum(values), sums[0].reshape(self.samples_shape) if scatters else sums[0]
 
     def _checked(self, name: str, array: Image, shape: tuple[int, ...]) -> Image:
         """Return samples or images in the operator's dtype, copied only where they have to be."""
@@ -337,13 +317,3 @@ class SceneOperator:
         if chosen.min() < 0 or chosen.max() >= len(self.all_views):
             raise ValueError(f"views must lie within 0 and {len(self.all_views) - 1}, got {views}")
         return chosen.astype(np.intp)
-
-
-def _read_only[Number: np.generic](array: NDArray[Number]) -> NDArray[Number]:
-    """Return the elements of an array (element,) as a view that cannot be written to.
-
-    To the compiler, arrays that can and cannot be written to are different types, and a memory map may be of either.
-    """
-    flat = array.reshape(-1)
-    flat.flags.writeable = False
-    return flat
