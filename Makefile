@@ -8,7 +8,7 @@ OUT ?= demo
 SAMPLE ?= 300
 MODULES ?= recon calib rig/session rig/capture rig/stages
 
-.PHONY: demo test lint bench mutants results lock clean help
+.PHONY: demo test campaigns lint bench mutants results lock clean help
 
 help: ## list the tasks
 	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
@@ -18,6 +18,9 @@ demo: $(VENV)/compiled ## the whole experiment, simulated; the last line is the 
 
 test: $(VENV)/compiled ## all tests, on two cores
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+campaigns: $(VENV)/compiled ## thousands of damaged files, kills, faults and arrangements: an hour, before a release
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m campaign
 
 lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.library_solver import primal_dual
+from benchmarks.library_solver import LibraryProblem, installed_solvers, iterates_of
 from benchmarks.problem import BenchmarkProblem
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -27,7 +27,7 @@ _LIMIT_S = 15.0
 
 def compare_solvers(size_px: int) -> dict[str, float | None]:
     """Return passes and seconds to the criterion, and the time of the others relative to PMLEM."""
-    operator, images = _scene(size_px)
+    operator, images = dark_scene(size_px)
     start = smooth_start(operator, images)
     weight = universal_penalty_weight(operator, images, start)
     fit = DataFit(operator, images, float(start.mean()))
@@ -35,18 +35,18 @@ def compare_solvers(size_px: int) -> dict[str, float | None]:
     def ours() -> Iterator[Image]:
         return (iterate.plane for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=1e-3))
 
-    optimum = _last(iterate for iterate in itertools.islice(ours(), 60))
+    optimum = last_of(iterate for iterate in itertools.islice(ours(), 60))
     epsilon = 0.005 * float(np.quantile(start, 0.99)) ** 2
 
     def late() -> Iterator[Image]:
         steps = pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon)
         return (iterate.plane for iterate in steps)
 
-    settled = _last(itertools.islice(late(), 200))  # its own limit: its penalty is smoothed
+    settled = last_of(itertools.islice(late(), 200))  # its own limit: its penalty is smoothed
     found = {
-        "pmlem": _to_criterion(ours, optimum),
-        "one_step_late": _to_criterion(late, settled),
-        "pyproximal": _to_criterion(lambda: primal_dual(operator, images, start, weight, optimum), optimum),
+        "pmlem": seconds_to_criterion(ours, optimum),
+        "one_step_late": seconds_to_criterion(late, settled),
+        "pyproximal": _of_library(LibraryProblem(operator, images, start, weight, optimum)),
     }
     result: dict[str, float | None] = {}
     for name, (passes, seconds) in found.items():
@@ -57,7 +57,7 @@ def compare_solvers(size_px: int) -> dict[str, float | None]:
     return result
 
 
-def _scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
+def dark_scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
     """Return dark views (one electron per pixel, read noise 3.5) of rectangles of several levels."""
     problem, generator = BenchmarkProblem.of_size(size_px), np.random.default_rng(4)
     operator, truth = problem.operator(), np.full(problem.grid().shape, 0.3)
@@ -72,11 +72,19 @@ def _scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
     return operator, ElementalImages(electrons, known.background_e, known.read_variance_e2, known.valid)
 
 
-def _to_criterion(iterate: Callable[[], Iterable[Image] | None], converged: Image) -> tuple[float | None, float | None]:
+def _of_library(problem: LibraryProblem) -> tuple[float | None, float | None]:
+    """Return the passes and seconds of pyproximal, None if it is not installed."""
+    solver = installed_solvers()["pyproximal"]
+    if solver is None:
+        return None, None
+    return seconds_to_criterion(lambda: iterates_of(solver, problem), problem.optimum)
+
+
+def seconds_to_criterion(
+    iterate: Callable[[], Iterable[Image]], converged: Image, limit_s: float = _LIMIT_S
+) -> tuple[float | None, float | None]:
     """Return the passes and seconds until the criterion holds; None if it does not within the limit."""
     planes = iterate()
-    if planes is None:
-        return None, None
     rows, columns = converged.shape
     region = np.s_[rows // 3 : 2 * rows // 3, columns // 3 : 2 * columns // 3]
     held: list[tuple[float, float]] = []
@@ -89,7 +97,7 @@ def _to_criterion(iterate: Callable[[], Iterable[Image] | None], converged: Imag
         checking += time.perf_counter() - now
         if len(held) == _IN_A_ROW:
             return held[0]
-        if now - started > _LIMIT_S:
+        if now - started > limit_s:
             break
     return None, None
 
@@ -98,7 +106,8 @@ def _mean(part: NDArray[np.floating]) -> float:
     return float(part.mean(dtype=np.float64))
 
 
-def _last(planes: Iterable[Image]) -> Image:
-    for plane in planes:
-        last = plane
+def last_of[Item](items: Iterable[Item]) -> Item:
+    """Return the last of some items, of which there is at least one."""
+    for item in items:
+        last = item
     return last

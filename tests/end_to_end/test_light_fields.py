@@ -116,8 +116,8 @@ QUICK = (
 
 
 def _each(names: Iterable[str], quick: Collection[str]) -> list[Any]:
-    """Return names as parameters, marked as slow but for the quick ones."""
-    return [name if name in quick else pytest.param(name, marks=pytest.mark.slow) for name in names]
+    """Return names as parameters, marked as a campaign but for the quick ones."""
+    return [name if name in quick else pytest.param(name, marks=pytest.mark.campaign) for name in names]
 
 
 @pytest.mark.parametrize("name", _each(CORPUS, QUICK))

@@ -61,7 +61,7 @@ frames_per_node = {}
 """
 _FEW = (("dark_scene", 0.1, 1), ("dark", 0.1, 1))
 _ENOUGH = (*(("charuco", 0.05, 1),) * 3, ("dark_scene", 0.1, 1), ("dark", [0.1, 60.0], 2), ("flat", 0.1, 2))
-_PLANE = ["--depth-mm", "500", "--passes", "1", "--penalty-weight", "0.1"]
+_PLANE = ["--depth-mm", "500", "--passes", "1", "--penalty-weight", "0.1", "--prior", "tv"]
 
 _TIMES = re.compile(
     rb'"wall_time_s": [^,\n]+|<th scope="row">(?:written|wall time, s)</th><td>[^<]*</td>|'

@@ -106,6 +106,7 @@ _COMPUTATIONS = (
     "faintfield.pipelines.calibration.geometry.stage_report",
     "faintfield.pipelines.calibration.geometry.transfer_sigma_at",
     "faintfield.pipelines.calibration.noise.calibrate",
+    "faintfield.pipelines.pages.emva_page.emva_page",
     "faintfield.pipelines.pages.geometry_page.geometry_page",
     "faintfield.pipelines.pages.noise_page.draw_page",
     "faintfield.pipelines.pages.geometry_page.node_drawing",

@@ -76,14 +76,14 @@ class Kind:
     calls : tuple of Call
         The commands that read them; each case runs one.
     usual, many : int
-        Number of cases in `make test` and in `.ci/run`, where the cases of all kinds are ten thousand. Kinds whose
-        commands compute for long have few.
+        Number of cases in `make test`, and in `make campaigns`, where the cases of all kinds are some five thousand.
+        Kinds whose commands compute for long have few.
     """
 
     seed: Callable[[Path], None]
     files: tuple[str, ...]
     calls: tuple[Call, ...]
-    usual: int = 60
+    usual: int = 30
     many: int = 300
 
 
@@ -314,11 +314,11 @@ _VERIFY = Call("verify IN/session", _NOTHING, notices=("session/plan.json", _JOU
 
 KINDS: Mapping[str, Kind] = {
     "elemental set": Kind(_simulated, ("elemental.toml",), _READ_SET),
-    "frames": Kind(_simulated, ("view_*.tiff", "noise_reference.tiff"), _READ_SET[:3], usual=30, many=300),
-    "truth": Kind(_simulated, ("truth.json", "truth/*"), (Call(_RECONSTRUCT), Call(_BACKPROJECT)), usual=30, many=300),
+    "frames": Kind(_simulated, ("view_*.tiff", "noise_reference.tiff"), _READ_SET[:3], usual=15, many=300),
+    "truth": Kind(_simulated, ("truth.json", "truth/*"), (Call(_RECONSTRUCT), Call(_BACKPROJECT)), usual=15, many=300),
     "plane poses": Kind(_plane_poses, ("poses.toml",), (Call(f"{_BACKPROJECT} --plane-pose IN/poses.toml"),)),
     "pictures": Kind(_pictures, ("*/view_*",), (Call("import grid IN/8_bits OUT"), Call("import grid IN/16_bits OUT"))),
-    "raw picture": Kind(_raw_picture, ("view_*",), (Call("import grid IN OUT"),), usual=8, many=60),
+    "raw picture": Kind(_raw_picture, ("view_*",), (Call("import grid IN OUT"),), usual=4, many=60),
     "other pictures": Kind(
         _other_pictures,
         ("*/view_*", "stack.tif", "hci/*.cfg", "hci/*.pfm"),
@@ -333,14 +333,14 @@ KINDS: Mapping[str, Kind] = {
         _boards,
         ("charuco.toml", "charuco.toml", "b*.tiff"),
         (Call("geometry IN --out OUT --limit-px 100"),),
-        usual=6,
+        usual=3,
         many=50,
     ),
     "noise set": Kind(
         _dark_room,
         ("noise.toml", "noise.toml", "*.tiff"),
         (Call("noise IN --out OUT"), Call("export emva1288 IN OUT", copies=("OUT/images/*",))),
-        usual=8,
+        usual=4,
         many=60,
     ),
     "noise": Kind(
@@ -353,7 +353,7 @@ KINDS: Mapping[str, Kind] = {
             Call("noise --compare IN IN/noise.json", _NOTHING),
             Call("verify IN", _NOTHING, notices=("noise_maps.npz",)),
         ),
-        usual=30,
+        usual=15,
         many=300,
     ),
     "geometry": Kind(
@@ -364,7 +364,7 @@ KINDS: Mapping[str, Kind] = {
             Call("reconstruct IN/scene --geometry IN/geometry.json --out OUT --depth-mm 500 --method backprojection"),
             Call("verify IN", _NOTHING, notices=("*.npz", "cameras/*")),
         ),
-        usual=30,
+        usual=15,
         many=300,
     ),
     "COLMAP text": Kind(_exported("colmap"), ("model/*.txt",), (Call("import colmap IN/model OUT --images IN"),)),
@@ -391,10 +391,10 @@ KINDS: Mapping[str, Kind] = {
             Call("capture IN/rig.toml IN/session --yes", _IN_SESSION),
             Call("noise IN/session --out OUT"),
         ),
-        usual=30,
+        usual=15,
         many=300,
     ),
-    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME), usual=40, many=300),
+    "open session": Kind(_open_session, _OF_SESSION, (_VERIFY, _RESUME, _RESUME), usual=20, many=300),
     "measured session": Kind(
         _whole_session,
         (
@@ -408,7 +408,7 @@ KINDS: Mapping[str, Kind] = {
             Call("verify IN/session", _NOTHING),
             Call("export colmap IN/session OUT"),
         ),
-        usual=12,
+        usual=6,
         many=100,
     ),
     "results": Kind(
@@ -426,14 +426,14 @@ KINDS: Mapping[str, Kind] = {
             Call("verify IN/sweep", _NOTHING, notices=("sweep/plane_*.tiff",)),
             Call("export zarr IN/sweep OUT"),
         ),
-        usual=40,
+        usual=20,
         many=300,
     ),
     "zarr": Kind(
         _zarr,
         ("sweep.ome.zarr/*", "sweep.ome.zarr/zarr.json", "sweep.ome.zarr/*/zarr.json"),
         (Call("export zarr IN/sweep IN/sweep.ome.zarr --overwrite", ("IN/sweep.ome.zarr", "IN/sweep.ome.zarr/*")),),
-        usual=20,
+        usual=10,
         many=200,
     ),
     "figures": Kind(

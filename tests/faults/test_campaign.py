@@ -182,7 +182,7 @@ def test_no_frame_that_counts_was_taken_in_motion_or_away_from_its_node(controll
     campaign(controller, 60, seed=20)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("controller", CONTROLLERS)
 def test_nor_was_one_in_a_thousand_faults(controller: Controller) -> None:
     campaign(controller, 1000, seed=21)

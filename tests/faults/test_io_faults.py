@@ -41,7 +41,7 @@ def test_a_command_survives_faults_of_the_system(bench: Bench, name: str) -> Non
     assert_all_survived(bench, name, [faults[index] for index in sorted(chosen)])
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(10 * HANG_S)
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_command_survives_many_faults_of_the_system(bench: Bench, name: str) -> None:

@@ -49,7 +49,7 @@ def test_a_killed_command_ends_well_when_it_is_run_again(bench: Bench, name: str
     assert_recovers_from_all(bench, name, kills(bench.calls(name), changing=5, others=1))
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.timeout(10 * HANG_S)
 @pytest.mark.parametrize("name", _NAMES)
 def test_a_hundred_kills(bench: Bench, name: str) -> None:

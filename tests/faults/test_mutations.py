@@ -16,7 +16,7 @@ from tests.faults.mutations import CASES, ONE_THREAD
 _ROOT = Path(__file__).parents[2]
 _KEPT = [json.loads(line) for line in CASES.read_text().splitlines()]
 
-# Seeds of `.ci/run`, which repeat none of those of `make test`.
+# Seeds of `make campaigns`, which repeat none of those of `make test`.
 _FIRST_OF_MANY = 10_000
 
 # For a machine that does much else.
@@ -97,7 +97,7 @@ def test_mutated_files_are_read_or_refused_in_one_line(kind: str, ask: Ask) -> N
     assert not found, "\n".join(found)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("kind", KINDS_HERE)
 def test_many_mutated_files_are_read_or_refused_in_one_line(kind: str, ask: Ask) -> None:
     found = ask(kind=kind, first=_FIRST_OF_MANY, last=_FIRST_OF_MANY + KINDS[kind].many)

@@ -465,7 +465,7 @@ def test_any_flipped_bit_is_found_or_does_no_harm(journal_file: Path) -> None:
     assert refused > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_any_of_many_flipped_bits_is_found_or_does_no_harm(journal_file: Path) -> None:
     expected, written = content(journal_file), journal_file.read_bytes()
     for bit in flips(written, each=61):
