@@ -199,7 +199,7 @@ def solve_by_odl(problem: LibraryProblem, callback: Callable[[Image], None]) -> 
         def adjoint(self) -> Adjoint:
             return Adjoint()
 
-    class ShiftedPoisson(odl.functional.Functional):  # type: ignore[misc]
+    class ShiftedPoisson(odl.functionals.Functional):  # type: ignore[misc]
         """The negative log-likelihood, of which the iteration takes the proximal point alone."""
 
         def __init__(self) -> None:
@@ -220,12 +220,12 @@ def solve_by_odl(problem: LibraryProblem, callback: Callable[[Image], None]) -> 
             return at
 
     gradient = problem.scale * odl.Gradient(plane, method="forward", pad_mode="symmetric")
-    penalty = (problem.weight / problem.scale) * odl.functional.GroupL1Norm(gradient.range, exponent=2)
+    penalty = (problem.weight / problem.scale) * odl.functionals.GroupL1Norm(gradient.range, exponent=2)
     on_plane, on_dual = problem.lengths
     odl.solvers.pdhg(
         plane.element(problem.start.copy()),
-        odl.functional.IndicatorNonnegativity(plane),
-        odl.functional.SeparableSum(ShiftedPoisson(), penalty),
+        odl.functionals.IndicatorNonnegativity(plane),
+        odl.functionals.SeparableSum(ShiftedPoisson(), penalty),
         odl.BroadcastOperator(Forward(), gradient),
         _STEPS,
         tau=on_plane,
