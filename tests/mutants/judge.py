@@ -25,7 +25,10 @@ _TESTS = {
     "rig": ("tests/rig", "tests/faults/test_capture_faults.py", "tests/faults/test_stage_faults.py"),
 }
 PACKAGES = tuple(_TESTS)
-_COPIED = (*PACKAGES, "pipelines", "testing", "faintfield", "tests", "pyproject.toml")
+_COPIED = (
+    *(*PACKAGES, "pipelines", "testing", "faintfield", "benchmarks", "training"),
+    *("tests", "docs/plugins.md", "pyproject.toml"),
+)
 # Loaded once, before the forks; each process would spend seconds on them.
 _PRELOADED = (
     *("cv2", "hypothesis", "msgspec", "numba", "numpy.testing", "rich.console", "scipy.ndimage", "scipy.optimize"),
