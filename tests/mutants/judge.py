@@ -26,7 +26,7 @@ _TESTS = {
 }
 PACKAGES = tuple(_TESTS)
 _COPIED = (
-    *(*PACKAGES, "pipelines", "testing", "faintfield", "benchmarks", "training"),
+    *(*PACKAGES, "pipelines", "testing", "faintfield", "benchmarks"),
     *("tests", "docs/plugins.md", "pyproject.toml"),
 )
 # Loaded once, before the forks; each process would spend seconds on them.
