@@ -20,11 +20,15 @@ from faintfield.pipelines.pages.report_sets import SetSection
 # A plane of more samples is binned: a phone draws this many in a frame.
 _MAX_SAMPLES = 1_500_000
 
-# Bytes that all numbers together may take before base64: in any case, and for each picture.
-_MIN_BUDGET, _BUDGET_PER_PICTURE = 1_300_000, 115_000
+# Bytes that all numbers together may take before base64: in any case, and for each picture. Coarser steps are tried to
+# keep to it. Only numbers that take more even so, more than the last of these for each picture, are binned.
+_MIN_BUDGET, _BUDGET_PER_PICTURE, _MOST_PER_PICTURE = 1_300_000, 115_000, 250_000
 
 # The level of a sample without a number, and the highest of one with a number.
 UNKNOWN_LEVEL, _TOP_LEVEL = 65535, 65534
+
+# White of a picture of 8 bits.
+_TOP_GREY = 255
 
 # Median absolute difference of two samples of normal noise, in its standard deviations.
 _MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
@@ -167,36 +171,31 @@ def _first(
 def _views(the_set: SetSection, scales: dict[Kind, Scale]) -> list[ViewerPicture]:
     """Return the views that the page shows anyway, whose grey levels the script reads from there."""
     found: list[ViewerPicture] = []
-    overview = the_set.overview
-    common = {"words": "as recorded", "place": None, "bins": 1}
-    if the_set.pictures["view"] and overview.grey_scale_dn is not UNSET:
-        black, white = overview.grey_scale_dn
+    if the_set.pictures["view"] and the_set.overview.grey_scale_dn is not UNSET:
+        black, white = the_set.overview.grey_scale_dn
         scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
-        found.append(
-            ViewerPicture(
-                kind="view",
-                title="One view",
-                unit="DN",
-                low=black,
-                step=(white - black) / 255,
-                element="recorded-view",
-                **common,
-            )
-        )
+        step = (white - black) / _TOP_GREY
+        found.append(_view("view", "One view", "as recorded", "DN", black, step, "recorded-view"))
     if the_set.pictures["bright"]:
-        scales["bright"] = {"black": 0.0, "white": 255.0, "name": "bright view"}
-        found.append(
-            ViewerPicture(
-                kind="bright",
-                title="The same view in plenty of light",
-                unit="of 255 grey levels",
-                low=0.0,
-                step=1.0,
-                element="bright-view",
-                **(common | {"words": "preview"}),
-            )
-        )
+        scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
+        title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"
+        found.append(_view("bright", title, "preview", unit, 0.0, 1.0, "bright-view"))
     return found
+
+
+def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float, element: str) -> ViewerPicture:
+    """Return a view, which stands at no depth."""
+    return {
+        "kind": kind,
+        "title": title,
+        "words": words,
+        "place": None,
+        "unit": unit,
+        "low": low,
+        "step": step,
+        "bins": 1,
+        "element": element,
+    }
 
 
 @dataclass(frozen=True)
@@ -221,12 +220,14 @@ def _plane_pictures(
         if (sigma := plane.sigma_e()) is not None:
             sources.append(_Source(plane, "sigma", f"σ of {title}", place, sigma))
     budget = max(_MIN_BUDGET, _BUDGET_PER_PICTURE * len(sources))
+    most = max(_MIN_BUDGET, _MOST_PER_PICTURE * len(sources))
     bins = [_bins(source.numbers) for source in sources]
     while True:
         binned = [_binned(source.numbers, by) for source, by in zip(sources, bins, strict=True)]
         for fineness in _FINENESSES:
             packed = [pack(numbers, fineness.step(numbers)) for numbers in binned]
-            if sum(len(one.png) for one in packed) <= budget:
+            limit = most if fineness is _FINENESSES[-1] else budget
+            if sum(len(one.png) for one in packed) <= limit:
                 return [_picture(*each, units) for each in zip(sources, packed, bins, strict=True)]
         bins = [by + 1 for by in bins]
 

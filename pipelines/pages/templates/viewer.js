@@ -384,8 +384,8 @@ const viewer = (() => {
       pen.fillRect(across(scale.black), 0, across(scale.white) - across(scale.black), height);
       found.forEach((one, index) => {
         // Bins of as many levels each: others would be a comb where levels are few
-        const levelsPerBin = Math.max(1, Math.ceil((axis[1] - axis[0]) / BINS / (one.step || 1)));
-        const wide = levelsPerBin * (one.step || (axis[1] - axis[0]) / BINS), from = one.low - wide / 2 - wide * Math.ceil((one.low - axis[0]) / wide);
+        const grain = Math.max(one.step || (axis[1] - axis[0]) / BINS, one.unit === "DN" && one.element ? 1 : 0);
+        const wide = grain * Math.max(1, Math.ceil((axis[1] - axis[0]) / BINS / grain)), from = one.low - wide / 2 - wide * Math.ceil((one.low - axis[0]) / wide);
         const heights = new Float64Array(Math.ceil((axis[1] - from) / wide) + 1);
         for (let level = 0; level < UNKNOWN; level++) if (one.counts[level]) {
           const bin = Math.floor((number(one, level) - from) / wide + 1e-6);
@@ -465,7 +465,7 @@ const viewer = (() => {
   const keys = {
     "+": () => zoomBy(1.5), "=": () => zoomBy(1.5), "-": () => zoomBy(1 / 1.5), 0: whole, 1: oneToOne,
     ",": () => wipeTo(state.wipe - 0.02), ".": () => wipeTo(state.wipe + 0.02), x: swap, r: readAloud, m: () => controls.forEach(one => one.auto.click()),
-    l: () => layOut({ wipe: "pair", pair: "all", all: "wipe" }[state.layout]), Backspace: reset,
+    l: () => layOut({ wipe: "pair", pair: "all", all: "wipe" }[state.layout]), backspace: reset,
     ...(steps ? { "[": () => toPlaceOf(Math.max((picture(B).place ?? 0) - 1, 0)), "]": () => toPlaceOf(Math.min((picture(B).place ?? 0) + 1, places.length - 1)), " ": playOrStop } : {}),
   };
   stage.addEventListener("keydown", event => {
