@@ -78,7 +78,8 @@ const viewer = (() => {
   }
 
   // ---- What is shown -------------------------------------------------------------------------------------------
-  const asOpened = () => ({ zoom: 1, u: 0.5, v: 0, wipe: 0.5 });
+  // Of a dark view beside a plane most of the plane is shown: there is little to see in the view
+  const asOpened = () => ({ zoom: 1, u: 0.5, v: 0, wipe: pictures[data.first[0]].place === null ? 0.25 : 0.5 });
   const state = { shown: [...data.first], layout: "wipe", cursor: null, ...asOpened() };
   const opened = structuredClone(scales);
   const stage = make("div", { className: "v-stage", tabIndex: 0, role: "application", "aria-roledescription": "picture viewer",
@@ -227,7 +228,7 @@ const viewer = (() => {
       const told = state.cursor && state.layout === "all" ? valueAt(cell.one, ...state.cursor) : null;
       const side = cell.side === null ? "" : "AB"[cell.side] + ": ";
       const small = cell.w < 240, inset = small ? 3 : 8, words = state.layout === "all" && cell.one.place !== null ? cell.one.title : name(cell.one);
-      label(side + (told ? told.value + ": " : "") + words, right ? width - 8 : cell.x + inset, cell.y + inset, right, wiped ? width / 2 - 28 : cell.w - 24, small ? 11 : 13);
+      label(side + (told ? told.value + ": " : "") + words, right ? width - 8 : cell.x + inset, cell.y + inset, right, wiped ? Math.max(right ? width - at : at, 120) - 30 : cell.w - 24, small ? 11 : 13);
       // Planes at one depth have one scale, and small pictures no room for it in each
       if (!small || cell === lastWithScale) drawBar(cell, right);
     }
@@ -299,6 +300,7 @@ const viewer = (() => {
     state.layout = layout;
     for (const [key, button] of Object.entries(layouts)) button.setAttribute("aria-pressed", key === layout);
     wipe.disabled = layout !== "wipe";
+    fillScales();
     fit();
     draw();
   }
@@ -340,7 +342,7 @@ const viewer = (() => {
   const scalesBox = make("div", { className: "v-scales" });
   let controls = [];
   function fillScales() {
-    const kinds = [...new Set([picture(A).kind, picture(B).kind])];
+    const kinds = [...new Set([picture(A), picture(B), ...(state.layout === "all" ? all() : [])].map(one => one.kind))];
     if (controls.map(one => one.kind).join() !== kinds.join()) {
       controls = kinds.map(scaleControl);
       scalesBox.replaceChildren(...controls.map(one => one.box));
@@ -350,7 +352,8 @@ const viewer = (() => {
   /** Minimum and maximum of one kind of pictures: handles on a histogram, numbers, and buttons. */
   function scaleControl(kind) {
     const scale = scales[kind], unit = pictures.find(one => one.kind === kind).unit;
-    const shown = () => [A, B].map(picture).filter(one => one.kind === kind && one.levels);
+    const ofKind = found => found.filter(one => one.kind === kind && one.levels);
+    const shown = () => { const chosen = ofKind([A, B].map(picture)); return chosen.length ? chosen : ofKind(all()).slice(0, 2); };
     const plot = make("canvas", { role: "img", "aria-label": "Histogram of " + scale.name });
     const range = end => make("input", { type: "range", step: "any", id: "v-" + end + "-" + kind, "aria-label": (end === "black" ? "Black" : "White") + " of the " + scale.name + ", " + unit, oninput: event => set(end, Number(event.target.value)) });
     const typed = end => make("input", { type: "number", step: "any", id: "v-" + end + "-number-" + kind, onchange: event => { if (event.target.value) set(end, Number(event.target.value)); } });
@@ -391,10 +394,10 @@ const viewer = (() => {
           const bin = Math.floor((number(one, level) - from) / wide + 1e-6);
           if (bin >= 0 && bin < heights.length) heights[bin] += one.counts[level];
         }
-        const top = Math.sqrt(heights.reduce((most, it) => Math.max(most, it), 1));
+        const top = Math.log1p(heights.reduce((most, it) => Math.max(most, it), 1));
         pen.beginPath();
         pen.moveTo(0, height);
-        heights.forEach((count, bin) => { const y = height * (1 - 0.95 * Math.sqrt(count) / top); pen.lineTo(across(from + bin * wide), y); pen.lineTo(across(from + (bin + 1) * wide), y); });
+        heights.forEach((count, bin) => { const y = height * (1 - 0.95 * Math.log1p(count) / top); pen.lineTo(across(from + bin * wide), y); pen.lineTo(across(from + (bin + 1) * wide), y); });
         pen.lineTo(width, height);
         pen.lineWidth = 1.5 * devicePixelRatio;
         pen.strokeStyle = style.getPropertyValue(one === picture(B) ? "--accent" : "--second");
@@ -413,7 +416,7 @@ const viewer = (() => {
       draw();
     }, "Scale of the " + scale.name + " by what is shown: 0.2 % black, 0.2 % white");
     const back = button("As opened", () => { Object.assign(scale, opened[kind]); update(); draw(); });
-    const box = make("fieldset", {}, make("legend", {}, "Grey scale of the " + scale.name + ", " + unit + " (histogram: square root of counts)"),
+    const box = make("fieldset", {}, make("legend", {}, "Grey scale of the " + scale.name + ", " + unit + " (histogram: logarithm of counts)"),
       make("div", { className: "v-histogram" }, plot, ends.black[0], ends.white[0]),
       make("div", { className: "v-numbers" }, make("label", {}, "black ", ends.black[1]), make("label", {}, "white ", ends.white[1]), auto, back));
     return { kind, box, update, auto };
