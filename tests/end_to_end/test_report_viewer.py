@@ -13,7 +13,10 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
+from faintfield.pipelines import pages
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.pages.page import smaller_uri
+from faintfield.pipelines.pages.report_viewer import Viewer, pack
 from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
@@ -476,3 +479,60 @@ def test_it_fits_any_screen(width: int, page: Tab) -> None:
 
 def test_the_page_is_small(folder: Path) -> None:
     assert (folder / "report.html").stat().st_size < MOST_BYTES
+
+
+def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
+    """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
+    packed = pack(numbers, 1e-3)
+    shown: Viewer = {
+        "pictures": [
+            {
+                "kind": "light",
+                "title": "PMLEM",
+                "words": "500 mm",
+                "place": 0,
+                "unit": "e⁻ per pixel",
+                "low": packed.low,
+                "step": packed.step,
+                "bins": 1,
+                "pitch": 0.5,
+                "origin": (-10.0, 20.0),
+                "src": smaller_uri(packed.png),
+            }
+        ],
+        "scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}},
+        "places": ["500 mm"],
+        "quantity": "depth",
+        "length": "mm",
+        "binned": False,
+        "first": (0, 0),
+    }
+    templates = Path(pages.__path__[0]) / "templates"
+    script, style = ((templates / name).read_text() for name in ("viewer.js", "viewer.css"))
+    (folder / "alone.html").write_text(
+        f'<!doctype html><meta charset="utf-8"><style>{style}</style><section id="viewer"></section>'
+        f'<script type="application/json" id="viewer-data">{json.dumps(shown)}</script><script>{script}</script>'
+    )
+    return (folder / "alone.html").as_uri()
+
+
+def test_colours_and_samples_without_numbers_are_read_out(browser: Tab, tmp_path: Path) -> None:
+    numbers = np.random.default_rng(3).normal(1.0, 0.5, (30, 40, 3)).astype(np.float32)
+    numbers[5, 6] = np.nan
+    _resize(browser, 1200)
+    browser.open("about:blank")
+    browser.open(_page_of(numbers, tmp_path))
+    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    left, top, width, height = _box(browser)
+    size, v = _state(browser, "size"), _state(browser, "v")
+    for row, column in ((10, 20), (29, 39), (5, 6)):
+        x = left + width / 2 + ((column + 0.5) / 40 - 0.5) * size
+        _mouse(browser, "mouseMoved", x, top + height / 2 + ((row + 0.5) / 40 - v) * size)
+        _drawn(browser)
+        told = re.search(r"R (.+), G (.+), B (.+) e⁻ per pixel", _told(browser))
+        assert told is not None, _told(browser)
+        if (row, column) == (5, 6):
+            assert told.groups() == ("not known",) * 3
+        else:
+            np.testing.assert_allclose([float(word) for word in told.groups()], numbers[row, column], atol=1.1e-3)
+    assert browser.complaints == []
