@@ -1,7 +1,8 @@
 """Make the pictures of README.md and the guide from a finished demo: `python docs/draw_pictures.py demo`.
 
 Run it from the root of the repository. Chromium takes the pictures of the pages. That of a capture shows a session on a
-simulated rig, which is started for it.
+simulated rig, which is started for it. `python docs/draw_pictures.py demo FOLDER` takes the viewer of its report
+instead, on screens of three widths, bright and dark, and puts the pictures into the folder.
 """
 
 import base64
@@ -27,6 +28,12 @@ _TRUCK, _AIRPLANE = "plane_00500.0.tiff", "plane_00700.0.tiff"
 _PENALISED = ("pmlem", "pmlem-osl")
 _WIDTH_PX = 1000
 _PAGES = (("report", "report.html", 1250), ("stage", "geometry.html", 1250))
+
+# Widths and heights of the screens on which the viewer is shown.
+_SCREENS = ((1400, 1250), (1024, 1100), (390, 1500))
+
+# What the guide shows of it: its name, the layout's button, and the share of the left picture.
+_LAYOUTS = (("wipe", "Wipe", 0.42), ("pair", "Side by side", 0.5), ("all", "All", 0.5))
 
 
 def draw_planes(demo: Path) -> None:
@@ -58,7 +65,12 @@ def draw_pages(demo: Path) -> None:
             _resize(tab, height_px)
             tab.open(_first(demo, page).resolve().as_uri())
             tab.wait_until("document.readyState == 'complete' && location.protocol == 'file:'")
+            tab.wait_until("!document.getElementById('viewer') || document.querySelector('.v-stage')?.dataset.ready")
             _take(tab, name)
+        _show_viewer(tab, demo, "All", 0.5)
+        tab.call("Emulation.setDeviceMetricsOverride", width=1100, height=1140, deviceScaleFactor=1, mobile=False)
+        tab.evaluate("document.getElementById('viewer').scrollIntoView()")
+        _take(tab, "viewer")
         _resize(tab, 600)
         with _capturing(Path(scratch)) as address:
             tab.open(address)
@@ -68,6 +80,38 @@ def draw_pages(demo: Path) -> None:
             tab.click("go")
             tab.wait_until("parseInt(document.getElementById('count').textContent) >= 20")
             _take(tab, "capture")
+
+
+def draw_viewer(demo: Path, folder: Path) -> None:
+    """Take the viewer of a report on screens of all widths, bright and dark, in each of its layouts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory() as scratch, open_browser(Path(scratch) / "browser") as tab:
+        tab.call("Emulation.setScrollbarsHidden", hidden=True)
+        for width_px, height_px in _SCREENS:
+            for scheme in ("light", "dark"):
+                feature = {"name": "prefers-color-scheme", "value": scheme}
+                tab.call("Emulation.setEmulatedMedia", media="", features=[feature])
+                size = {"width": width_px, "height": height_px}
+                tab.call("Emulation.setDeviceMetricsOverride", **size, deviceScaleFactor=1, mobile=width_px < 500)
+                for name, button, share in _LAYOUTS:
+                    _show_viewer(tab, demo, button, share)
+                    taken = tab.call("Page.captureScreenshot", format="png")["data"]
+                    (folder / f"viewer_{name}_{width_px}_{scheme}.png").write_bytes(base64.b64decode(taken))
+        if tab.complaints:
+            raise AssertionError(tab.complaints)
+
+
+def _show_viewer(tab: Tab, demo: Path, button: str, share: float) -> None:
+    """Open the report with its viewer at the top, in a layout, with the line at a share of the width."""
+    tab.open("about:blank")
+    tab.open(_first(demo, "report.html").resolve().as_uri())
+    tab.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    tab.evaluate(
+        f"[...document.querySelectorAll('#viewer button')].find(it => it.textContent === '{button}').click(); "
+        f"(it => {{ it.value = {share}; it.dispatchEvent(new Event('input')); }})(document.getElementById('v-wipe')); "
+        "document.getElementById('viewer').scrollIntoView(); "
+        "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done())))"
+    )
 
 
 @contextmanager
@@ -134,6 +178,9 @@ def _first(demo: Path, name: str) -> Path:
 
 if __name__ == "__main__":
     finished = Path(sys.argv[1])
+    if len(sys.argv) > 2:
+        draw_viewer(finished, Path(sys.argv[2]))
+        sys.exit()
     draw_planes(finished)
     draw_noise_page(finished)
     draw_pages(finished)

@@ -37,6 +37,7 @@ from faintfield.pipelines.pages.report_pictures import plane_sections
 from faintfield.pipelines.pages.report_planes import error_sections, method_title, read_planes
 from faintfield.pipelines.pages.report_sets import SetSection, set_sections
 from faintfield.pipelines.pages.report_surface import surface_sections
+from faintfield.pipelines.pages.report_viewer import viewer_of
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,7 @@ def write_report(directory: Path, *, noise: Path | None = None, geometry: Path |
         facts=facts,
         sets=sets,
         **vars(shown),
+        viewer=viewer_of(planes, shown, the_set),
         depth_maps=depth_sections(directory, results),
         surfaces=surface_sections(directory, surfaces),
         noise=of_noise,

@@ -15,7 +15,7 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.geometry import GEOMETRY_PAGE, GeometryRecord, read_geometry
 from faintfield.pipelines.formats.results.noise import Measured, NoiseRecord, read_noise
 from faintfield.pipelines.formats.results.result_files import file_within
-from faintfield.pipelines.pages.page import data_uri
+from faintfield.pipelines.pages.page import smaller_uri
 
 if TYPE_CHECKING:
     from faintfield.pipelines.pages.geometry_page import Row
@@ -106,7 +106,7 @@ def noise_section(directory: Path, path: Path, inputs: Set[str]) -> NoiseSection
     pages = [file_within(path.parent, page.name) for page in sorted(path.parent.glob("noise_page*.png"))]
     return NoiseSection(
         **_origin(directory, path, inputs),
-        pages=[(_link(directory, page), data_uri(read_content(page, MAX_PREVIEW_BYTES), ".png")) for page in pages],
+        pages=[(_link(directory, page), smaller_uri(read_content(page, MAX_PREVIEW_BYTES))) for page in pages],
         made=record.provenance,
         record=record,
         rows=[

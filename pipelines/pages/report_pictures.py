@@ -22,8 +22,8 @@ from faintfield.pipelines.pages.report_planes import Plane, best_column, column_
 # Largest number of depths side by side; more are shown on a slider only.
 _MAX_ROWS = 6
 
-# Widths of the pictures side by side and on the sliders.
-_GRID_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 800
+# Widths of the pictures side by side, of all that stand in one row, and on the sliders.
+_GRID_WIDTH_PX, _ROW_WIDTH_PX, _SLIDER_WIDTH_PX = 640, 1920, 800
 
 # Ends of the scale of what the data moved, in standard deviations.
 _MOST_MOVED = 3.0
@@ -57,12 +57,11 @@ class Proposed(NamedTuple):
 
 
 class Slide(TypedDict):
-    """One picture of the sliders as a data URI, and the samples across the plane; JSON for the page's script."""
+    """One picture of the sliders, which the page's script takes from the viewer, and the samples across the plane."""
 
     depth: float
     words: str
     samples: int
-    src: str
 
 
 class SliderColumn(TypedDict):
@@ -92,6 +91,8 @@ class PlaneSections:
         Titles, and pictures side by side.
     slider, slider_column, slider_depth : list, int, int
         The sliders, and what they show first.
+    slider_picture, slider_width_px : str, int
+        The picture that they show first, and the largest width of theirs.
     proposals : list of Proposed
         What a prior proposed, where that was saved.
     depths : int
@@ -114,6 +115,8 @@ class PlaneSections:
     slider: list[SliderColumn] | None = None
     slider_column: int = 0
     slider_depth: int = 0
+    slider_picture: str | None = None
+    slider_width_px: int = _SLIDER_WIDTH_PX
     sigmas: Sigmas | None = None
     proposals: list[Proposed] = field(default_factory=list)
     depths: int = 0
@@ -138,12 +141,17 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
     of_best = [plane for plane in planes if plane.column == best]
     records = [record for plane in of_best for record in plane.records]
     place = columns.index(best)
+    several = len(places) > 1 or len(columns) > 1
+    slider_depth = _first_depth([depth for depth, _ in places], focus)
+    first_slide = _in_order(planes, best)[: slider_depth + 1][-1]
     return PlaneSections(
         best=of_best[0],
         best_title=titles[best],
         left_out=next((record.occlusion_left_out for record in records if record.occlusion_left_out), None),
         blurred=len(places) > 1 and of_best[0].method not in JOINT_METHODS,
-        best_planes=[(row.words, picture) for row in rows if (picture := row.cells[place])],
+        best_planes=[
+            (row.words, cell) for row in _side_by_side(of_best, [best], shown, white) for cell in row.cells if cell
+        ],
         weight_curves=weight_curves(of_best),
         certificates=[
             (plane.words, record.certificate)
@@ -153,9 +161,10 @@ def plane_sections(planes: list[Plane], results: Iterable[ReconstructionRecord])
         ],
         columns=list(titles.values()),
         rows=rows,
-        slider=_slider(planes, titles, white) if len(places) > 1 or len(columns) > 1 else None,
+        slider=_slider(planes, titles) if several else None,
         slider_column=place,
-        slider_depth=_first_depth([depth for depth, _ in places], focus),
+        slider_depth=slider_depth,
+        slider_picture=_picture(first_slide.pixels(), white, _SLIDER_WIDTH_PX, ".jpg") if several else None,
         sigmas=_sigmas(planes, titles, shown),
         proposals=_proposals(planes, titles, shown, white),
         depths=len(places),
@@ -193,10 +202,11 @@ def _shown_depths(depths: list[float], focus: FocusCurve | None) -> list[float]:
 def _side_by_side(planes: list[Plane], columns: list[str], depths: list[float], white: float) -> list[Row]:
     """Return the pictures side by side: a row per depth, and per plane given by a pose; a cell per column."""
     by_place = {(plane.place, plane.column): plane for plane in planes}
+    width_px = min(_GRID_WIDTH_PX, _ROW_WIDTH_PX // len(columns))
     rows = []
     for place in sorted({plane.place for plane in planes if plane.name or plane.depth_mm in depths}):
         found = (by_place.get((place, column)) for column in columns)
-        cells = [None if plane is None else _picture(plane.pixels(), white, _GRID_WIDTH_PX, ".png") for plane in found]
+        cells = [None if plane is None else _picture(plane.pixels(), white, width_px, ".png") for plane in found]
         rows.append(Row(plane_words(planes[0].units, *place), cells))
     return rows
 
@@ -235,24 +245,22 @@ def _proposals(planes: list[Plane], titles: dict[str, str], depths: list[float],
     return found
 
 
-def _slider(planes: list[Plane], titles: dict[str, str], white: float) -> list[SliderColumn]:
-    """Return the pictures of the sliders: the planes of each column by depth."""
+def _slider(planes: list[Plane], titles: dict[str, str]) -> list[SliderColumn]:
+    """Return what the sliders show: the planes of each column by depth."""
     columns: list[SliderColumn] = []
     for column, title in titles.items():
-        ordered = sorted((plane for plane in planes if plane.column == column), key=lambda plane: plane.place)
-        columns.append({"title": title, "planes": [_slide(plane, white) for plane in ordered]})
+        columns.append({"title": title, "planes": [_slide(plane) for plane in _in_order(planes, column)]})
     return columns
 
 
-def _slide(plane: Plane, white: float) -> Slide:
+def _slide(plane: Plane) -> Slide:
     """Return one picture of the sliders."""
-    pixels = plane.pixels()
-    return {
-        "depth": plane.depth_mm,
-        "words": plane.words,
-        "samples": pixels.shape[1],
-        "src": _picture(pixels, white, _SLIDER_WIDTH_PX, ".jpg"),
-    }
+    return {"depth": plane.depth_mm, "words": plane.words, "samples": plane.pixels().shape[1]}
+
+
+def _in_order(planes: list[Plane], column: str) -> list[Plane]:
+    """Return the planes of a column by depth."""
+    return sorted((plane for plane in planes if plane.column == column), key=lambda plane: plane.place)
 
 
 def _first_depth(depths: list[float], focus: FocusCurve | None) -> int:

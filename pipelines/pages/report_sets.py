@@ -12,7 +12,7 @@ from faintfield.pipelines.formats.reading import read_content
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.result_files import file_within, read_result
 from faintfield.pipelines.formats.units import units_of
-from faintfield.pipelines.pages.page import data_uri
+from faintfield.pipelines.pages.page import smaller_uri
 from faintfield.pipelines.pages.report_planes import PREFERRED_POSES
 from faintfield.pipelines.reconstruction.overview import (
     BRIGHT_VIEW,
@@ -25,6 +25,9 @@ from faintfield.recon.metrics import noise_variance_e2
 
 # Width of a picture that is shown pixel for pixel: two stand side by side.
 _PIXELS_ACROSS = 540
+
+# Quality of the picture of all views, most of which is noise: it would be a fifth of the page without losses.
+_OVERVIEW_QUALITY = 60
 
 
 @dataclass(frozen=True)
@@ -101,7 +104,7 @@ def _section(folder: Path, overview: Overview) -> SetSection:
     """Return what the page shows of one set."""
     view = folder / REFERENCE_VIEW
     pictures = {
-        "integral": _whole(folder / INTEGRAL_IMAGE),
+        "integral": _whole(folder / INTEGRAL_IMAGE, _OVERVIEW_QUALITY),
         "bright": _whole(folder / BRIGHT_VIEW),
         "region": _whole(folder / REGION_OUTLINED),
         "pixels": _pixel_for_pixel(view),
@@ -111,9 +114,12 @@ def _section(folder: Path, overview: Overview) -> SetSection:
     return SetSection(overview, overview.read_noise_e == 0, photon_budget(overview), pictures)
 
 
-def _whole(path: Path) -> str | None:
-    """Return a picture as it is."""
-    return data_uri(read_content(path, MAX_PREVIEW_BYTES), ".png") if path.is_file() else None
+def _whole(path: Path, quality: int | None = None) -> str | None:
+    """Return a whole picture, as it is unless a quality of WebP is given."""
+    content = read_content(path, MAX_PREVIEW_BYTES) if path.is_file() else None
+    if content is None:
+        return None
+    return smaller_uri(content) if quality is None else smaller_uri(content, quality)
 
 
 def _pixel_for_pixel(path: Path) -> str | None:
@@ -122,7 +128,7 @@ def _pixel_for_pixel(path: Path) -> str | None:
         return None
     picture = read_frame(path).pixels_dn
     (top, left) = ((size - min(size, _PIXELS_ACROSS)) // 2 for size in picture.shape[:2])
-    return data_uri(encoded(picture[top : top + _PIXELS_ACROSS, left : left + _PIXELS_ACROSS], ".png"), ".png")
+    return smaller_uri(encoded(picture[top : top + _PIXELS_ACROSS, left : left + _PIXELS_ACROSS], ".png"))
 
 
 def _thinned(path: Path) -> str | None:
@@ -131,7 +137,7 @@ def _thinned(path: Path) -> str | None:
         return None
     picture = read_frame(path).pixels_dn
     step = -(-picture.shape[1] // (2 * _PIXELS_ACROSS))
-    return data_uri(encoded(picture[::step, ::step], ".png"), ".png")
+    return smaller_uri(encoded(picture[::step, ::step], ".png"))
 
 
 def photon_budget(overview: Overview) -> PhotonBudget | None:

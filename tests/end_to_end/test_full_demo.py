@@ -3,20 +3,32 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 pytestmark = pytest.mark.slow
 
+MOST_BYTES_OF_THE_REPORT = 5_000_000
+
 
 @pytest.fixture(scope="module")
-def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("full") / "demo"
     call = "import sys; from faintfield.pipelines.cli import main; main(sys.argv[1:])"
     ended = subprocess.run([sys.executable, "-c", call, "demo", str(out)], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
-    return dict(json.loads((out / "metrics.json").read_text()))
+    return out
+
+
+@pytest.fixture(scope="module")
+def metrics(demo: Path) -> dict[str, Any]:
+    return dict(json.loads((demo / "metrics.json").read_text()))
+
+
+def test_its_report_can_be_sent_by_mail(demo: Path) -> None:
+    assert (demo / "report.html").stat().st_size <= MOST_BYTES_OF_THE_REPORT
 
 
 def test_the_camera_was_found_where_it_was(metrics: dict[str, Any]) -> None:

@@ -114,7 +114,7 @@ def test_every_picture_can_be_decoded(text: str, page: _Page) -> None:
     assert len(sources) >= 3 + 3 * 2 + 3 * 2  # the set, the planes side by side, the slider
     for source in sources:
         kind, content = source.split(";base64,")
-        assert kind in ("data:image/png", "data:image/jpeg")
+        assert kind in ("data:image/png", "data:image/jpeg", "data:image/webp")
         picture = cv2.imdecode(np.frombuffer(base64.b64decode(content), np.uint8), cv2.IMREAD_UNCHANGED)
         assert picture is not None
 

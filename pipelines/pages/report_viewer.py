@@ -1,0 +1,305 @@
+"""What the viewer of a report shows: numbers packed in lossless pictures that the page's script decodes, and scales."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NotRequired, TypedDict
+
+import cv2
+import numpy as np
+from msgspec import UNSET
+from numpy.typing import NDArray
+
+from faintfield.pipelines.formats.image_files import encoded
+from faintfield.pipelines.formats.results.records import JOINT_METHODS
+from faintfield.pipelines.formats.units import StatedUnits
+from faintfield.pipelines.pages.page import smaller_uri
+from faintfield.pipelines.pages.report_pictures import PlaneSections
+from faintfield.pipelines.pages.report_planes import Plane, best_column, column_titles
+from faintfield.pipelines.pages.report_sets import SetSection
+
+# A plane of more samples is binned: a phone draws this many in a frame.
+_MAX_SAMPLES = 1_500_000
+
+# Bytes that all numbers together may take before base64: in any case, and for each picture. Coarser steps are tried to
+# keep to it. Only numbers that take more even so, more than the last of these for each picture, are binned.
+_MIN_BUDGET, _BUDGET_PER_PICTURE, _MOST_PER_PICTURE = 1_300_000, 115_000, 250_000
+
+# The level of a sample without a number, and the highest of one with a number.
+UNKNOWN_LEVEL, _TOP_LEVEL = 65535, 65534
+
+# White of a picture of 8 bits.
+_TOP_GREY = 255
+
+# Median absolute difference of two samples of normal noise, in its standard deviations.
+_MEDIAN_DIFFERENCE = 0.6745 * np.sqrt(2)
+
+type Kind = Literal["light", "sigma", "view", "bright"]
+
+
+@dataclass(frozen=True)
+class Fineness:
+    """Largest step of the numbers of a plane: the greater of a share of its noise and of its range."""
+
+    of_noise: float
+    of_range: float
+
+    def step(self, plane: NDArray[np.floating]) -> float:
+        """Return the step for a plane; levels up to `_TOP_LEVEL` are enough for its range."""
+        finite = plane[np.isfinite(plane)]
+        reach = float(np.ptp(finite)) if finite.size else 0.0
+        return max(reach / _TOP_LEVEL, self.of_noise * _noise(plane), self.of_range * reach)
+
+
+# Tried in turn until the numbers fit into their budget.
+_FINENESSES = (
+    Fineness(0, 0),
+    Fineness(1 / 16, 2**-13),
+    Fineness(1 / 8, 2**-12),
+    Fineness(1 / 4, 2**-11),
+    Fineness(1 / 3, 2**-10),
+    Fineness(1 / 2, 2**-9),
+    Fineness(1 / 2, 2**-8),
+)
+
+
+class ViewerPicture(TypedDict):
+    """One picture of the viewer; JSON for the page's script.
+
+    A number is `low + step * level`. `src` is a lossless picture with the high bytes of all levels above their low
+    bytes, or else `element` is the id of an 8-bit picture on the page. Lengths are those of the numbers after binning.
+    """
+
+    kind: Kind
+    title: str
+    words: str
+    place: int | None
+    unit: str
+    low: float
+    step: float
+    bins: int
+    pitch: NotRequired[float]
+    origin: NotRequired[tuple[float, float]]
+    src: NotRequired[str]
+    element: NotRequired[str]
+
+
+class Scale(TypedDict):
+    """Black and white of the pictures of one kind when the page opens."""
+
+    black: float
+    white: float
+    name: str
+
+
+class Viewer(TypedDict):
+    """What the viewer shows; JSON for the page's script.
+
+    `first` are the indices of the two pictures that it opens with, `length` is the unit of lengths on the planes, and
+    `binned` says whether any plane is.
+    """
+
+    pictures: list[ViewerPicture]
+    scales: dict[Kind, Scale]
+    places: list[str]
+    quantity: str
+    length: str
+    binned: bool
+    first: tuple[int, int]
+
+
+def viewer_of(planes: Sequence[Plane], shown: PlaneSections, the_set: SetSection | None) -> Viewer | None:
+    """Return what the viewer shows, None without planes.
+
+    Parameters
+    ----------
+    planes : sequence of Plane
+        All planes, in the order of the columns.
+    shown : PlaneSections
+        What else the page shows of them; the grey scales are the same.
+    the_set : SetSection, optional
+        The set whose views the page shows.
+    """
+    if not planes:
+        return None
+    units = planes[0].units
+    places = sorted({plane.place for plane in planes})
+    words = {plane.place: plane.words for plane in planes}
+    scales: dict[Kind, Scale] = {"light": {"black": 0.0, "white": shown.white, "name": "planes"}}
+    views = _views(the_set, scales) if the_set else []
+    numbers = _plane_pictures(planes, column_titles(list(planes)), places, units)
+    if shown.sigmas:
+        scales["sigma"] = {"black": 0.0, "white": shown.sigmas.white, "name": "standard deviations"}
+    pictures = [*views, *numbers]
+    return {
+        "pictures": pictures,
+        "scales": scales,
+        "places": [words[place] for place in places],
+        "quantity": units.quantity,
+        "length": units.length or "(unit of the poses)",
+        "binned": any(one["bins"] > 1 for one in numbers),
+        "first": _first(planes, shown, places, pictures),
+    }
+
+
+def _first(
+    planes: Sequence[Plane], shown: PlaneSections, places: list[tuple[float, str]], pictures: list[ViewerPicture]
+) -> tuple[int, int]:
+    """Return the pictures that the viewer opens with: what the best is compared with, and the best.
+
+    A plane of all planes together stands beside that of its own, any other beside a view as recorded.
+    """
+    best = best_column(list(planes))
+    titles = column_titles(list(planes))
+    of_best = [plane for plane in planes if plane.column == best]
+    wanted = places[min(shown.slider_depth, len(places) - 1)]
+    lead = min(of_best, key=lambda plane: abs(plane.depth_mm - wanted[0]))
+
+    def index_of(column: str) -> int | None:
+        """Return the index of the picture of a column at the place of the best one."""
+        keys = [(one["kind"], one["title"], one["place"]) for one in pictures]
+        key = ("light", titles[column], places.index(lead.place))
+        return keys.index(key) if key in keys else None
+
+    second = index_of(best) or 0
+    if lead.method in JOINT_METHODS:
+        alone = [plane for plane in planes if plane.method not in JOINT_METHODS and plane.place == lead.place]
+        if alone and (first := index_of(best_column(alone))) is not None:
+            return first, second
+    return 0 if second else min(1, len(pictures) - 1), second
+
+
+def _views(the_set: SetSection, scales: dict[Kind, Scale]) -> list[ViewerPicture]:
+    """Return the views that the page shows anyway, whose grey levels the script reads from there."""
+    found: list[ViewerPicture] = []
+    if the_set.pictures["view"] and the_set.overview.grey_scale_dn is not UNSET:
+        black, white = the_set.overview.grey_scale_dn
+        scales["view"] = {"black": black, "white": white, "name": "view as recorded"}
+        step = (white - black) / _TOP_GREY
+        found.append(_view("view", "One view", "as recorded", "DN", black, step, "recorded-view"))
+    if the_set.pictures["bright"]:
+        scales["bright"] = {"black": 0.0, "white": float(_TOP_GREY), "name": "bright view"}
+        title, unit = "The same view in plenty of light", f"of {_TOP_GREY} grey levels"
+        found.append(_view("bright", title, "preview", unit, 0.0, 1.0, "bright-view"))
+    return found
+
+
+def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float, element: str) -> ViewerPicture:
+    """Return a view, which stands at no depth."""
+    return {
+        "kind": kind,
+        "title": title,
+        "words": words,
+        "place": None,
+        "unit": unit,
+        "low": low,
+        "step": step,
+        "bins": 1,
+        "element": element,
+    }
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The numbers of a picture (row, column[, colour]), and what is said of it."""
+
+    plane: Plane
+    kind: Kind
+    title: str
+    place: int
+    numbers: NDArray[np.floating]
+
+
+def _plane_pictures(
+    planes: Sequence[Plane], titles: dict[str, str], places: list[tuple[float, str]], units: StatedUnits
+) -> list[ViewerPicture]:
+    """Return the planes and their standard deviations, as fine as their budget allows."""
+    sources = []
+    for plane in planes:
+        title, place = titles[plane.column], places.index(plane.place)
+        sources.append(_Source(plane, "light", title, place, plane.pixels()))
+        if (sigma := plane.sigma_e()) is not None:
+            sources.append(_Source(plane, "sigma", f"σ of {title}", place, sigma))
+    budget = max(_MIN_BUDGET, _BUDGET_PER_PICTURE * len(sources))
+    most = max(_MIN_BUDGET, _MOST_PER_PICTURE * len(sources))
+    bins = [_bins(source.numbers) for source in sources]
+    while True:
+        binned = [_binned(source.numbers, by) for source, by in zip(sources, bins, strict=True)]
+        for fineness in _FINENESSES:
+            packed = [pack(numbers, fineness.step(numbers)) for numbers in binned]
+            limit = most if fineness is _FINENESSES[-1] else budget
+            if sum(len(one.png) for one in packed) <= limit:
+                return [_picture(*each, units) for each in zip(sources, packed, bins, strict=True)]
+        bins = [by + 1 for by in bins]
+
+
+def _bins(numbers: NDArray[Any]) -> int:
+    """Return by how many samples a plane is binned along rows and columns, 1 if it is small enough."""
+    bins = 1
+    while (numbers.shape[0] // bins) * (numbers.shape[1] // bins) > _MAX_SAMPLES:
+        bins += 1
+    return bins
+
+
+def _binned(numbers: NDArray[np.floating], by: int) -> NDArray[np.floating]:
+    """Return the means of bins of `by` × `by` samples; incomplete bins at the end are left out."""
+    rows, columns = (max(size // by, 1) for size in numbers.shape[:2])
+    if by == 1 or min(numbers.shape[:2]) < by:
+        return numbers
+    size = (columns, rows)
+    return np.asarray(cv2.resize(numbers[: rows * by, : columns * by], size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Numbers as a PNG: a number is `low + step * level`, high bytes of the levels above low bytes."""
+
+    png: bytes
+    low: float
+    step: float
+
+
+def pack(numbers: NDArray[np.floating], step: float) -> Packed:
+    """Return numbers (row, column[, colour]) as a PNG twice as high, which a canvas of 8 bits can decode.
+
+    Parameters
+    ----------
+    numbers : array
+        Numbers that are not finite have the level `UNKNOWN_LEVEL`.
+    step : float
+        Difference of two levels, in the unit of the numbers; at least their range over 65534.
+    """
+    known = np.isfinite(numbers)
+    low = float(numbers[known].min()) if known.any() else 0.0
+    filled = np.where(known, numbers, low).astype(np.float64)
+    levels = np.rint((filled - low) / step) if step > 0 else np.zeros(numbers.shape)
+    codes = np.where(known, np.clip(levels, 0, _TOP_LEVEL), UNKNOWN_LEVEL).astype(np.uint16)
+    both = np.concatenate([(codes >> 8).astype(np.uint8), (codes & 255).astype(np.uint8)])
+    return Packed(encoded(both, ".png"), low, step)
+
+
+def _noise(plane: NDArray[np.floating]) -> float:
+    """Return the standard deviation of a plane's noise, from the differences of neighbours along rows."""
+    differences = np.abs(np.diff(plane, axis=1))
+    finite = differences[np.isfinite(differences)]
+    return float(np.median(finite) / _MEDIAN_DIFFERENCE) if finite.size else 0.0
+
+
+def _picture(source: _Source, packed: Packed, bins: int, units: StatedUnits) -> ViewerPicture:
+    """Return one plane for the page's script."""
+    record = source.plane.records[0]
+    pitch = record.pitch_mm
+    # The first bin's centre lies half a bin less half a sample from that of the first sample
+    x, y = (place + pitch * (bins - 1) / 2 for place in record.origin_mm)
+    return {
+        "kind": source.kind,
+        "title": source.title,
+        "words": source.plane.words,
+        "place": source.place,
+        "unit": units.light_per_pixel,
+        "low": packed.low,
+        "step": packed.step,
+        "bins": bins,
+        "pitch": pitch * bins,
+        "origin": (x, y),
+        "src": smaller_uri(packed.png),
+    }

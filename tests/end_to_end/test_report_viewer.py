@@ -1,0 +1,538 @@
+"""The viewer of a report in a real headless browser, from disk: hands, keys, and whether its numbers are true."""
+
+import base64
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines import pages
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.pages.page import smaller_uri
+from faintfield.pipelines.pages.report_viewer import Viewer, pack
+from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
+
+# Of files and pages, all numbers of a set this small and a little more.
+MOST_BYTES = 700_000
+
+FOLDERS = {"back-projection": "backprojection", "PMLEM (one-step-late, TV)": "pmlem-osl"}
+DEPTHS_MM = (500, 600, 700)
+VIRTUAL_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowUp": 38, "ArrowDown": 40, "Backspace": 8}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("viewer")
+    assert run(["simulate", str(folder / "set"), "--size-px", "96", "72", "--rows", "3", "--columns", "3"]) == 0
+    words = ["--method", "backprojection", "--method", "pmlem-osl", "--passes", "3", "--out", str(folder / "out")]
+    assert run(["reconstruct", str(folder / "set"), "--sweep-mm", "500:700:3", *words]) == 0
+    return folder / "out"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
+        yield tab
+
+
+@pytest.fixture
+def page(browser: Tab, folder: Path) -> Iterator[Tab]:
+    browser.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": "light"}])
+    _resize(browser, 1200)
+    browser.open("about:blank")
+    browser.open((folder / "report.html").as_uri())
+    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    browser.evaluate("document.querySelector('.v-stage').scrollIntoView()")
+    _drawn(browser)
+    yield browser
+    assert browser.complaints == []
+
+
+def _resize(tab: Tab, width: int) -> None:
+    tab.call("Emulation.setDeviceMetricsOverride", width=width, height=1000, deviceScaleFactor=1, mobile=width < 500)
+
+
+def _drawn(tab: Tab) -> None:
+    """Wait until what was asked for is drawn."""
+    tab.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def _state(tab: Tab, name: str) -> float:
+    return float(tab.evaluate(f"document.querySelector('.v-stage').dataset.{name}"))
+
+
+def _box(tab: Tab, selector: str = ".v-stage") -> tuple[float, float, float, float]:
+    """Return left, top, width and height of an element on the screen, in pixels."""
+    box = f"document.querySelector('{selector}').getBoundingClientRect()"
+    left, top, width, height = tab.evaluate(f"(box => [box.left, box.top, box.width, box.height])({box})")
+    return left, top, width, height
+
+
+def _mouse(tab: Tab, kind: str, x: float, y: float, **more: Any) -> None:
+    tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+
+def _drag(tab: Tab, start: tuple[float, float], by: tuple[float, float]) -> None:
+    held: dict[str, Any] = {"button": "left", "buttons": 1}
+    _mouse(tab, "mouseMoved", *start)
+    _mouse(tab, "mousePressed", *start, clickCount=1, **held)
+    for part in (0.5, 1.0):
+        _mouse(tab, "mouseMoved", start[0] + part * by[0], start[1] + part * by[1], **held)
+    _mouse(tab, "mouseReleased", start[0] + by[0], start[1] + by[1], button="left")
+    _drawn(tab)
+
+
+def _press(tab: Tab, *keys: str, shift: bool = False) -> None:
+    """Press keys while the pictures have the focus."""
+    tab.evaluate("document.querySelector('.v-stage').focus()")
+    for key in keys:
+        text = {} if len(key) > 1 else {"text": key}
+        code = {"windowsVirtualKeyCode": VIRTUAL_KEYS[key]} if key in VIRTUAL_KEYS else {}
+        tab.call("Input.dispatchKeyEvent", type="keyDown", key=key, modifiers=8 * shift, **text, **code)
+        tab.call("Input.dispatchKeyEvent", type="keyUp", key=key)
+    _drawn(tab)
+
+
+def _choose(tab: Tab, side: str, words: str) -> None:
+    """Choose a picture by its name."""
+    tab.evaluate(
+        f"(() => {{ const one = document.getElementById('v-{side}'); "
+        f"one.value = [...one.options].find(it => it.text === {json.dumps(words)}).value; "
+        "one.dispatchEvent(new Event('change')); })()"
+    )
+    _drawn(tab)
+
+
+def _chosen(tab: Tab, side: str) -> str:
+    return str(tab.evaluate(f"document.getElementById('v-{side}').selectedOptions[0].text"))
+
+
+def _click(tab: Tab, words: str) -> None:
+    tab.evaluate(
+        f"[...document.querySelectorAll('#viewer button')].find(it => it.textContent === {json.dumps(words)}).click()"
+    )
+    _drawn(tab)
+
+
+def _set_wipe(tab: Tab, share: float) -> None:
+    tab.evaluate(
+        f"(it => {{ it.value = {share}; it.dispatchEvent(new Event('input')); }})(document.getElementById('v-wipe'))"
+    )
+    _drawn(tab)
+
+
+def _told(tab: Tab, side: str = "B") -> str:
+    return str(tab.evaluate(f"document.getElementById('v-out-{side}').innerText")).replace("−", "-")
+
+
+def _canvas(tab: Tab) -> NDArray[Any]:
+    """Return the pixels of the viewer's canvas (row, column, BGR)."""
+    uri = tab.evaluate("document.querySelector('.v-stage canvas').toDataURL()")
+    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.asarray(decoded)
+
+
+def _bar_px(tab: Tab) -> int:
+    """Return the length of the bar at the lower left, counted on the canvas."""
+    pixels = _canvas(tab)
+    white = (pixels[-14, 16:] == 255).all(axis=-1)  # the bar is 4 px high, 16 px from the left and from below
+    assert white[0]
+    return int(np.argmin(white))
+
+
+def _plane(folder: Path, title: str, depth_mm: int) -> tuple[NDArray[np.float32], dict[str, Any]]:
+    """Return a plane's numbers as its file has them, and its record."""
+    record = json.loads((folder / FOLDERS[title] / "reconstruction.json").read_text())
+    name = f"plane_{depth_mm:07.1f}.tiff"
+    found = next(one for one in record["planes"] if one["file"] == name)
+    return tifffile.imread(folder / FOLDERS[title] / name), found
+
+
+def test_the_page_leads_with_the_best_plane_beside_a_view(page: Tab) -> None:
+    assert _chosen(page, "A") == "One view, as recorded"
+    assert _chosen(page, "B").startswith("PMLEM (one-step-late, TV), ")
+    viewer, first = (page.evaluate(f"document.getElementById('{one}').offsetTop") for one in ("viewer", "result"))
+    assert viewer < first
+
+
+def test_the_numbers_under_the_cross_are_those_of_the_files(page: Tab, folder: Path) -> None:
+    left, top, width, height = _box(page)
+    size = _state(page, "size")
+    rng = np.random.default_rng(1)
+    for title in FOLDERS:
+        for depth_mm in DEPTHS_MM:
+            _choose(page, "B", f"{title}, {depth_mm} mm")
+            plane, record = _plane(folder, title, depth_mm)
+            row, column = (int(rng.integers(1, count - 1)) for count in plane.shape)
+            u0, v0 = width / 2 - 0.5 * size, height / 2 - _state(page, "v") * size
+            sample_px = size / plane.shape[1]
+            _mouse(page, "mouseMoved", left + u0 + (column + 0.5) * sample_px, top + v0 + (row + 0.5) * sample_px)
+            _drawn(page)
+            told = re.search(
+                r"(-?[\d.]+) e⁻ per pixel \(± (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)", _told(page)
+            )
+            assert told is not None, _told(page)
+            value, off, x_mm, y_mm = (float(word) for word in told.groups()[:4])
+            assert (int(told[5]), int(told[6])) == (column, row)
+            assert off < 1e-3
+            decimals = len(told[1].partition(".")[2])
+            assert value == pytest.approx(float(plane[row, column]), abs=1.05 * off + 0.5 * 10**-decimals)
+            x0_mm, y0_mm = record["origin_mm"]
+            assert x_mm == pytest.approx(x0_mm + column * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
+            assert y_mm == pytest.approx(y0_mm + row * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
+
+
+def test_both_pictures_are_read_at_one_place(page: Tab) -> None:
+    left, top, width, height = _box(page)
+    _mouse(page, "mouseMoved", left + 0.3 * width, top + 0.6 * height)
+    _drawn(page)
+    places = [re.search(r"column (\d+), row (\d+)", _told(page, side)) for side in "AB"]
+    assert places[0] is not None
+    assert places[1] is not None
+    assert places[0].groups() == places[1].groups()
+    assert " DN" in _told(page, "A")
+    assert "e⁻ per pixel" in _told(page, "B")
+
+
+def test_keys_zoom_about_the_middle_and_0_shows_all(page: Tab) -> None:
+    middle = _state(page, "u"), _state(page, "v")
+    _press(page, "+", "+")
+    assert _state(page, "zoom") == pytest.approx(2.25)
+    assert (_state(page, "u"), _state(page, "v")) == pytest.approx(middle)
+    _press(page, "-")
+    assert _state(page, "zoom") == pytest.approx(1.5)
+    _press(page, "0")
+    assert _state(page, "zoom") == 1
+
+
+def test_1_shows_one_sample_per_pixel(page: Tab, folder: Path) -> None:
+    _resize(page, 60 + 40)  # narrower than the plane
+    _press(page, "1")
+    assert _state(page, "size") == pytest.approx(_plane(folder, "back-projection", 500)[0].shape[1])
+
+
+def test_the_wheel_zooms_about_the_cursor_once_the_pictures_are_clicked(page: Tab) -> None:
+    left, top, width, height = _box(page)
+    x, y = left + 0.255 * width, top + 0.5 * height
+    _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-1)
+    _drawn(page)
+    assert _state(page, "zoom") == 1
+    _drag(page, (x, y), (0, 0))
+    before = _told(page)
+    _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-600)
+    page.wait_until("Number(document.querySelector('.v-stage').dataset.zoom) > 2")
+    _mouse(page, "mouseMoved", x, y)
+    _drawn(page)
+    assert _told(page) == before
+
+
+def test_a_drag_pans_as_far_as_the_hand_moves(page: Tab) -> None:
+    _press(page, "+", "+", "+")
+    u, v, size = (_state(page, name) for name in ("u", "v", "size"))
+    left, top, width, height = _box(page)
+    _drag(page, (left + 0.75 * width, top + 0.5 * height), (-80, 40))
+    assert (_state(page, "u") - u) * size == pytest.approx(80, abs=0.1)
+    assert (_state(page, "v") - v) * size == pytest.approx(-40, abs=0.1)
+    _press(page, "ArrowLeft")
+    assert (_state(page, "u") - u) * size == pytest.approx(80 - 60, abs=0.1)
+
+
+def test_two_fingers_zoom(page: Tab) -> None:
+    left, top, width, height = _box(page)
+    x, y = left + 0.7 * width, top + 0.5 * height
+
+    def fingers(kind: str, apart: float) -> None:
+        points = [{"x": x - apart / 2, "y": y, "id": 0}, {"x": x + apart / 2, "y": y, "id": 1}]
+        page.call("Input.dispatchTouchEvent", type=kind, touchPoints=points if kind != "touchEnd" else [])
+
+    page.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    try:
+        fingers("touchStart", 50)
+        for apart in (60, 80, 100):
+            fingers("touchMove", apart)
+        fingers("touchEnd", 100)
+        page.wait_until("Math.abs(document.querySelector('.v-stage').dataset.zoom - 2) < 0.05")
+    finally:
+        page.call("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def test_panels_side_by_side_are_zoomed_and_panned_together(page: Tab) -> None:
+    _choose(page, "A", "PMLEM (one-step-late, TV), 600 mm")
+    _choose(page, "B", "PMLEM (one-step-late, TV), 600 mm")
+    _click(page, "Side by side")
+    _press(page, "+", "+", "ArrowRight", "ArrowDown")
+    pixels = _canvas(page)
+    half = (pixels.shape[1] - 4) // 2
+    a, b = pixels[60:-60, :half], pixels[60:-60, half + 4 : 2 * half + 4]
+    np.testing.assert_allclose(a.astype(float), b, atol=2)
+    assert a.std() > 10
+    _click(page, "All")
+    cell = _state(page, "size")
+    _press(page, "+")
+    assert _state(page, "size") == pytest.approx(1.5 * cell)
+    assert _canvas(page)[-60:, : pixels.shape[1] // 3].std() > 10
+
+
+def test_the_wipe_moves_by_drag_and_by_key(page: Tab) -> None:
+    left, top, width, height = _box(page)
+    _choose(page, "A", "back-projection, 500 mm")
+    _set_wipe(page, 0.5)
+    whole = _canvas(page)
+    _drag(page, (left + width / 2, top + height / 2), (-0.25 * width, 0))
+    assert _state(page, "wipe") == pytest.approx(0.25, abs=0.002)
+    moved = _canvas(page)
+    middle = slice(int(0.27 * width), int(0.45 * width))
+    assert np.abs(whole[60:-60, middle].astype(int) - moved[60:-60, middle]).mean() > 5
+    kept = slice(int(0.6 * width), int(0.8 * width))
+    # What lies right of both lines is that of B still
+    np.testing.assert_array_equal(whole[100:-100, kept], moved[100:-100, kept])
+    _press(page, ".", ".", ",")
+    assert _state(page, "wipe") == pytest.approx(0.27, abs=0.002)
+    assert float(page.evaluate("document.getElementById('v-wipe').value")) == pytest.approx(0.27, abs=0.006)
+
+
+def test_pictures_are_chosen_and_swapped(page: Tab) -> None:
+    _choose(page, "A", "back-projection, 500 mm")
+    _choose(page, "B", "back-projection, 700 mm")
+    assert _told(page, "A").startswith("A: back-projection, 500 mm")
+    _press(page, "x")
+    assert (_chosen(page, "A"), _chosen(page, "B")) == ("back-projection, 700 mm", "back-projection, 500 mm")
+    assert page.evaluate("document.getElementById('v-depth').value") == "0"
+
+
+def test_minimum_and_maximum_set_the_grey_levels(page: Tab, folder: Path) -> None:
+    title, depth_mm = "PMLEM (one-step-late, TV)", 700
+    _choose(page, "B", f"{title}, {depth_mm} mm")
+    plane, _ = _plane(folder, title, depth_mm)
+    _set_wipe(page, 0)
+    black, white = float(np.quantile(plane, 0.2)), float(np.quantile(plane, 0.9))
+    for end, value in (("black", black), ("white", white)):
+        page.evaluate(
+            f"(() => {{ const one = document.getElementById('v-{end}-number-light'); one.value = {value}; "
+            "one.dispatchEvent(new Event('change')); })()"
+        )
+    _press(page, "+", "+", "+", "+", "+", "+")  # samples are squares then
+    size, u, v = (_state(page, name) for name in ("size", "u", "v"))
+    _, _, width, height = _box(page)
+    pixels = _canvas(page)
+    rng = np.random.default_rng(2)
+    for x, y in zip(rng.uniform(150, width - 150, 40), rng.uniform(100, height - 100, 40), strict=True):
+        place = ((u + (x - width / 2) / size) * plane.shape[1], (v + (y - height / 2) / size) * plane.shape[1])
+        if min(*(one % 1 for one in place), *(1 - one % 1 for one in place)) < 0.15:
+            continue  # at the edge of a sample
+        value = float(plane[int(place[1]), int(place[0])])
+        expected = 255 * np.clip((value - black) / (white - black), 0, 1)
+        assert pixels[int(y), int(x)] == pytest.approx(expected, abs=2)
+
+
+def test_a_handle_on_the_histogram_is_dragged(page: Tab) -> None:
+    page.evaluate("document.querySelector('#v-white-light').scrollIntoView({block: 'center'})")
+    left, top, width, height = _box(page, "#v-white-light")
+    low, high, at = page.evaluate(
+        "(it => [it.min, it.max, it.value].map(Number))(document.getElementById('v-white-light'))"
+    )
+    thumb = 16
+    x = left + thumb / 2 + (at - low) / (high - low) * (width - thumb)
+    _drag(page, (x, top + height / 2), (-0.3 * width, 0))
+    now = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
+    assert now < at - 0.2 * (high - low)
+    said = page.evaluate("document.getElementById('v-white-light').getAttribute('aria-valuetext')")
+    assert said == f"{now:g} e⁻ per pixel"
+    _click(page, "As opened")
+    _press(page, "m")
+    automatic = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
+    assert automatic != now
+    _press(page, "Backspace")
+    white = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
+    assert white == pytest.approx(at, rel=1e-3)
+
+
+def test_the_scale_bar_is_as_long_as_it_says_at_any_zoom(page: Tab, folder: Path) -> None:
+    lengths = set()
+    for depth_mm in DEPTHS_MM:
+        _choose(page, "A", f"back-projection, {depth_mm} mm")
+        plane, record = _plane(folder, "back-projection", depth_mm)
+        for _ in range(3):
+            per_mm = _state(page, "size") / (plane.shape[1] * record["pitch_mm"])
+            said = page.evaluate("document.querySelector('.v-stage').dataset.barA")
+            length_mm = float(said.split(" mm")[0])
+            assert _bar_px(page) == pytest.approx(length_mm * per_mm, abs=1.5)
+            lengths.add(length_mm)
+            _press(page, "+", "+")
+        _press(page, "0")
+    assert len(lengths) >= 3
+
+
+def test_the_film_goes_through_the_depths_until_it_is_stopped(page: Tab) -> None:
+    words = "document.getElementById('v-depth-words').value"
+    page.evaluate("window.due = null; window.setInterval = step => { due = step; return 7; };")
+    page.evaluate("window.clearInterval = number => { if (number === 7) due = null; };")
+    _choose(page, "B", "back-projection, 600 mm")
+    _press(page, " ")
+    seen = []
+    for _ in range(5):
+        page.evaluate("due()")
+        seen.append(page.evaluate(words))
+    assert seen == ["700 mm", "600 mm", "500 mm", "600 mm", "700 mm"]
+    assert _chosen(page, "B") == "back-projection, 700 mm"
+    _click(page, "■ Stop")
+    assert page.evaluate("due") is None
+    assert page.evaluate("[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '▶ Film')")
+
+
+def test_the_film_plays_by_itself_only_once_it_is_started(page: Tab) -> None:
+    words = "document.getElementById('v-depth-words').value"
+    first = page.evaluate(words)
+    _press(page, " ")
+    page.wait_until(f"{words} !== {json.dumps(first)}")
+    _press(page, " ")
+
+
+def test_the_depth_moves_by_slider_and_by_key(page: Tab) -> None:
+    page.evaluate("(it => { it.value = 0; it.dispatchEvent(new Event('input')); })(document.getElementById('v-depth'))")
+    _drawn(page)
+    assert "500 mm" in _chosen(page, "B")
+    _press(page, "]")
+    assert "600 mm" in _chosen(page, "B")
+    assert _chosen(page, "A") == "One view, as recorded"
+    _choose(page, "A", "back-projection, 600 mm")
+    _press(page, "]")
+    assert "700 mm" in _chosen(page, "A")
+    assert "700 mm" in _chosen(page, "B")
+
+
+def test_the_keyboard_reads_a_sample_aloud(page: Tab, folder: Path) -> None:
+    _choose(page, "B", "back-projection, 600 mm")
+    _press(page, "ArrowRight", "ArrowDown", shift=True)
+    status = "document.querySelector('#viewer [role=status]').textContent"
+    assert page.evaluate(status) == ""
+    _press(page, "r")
+    said = page.evaluate(status)
+    place = re.search(r"B: back-projection, 600 mm\s+(\S+) e⁻ per pixel .*column (\d+), row (\d+)", said)
+    assert place is not None, said
+    plane, _ = _plane(folder, "back-projection", 600)
+    assert float(place[1].replace("−", "-")) == pytest.approx(float(plane[int(place[3]), int(place[2])]), abs=2e-3)
+
+
+def test_reset_shows_what_the_page_opened_with(page: Tab) -> None:
+    opened = [_state(page, "zoom"), _state(page, "wipe"), _chosen(page, "A"), _chosen(page, "B")]
+    _press(page, "+", ".", "x", "l")
+    assert page.evaluate("document.querySelector('.v-stage').dataset.layout") == "pair"
+    _click(page, "Reset")
+    assert [_state(page, "zoom"), _state(page, "wipe"), _chosen(page, "A"), _chosen(page, "B")] == opened
+    assert page.evaluate("document.querySelector('.v-stage').dataset.layout") == "wipe"
+
+
+def test_every_control_is_named_and_reached_by_the_keyboard(page: Tab) -> None:
+    names = page.evaluate(
+        "[...document.querySelectorAll('#viewer input, #viewer select, #viewer button, #viewer [tabindex]')]"
+        ".map(it => it.ariaLabel || [...(it.labels ?? [])].map(one => one.textContent).join() || it.textContent)"
+    )
+    assert len(names) > 15
+    assert all(name.strip() for name in names)
+    assert page.evaluate("[...document.querySelectorAll('#viewer output')].every(it => it.ariaLive !== 'polite')")
+    assert page.evaluate("document.querySelectorAll('#viewer [tabindex]:not([tabindex=\"0\"])').length") == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_stand_out_from_what_is_behind_them(scheme: str, page: Tab) -> None:
+    page.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": scheme}])
+    page.wait_until(f"document.documentElement.className === '{scheme}'")
+    colours = page.evaluate("""['button', 'select', 'label', 'output', 'legend']
+        .flatMap(tag => [...document.querySelectorAll('#viewer ' + tag)])
+        .filter(it => it.textContent && !it.disabled).map(it => {
+          let behind = it;
+          while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') behind = behind.parentElement;
+          return [getComputedStyle(it).color, getComputedStyle(behind).backgroundColor];
+        })""")
+    for pair in colours:
+        light = sorted(_luminance(colour) for colour in pair)
+        assert (light[1] + 0.05) / (light[0] + 0.05) >= 4.5, pair
+
+
+def _luminance(colour: str) -> float:
+    """Return the relative luminance of an opaque colour by WCAG 2."""
+    values = np.array([float(word) for word in re.findall(r"[\d.]+", colour)[:3]]) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("width", [390, 1024, 1400])
+def test_it_fits_any_screen(width: int, page: Tab) -> None:
+    _resize(page, width)
+    _drawn(page)
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    left, _, wide, _ = _box(page)
+    assert left >= 0
+    assert left + wide <= width
+
+
+def test_the_page_is_small(folder: Path) -> None:
+    assert (folder / "report.html").stat().st_size < MOST_BYTES
+
+
+def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
+    """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
+    packed = pack(numbers, 1e-3)
+    shown: Viewer = {
+        "pictures": [
+            {
+                "kind": "light",
+                "title": "PMLEM",
+                "words": "500 mm",
+                "place": 0,
+                "unit": "e⁻ per pixel",
+                "low": packed.low,
+                "step": packed.step,
+                "bins": 1,
+                "pitch": 0.5,
+                "origin": (-10.0, 20.0),
+                "src": smaller_uri(packed.png),
+            }
+        ],
+        "scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}},
+        "places": ["500 mm"],
+        "quantity": "depth",
+        "length": "mm",
+        "binned": False,
+        "first": (0, 0),
+    }
+    templates = Path(pages.__path__[0]) / "templates"
+    script, style = ((templates / name).read_text() for name in ("viewer.js", "viewer.css"))
+    (folder / "alone.html").write_text(
+        f'<!doctype html><meta charset="utf-8"><style>{style}</style><section id="viewer"></section>'
+        f'<script type="application/json" id="viewer-data">{json.dumps(shown)}</script><script>{script}</script>'
+    )
+    return (folder / "alone.html").as_uri()
+
+
+def test_colours_and_samples_without_numbers_are_read_out(browser: Tab, tmp_path: Path) -> None:
+    numbers = np.random.default_rng(3).normal(1.0, 0.5, (30, 40, 3)).astype(np.float32)
+    numbers[5, 6] = np.nan
+    _resize(browser, 1200)
+    browser.open("about:blank")
+    browser.open(_page_of(numbers, tmp_path))
+    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
+    left, top, width, height = _box(browser)
+    size, v = _state(browser, "size"), _state(browser, "v")
+    for row, column in ((10, 20), (29, 39), (5, 6)):
+        x = left + width / 2 + ((column + 0.5) / 40 - 0.5) * size
+        _mouse(browser, "mouseMoved", x, top + height / 2 + ((row + 0.5) / 40 - v) * size)
+        _drawn(browser)
+        told = re.search(r"R (.+), G (.+), B (.+) e⁻ per pixel", _told(browser))
+        assert told is not None, _told(browser)
+        if (row, column) == (5, 6):
+            assert told.groups() == ("not known",) * 3
+        else:
+            np.testing.assert_allclose([float(word) for word in told.groups()], numbers[row, column], atol=1.1e-3)
+    assert browser.complaints == []

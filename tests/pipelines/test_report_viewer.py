@@ -1,0 +1,167 @@
+"""The numbers of the viewer: as fine as stated, within their budget, and the best pictures first."""
+
+import base64
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import CompletedProcess
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.image_files import Spacing, write_plane
+from faintfield.pipelines.formats.results.records import Method, PlaneRecord
+from faintfield.pipelines.pages.report_pictures import PlaneSections
+from faintfield.pipelines.pages.report_planes import Plane
+from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Packed, ViewerPicture, pack, viewer_of
+
+type Command = Callable[..., CompletedProcess[str]]
+
+# What the planes of the demo, the 14 of 640 × 480 samples, may take of its page of 5 MB.
+MOST_OF_THE_DEMO = 2_600_000
+
+
+def _levels(png: bytes) -> NDArray[np.int64]:
+    both = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert both is not None
+    ordered = both if both.ndim == 2 else both[:, :, ::-1]
+    high, low = np.split(ordered.astype(np.int64), 2)
+    return np.asarray(256 * high + low)
+
+
+def _numbers(packed: Packed) -> NDArray[np.float64]:
+    return np.asarray(packed.low + packed.step * _levels(packed.png))
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (4, 7, 3)])
+def test_packed_numbers_come_back_within_half_a_step(shape: tuple[int, ...]) -> None:
+    numbers = np.random.default_rng(1).normal(2.0, 30.0, shape).astype(np.float32)
+    step = 0.01
+    assert np.abs(_numbers(pack(numbers, step)) - numbers).max() <= 0.5 * step * (1 + 1e-6)
+
+
+def test_the_finest_step_uses_all_levels() -> None:
+    numbers = np.array([[-3.0, 0.0, 1.0]], np.float32)
+    assert _levels(pack(numbers, 4.0 / 65534).png).max() == 65534
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_no_number_is_marked(bad: float) -> None:
+    levels = _levels(pack(np.array([[1.0, bad, 2.0]], np.float32), 0.5).png)
+    np.testing.assert_array_equal(levels, [[0, UNKNOWN_LEVEL, 2]])
+
+
+def test_a_constant_plane_and_one_without_numbers_can_be_packed() -> None:
+    np.testing.assert_array_equal(_numbers(pack(np.full((2, 2), 7.5, np.float32), 0.0)), 7.5)
+    assert (_levels(pack(np.full((2, 2), np.nan, np.float32), 0.0).png) == UNKNOWN_LEVEL).all()
+
+
+def _plane(folder: Path, method: Method, depth_mm: float, pixels: NDArray[np.float32]) -> Plane:
+    path = folder / f"{method}_{depth_mm:g}.tiff"
+    write_plane(path, pixels, Spacing(0.5))
+    record = PlaneRecord(
+        depth_mm=depth_mm,
+        method=method,
+        channel="grey",
+        file=path.name,
+        pitch_mm=0.5,
+        origin_mm=(-10.0, 20.0),
+        penalty_weight=None,
+        penalty_weight_chosen="",
+        passes=1,
+        certificate=None,
+        flux_e=1.0,
+    )
+    return Plane(method, method, "stated", depth_mm, path, [record])
+
+
+def _pictures(planes: list[Plane]) -> list[ViewerPicture]:
+    shown = viewer_of(planes, PlaneSections(white=1.0), None)
+    assert shown is not None
+    return shown["pictures"]
+
+
+def _noise(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
+    return np.random.default_rng(seed).normal(0.5, 0.4, shape).astype(np.float32)
+
+
+def test_a_small_plane_is_stated_by_a_sixteenth_of_a_million(tmp_path: Path) -> None:
+    plane = _noise((40, 60), 1)
+    (one,) = _pictures([_plane(tmp_path, "pmlem", 500.0, plane)])
+    assert one["step"] == pytest.approx(float(np.ptp(plane)) / 65534)
+    assert (one["bins"], one["pitch"], one["origin"]) == (1, 0.5, (-10.0, 20.0))
+
+
+def test_many_planes_of_noise_stay_within_the_demos_page(tmp_path: Path) -> None:
+    methods: list[Method] = ["backprojection", "mlem", "pmlem-osl", "pmlem", "joint", "occlusion", "pmlem"]
+    planes = [
+        _plane(tmp_path, method, depth_mm, _noise((480, 640), seed))
+        for seed, method in enumerate(methods)
+        for depth_mm in (500.0, 700.0)
+    ]
+    found = _pictures(planes)
+    assert sum(len(one["src"]) for one in found) < MOST_OF_THE_DEMO
+    assert all(one["bins"] == 1 for one in found)
+    assert all(one["step"] <= 0.5 * 0.4 * 1.05 for one in found)  # half of the noise
+
+
+def test_a_large_plane_is_shown_by_the_means_of_bins_in_their_places(tmp_path: Path) -> None:
+    plane = np.add.outer(np.arange(1400, dtype=np.float32), 2 * np.arange(1601, dtype=np.float32))
+    (one,) = _pictures([_plane(tmp_path, "pmlem", 500.0, plane)])
+    assert one["bins"] == 2
+    assert one["pitch"] == 1.0
+    assert one["origin"] == (-9.75, 20.25)
+    levels = _levels(base64.b64decode(one["src"].partition(",")[2]))
+    if levels.ndim == 3:
+        levels = levels[:, :, 0]
+    assert levels.shape == (700, 800)
+    shown = one["low"] + one["step"] * levels
+    expected = plane[:1400, :1600].reshape(700, 2, 800, 2).mean(axis=(1, 3))
+    np.testing.assert_allclose(shown, expected, atol=0.51 * one["step"] + 1e-3)
+
+
+@pytest.mark.parametrize("method", ["joint", "occlusion"])
+def test_planes_found_together_stand_beside_the_best_found_alone(method: Method, tmp_path: Path) -> None:
+    planes = [
+        _plane(tmp_path, one, depth_mm, _noise((6, 8), 1))
+        for one in ("backprojection", "pmlem", method)
+        for depth_mm in (500.0, 700.0)
+    ]
+    shown = viewer_of(planes, PlaneSections(white=1.0), None)
+    assert shown is not None
+    first, second = (shown["pictures"][index] for index in shown["first"])
+    assert first["title"] == "PMLEM"
+    assert second["title"].startswith("PMLEM, all planes together")
+    assert first["words"] == second["words"] == "500 mm"
+
+
+def test_without_planes_there_is_no_viewer() -> None:
+    assert viewer_of([], PlaneSections(), None) is None
+
+
+def _data(page: str) -> dict[str, Any]:
+    found = re.search(r'id="viewer-data">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return dict(json.loads(found[1]))
+
+
+def test_the_page_of_a_set_states_numbers_units_and_places(scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "</script><script>alert(1)</script>".replace("/", "∕")
+    assert run(["reconstruct", str(scene), "--out", str(out), "--depth-mm", "500", "--method", "backprojection"]) == 0
+    page = (out / "report.html").read_text()
+    assert "<script>alert(1)" not in page
+    data = _data(page)
+    (light,) = (one for one in data["pictures"] if one["kind"] == "light")
+    plane = tifffile.imread(out / "plane_00500.0.tiff")
+    levels = _levels(base64.b64decode(light["src"].partition(",")[2]))
+    shown = light["low"] + light["step"] * (levels if levels.ndim == 2 else levels[:, :, 0])
+    np.testing.assert_allclose(shown, plane, atol=0.5 * light["step"] * 1.01)
+    assert (light["unit"], data["length"]) == ("e⁻ per pixel", "mm")
+    record = json.loads((out / "reconstruction.json").read_text())["planes"][0]
+    assert (light["pitch"], light["origin"]) == (record["pitch_mm"], record["origin_mm"])
