@@ -36,7 +36,8 @@ mutants: $(VENV)/compiled ## wrong changes of the sources, and how many the test
 
 # Packages that only the benchmarks compare with stay out of .venv.
 build/bench:
-	$(PIP) install --no-deps --target $@ 'pylops>=2.4' 'pyproximal>=0.10' || mkdir -p $@
+	$(PIP) install --no-deps --target $@ 'pylops>=2.4' 'pyproximal>=0.10' \
+	  'odl>=1.0' array-api-compat future || mkdir -p $@
 
 results: $(VENV)/installed ## the demo's figures and pictures, put into README.md and docs/pictures; needs Chromium
 	$(BIN)/faintfield demo $(OUT)

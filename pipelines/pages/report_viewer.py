@@ -24,6 +24,9 @@ _MAX_SAMPLES = 1_500_000
 # keep to it. Only numbers that take more even so, more than the last of these for each picture, are binned.
 _MIN_BUDGET, _BUDGET_PER_PICTURE, _MOST_PER_PICTURE = 1_300_000, 115_000, 250_000
 
+# Pictures by which the fineness of all is chosen, spread evenly over them.
+_SAMPLE = 8
+
 # The level of a sample without a number, and the highest of one with a number.
 UNKNOWN_LEVEL, _TOP_LEVEL = 65535, 65534
 
@@ -200,36 +203,53 @@ def _view(kind: Kind, title: str, words: str, unit: str, low: float, step: float
 
 @dataclass(frozen=True)
 class _Source:
-    """The numbers of a picture (row, column[, colour]), and what is said of it."""
+    """A picture whose numbers are read when they are needed, and what is said of it."""
 
     plane: Plane
     kind: Kind
     title: str
     place: int
-    numbers: NDArray[np.floating]
+
+    def read(self, coarser: int) -> tuple[NDArray[np.floating], int]:
+        """Return the numbers (row, column[, colour]) in bins, and the width of these; `coarser` is added to it."""
+        numbers = self.plane.sigma_e() if self.kind == "sigma" else self.plane.pixels()
+        assert numbers is not None
+        by = _bins(numbers) + coarser
+        return _binned(numbers, by), by
 
 
 def _plane_pictures(
     planes: Sequence[Plane], titles: dict[str, str], places: list[tuple[float, str]], units: StatedUnits
 ) -> list[ViewerPicture]:
-    """Return the planes and their standard deviations, as fine as their budget allows."""
+    """Return the planes and their standard deviations, as fine as their budget allows; one at a time is in memory."""
     sources = []
     for plane in planes:
         title, place = titles[plane.column], places.index(plane.place)
-        sources.append(_Source(plane, "light", title, place, plane.pixels()))
-        if (sigma := plane.sigma_e()) is not None:
-            sources.append(_Source(plane, "sigma", f"σ of {title}", place, sigma))
-    budget = max(_MIN_BUDGET, _BUDGET_PER_PICTURE * len(sources))
-    most = max(_MIN_BUDGET, _MOST_PER_PICTURE * len(sources))
-    bins = [_bins(source.numbers) for source in sources]
+        sources.append(_Source(plane, "light", title, place))
+        if plane.records[0].sigma_file:
+            sources.append(_Source(plane, "sigma", f"σ of {title}", place))
+    fineness, coarser = _fitting(sources)
+    found = []
+    for source in sources:
+        numbers, by = source.read(coarser)
+        found.append(_picture(source, pack(numbers, fineness.step(numbers)), by, units))
+    return found
+
+
+def _fitting(sources: Sequence[_Source]) -> tuple[Fineness, int]:
+    """Return the finest steps, and by how much more bins are wide, that keep a sample of the pictures to its budget."""
+    sample = [sources[int(at)] for at in np.unique(np.linspace(0, len(sources) - 1, _SAMPLE).round())]
+    share = len(sample) / len(sources)
+    budget = share * max(_MIN_BUDGET, _BUDGET_PER_PICTURE * len(sources))
+    most = share * max(_MIN_BUDGET, _MOST_PER_PICTURE * len(sources))
+    coarser = 0
     while True:
-        binned = [_binned(source.numbers, by) for source, by in zip(sources, bins, strict=True)]
+        binned = [source.read(coarser)[0] for source in sample]
         for fineness in _FINENESSES:
-            packed = [pack(numbers, fineness.step(numbers)) for numbers in binned]
             limit = most if fineness is _FINENESSES[-1] else budget
-            if sum(len(one.png) for one in packed) <= limit:
-                return [_picture(*each, units) for each in zip(sources, packed, bins, strict=True)]
-        bins = [by + 1 for by in bins]
+            if sum(len(pack(numbers, fineness.step(numbers)).png) for numbers in binned) <= limit:
+                return fineness, coarser
+        coarser += 1
 
 
 def _bins(numbers: NDArray[Any]) -> int:
