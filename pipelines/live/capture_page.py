@@ -1,4 +1,4 @@
-"""Serve a capture as a local web page: what the terminal shows, with its keys as buttons, dim red on black.
+"""Serve a capture as a local web page: what the terminal shows, with its keys as buttons, and live planes.
 
 The page is served to this computer only, at an address that cannot be guessed: its path begins with a random token.
 Whatever any program sends there, the capture goes on: connections are bounded in number, size and time, and each
@@ -28,6 +28,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from faintfield.pipelines.console import conceal, inform
 from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.live.panel import REQUESTS, CapturePanel, ShownFrame
+from faintfield.pipelines.live.planes_client import PlanesClient
+from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import LABELS, display_levels
 from faintfield.rig.capture.guide import format_duration
 
@@ -61,14 +63,26 @@ class _PressRequest(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @contextmanager
-def serve_page(panel: CapturePanel) -> Iterator[str]:
-    """Serve the page of `panel` while the block runs; yield its address, which no log records."""
+def serve_page(
+    panel: CapturePanel, taken: TakenFrames | None = None, planes: PlanesClient | None = None
+) -> Iterator[str]:
+    """Serve the page of a capture while the block runs; yield its address, which no log records.
+
+    Parameters
+    ----------
+    panel : CapturePanel
+        What the capture asks and shows.
+    taken : TakenFrames, optional
+        The frames of its session, shown when a node is clicked.
+    planes : PlanesClient, optional
+        Its live planes.
+    """
     token = secrets.token_urlsafe(24)
     conceal(token)
     listener = socket.create_server((_HOST, 0))
     server = uvicorn.Server(
         uvicorn.Config(
-            _Door(_pages(panel), token),
+            _Door(_pages(panel, taken, planes), token),
             http=_BoundedConnection,
             h11_max_incomplete_event_size=_MAX_HEADER_BYTES,
             backlog=_MAX_ARRIVALS,
@@ -161,7 +175,7 @@ def _is_own(headers: Headers) -> bool:
     return host.partition(":")[0] == _HOST and headers.get("origin") in (None, f"http://{host}")
 
 
-def _pages(panel: CapturePanel) -> Router:
+def _pages(panel: CapturePanel, taken: TakenFrames | None, planes: PlanesClient | None) -> Router:
     """Return what is served behind the token."""
     html = files("faintfield.pipelines.live").joinpath("capture.html").read_text(encoding="utf-8")
 
@@ -170,13 +184,26 @@ def _pages(panel: CapturePanel) -> Router:
 
     async def state(_: Request) -> Response:
         # Escaped, because the name of a file may not be UTF-8
-        return Response(dumps(_state(panel)), media_type="application/json")
+        content = _state(panel) | {"planes": None if planes is None else _planes(planes)}
+        return Response(dumps(content), media_type="application/json")
 
     async def picture(_: Request) -> Response:
         shown = panel.shown
         if shown is None:
             return Response(status_code=404)
         return Response(_png(shown), media_type="image/png")
+
+    async def live_picture(request: Request) -> Response:
+        content = None if planes is None else planes.picture(request.path_params["name"])
+        return Response(status_code=404) if content is None else Response(content, media_type="image/png")
+
+    async def node(request: Request) -> Response:
+        status, row, column = panel.status, request.path_params["row"], request.path_params["column"]
+        if taken is None or status is None:
+            return Response(status_code=404)
+        return Response(
+            dumps(msgspec.to_builtins(taken.at(status.step - 1, (row, column)))), media_type="application/json"
+        )
 
     async def press(request: Request) -> Response:
         try:
@@ -193,6 +220,8 @@ def _pages(panel: CapturePanel) -> Router:
             Route("/", index),
             Route("/state", state),
             Route("/frame.png", picture),
+            Route("/planes/{name}", live_picture),
+            Route("/node/{row:int}/{column:int}", node),
             Route("/press", press, methods=["POST"]),
         ],
         redirect_slashes=False,
@@ -242,6 +271,17 @@ def _frame(shown: ShownFrame) -> dict[str, Any]:
         "values": dict(shown.values),
         "histogram": np.log1p(counts).tolist(),
         "range_dn": [float(edges[0]), float(edges[-1])],
+    }
+
+
+def _planes(planes: PlanesClient) -> dict[str, Any]:
+    """Return the state of live planes as a JSON object."""
+    status = planes.status()
+    return {
+        "ended": planes.ended(),
+        "offered": planes.offered(),
+        "silence_s": round(planes.silence_s()),
+        "status": None if status is None else msgspec.to_builtins(status),
     }
 
 

@@ -14,6 +14,9 @@ from faintfield.pipelines.errors import InputError, UnknownFormat
 from faintfield.pipelines.formats.files import require_room
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
+from faintfield.pipelines.live.planes_messages import LiveOrder
+from faintfield.pipelines.live.taken import TakenFrames
 from faintfield.pipelines.live.terminal import TerminalView
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.guide import format_duration
@@ -32,7 +35,9 @@ from faintfield.rig.stages.protocol import StageSettings
 _ROOM_FACTOR = 1.5
 
 
-def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, page: bool) -> int:
+def capture_session(
+    settings: RigSettings, folder: Path, *, unattended: bool, page: bool, planes: LiveOrder | None = None
+) -> int:
     """Begin or resume the session in `folder` and take its missing frames; return the number of frames taken.
 
     Parameters
@@ -45,6 +50,8 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
         Give every prompt its usual answer.
     page : bool
         Show the capture on a local web page as well.
+    planes : LiveOrder, optional
+        Show planes of the frames so far on that page.
 
     Raises
     ------
@@ -64,13 +71,14 @@ def capture_session(settings: RigSettings, folder: Path, *, unattended: bool, pa
         if before:
             inform(f"{folder}: {before} of {len(session.frames)} frames are there; going on")
         if page:
-            _open_page(panel, stack)
+            taken = TakenFrames(session)
+            _open_page(panel, stack, taken, None if planes is None else _begin_planes(planes, panel, taken, stack))
         stack.enter_context(TerminalView(panel).show())
         stack.enter_context(_stop_on_interrupt(panel))
         Capture(session, open_rig(settings, session.journal, read_pixels), panel, read_pixels).run()
-        taken = len(session.valid()) - before
-    inform(f"{folder}: complete, {taken} frames taken; faintfield verify {folder} compares every byte")
-    return taken
+        count = len(session.valid()) - before
+    inform(f"{folder}: complete, {count} frames taken; faintfield verify {folder} compares every byte")
+    return count
 
 
 def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
@@ -87,12 +95,20 @@ def _plan_session(settings: RigSettings, folder: Path) -> FrozenPlan:
     return FrozenPlan(found.plan, settings)
 
 
-def _open_page(panel: CapturePanel, stack: ExitStack) -> None:
+def _begin_planes(order: LiveOrder, panel: CapturePanel, taken: TakenFrames, stack: ExitStack) -> PlanesClient | None:
+    """Start live planes, which end with the stack; None if they cannot be started."""
+    client = stack.enter_context(live_planes(order, taken.of_dark_scene))
+    if client is not None:
+        panel.on_change.append(client.note_change)
+    return client
+
+
+def _open_page(panel: CapturePanel, stack: ExitStack, taken: TakenFrames, planes: PlanesClient | None) -> None:
     """Serve the page until the stack is closed; if that fails, go on where prompts can be answered otherwise."""
     try:
         from faintfield.pipelines.live.capture_page import serve_page  # slow: imports a web server
 
-        address = stack.enter_context(serve_page(panel))
+        address = stack.enter_context(serve_page(panel, taken, planes))
     except (OSError, RuntimeError) as failure:
         if not (panel.unattended or console.is_terminal):
             raise CaptureStopped(

@@ -115,12 +115,15 @@ def _covered_part(loaded: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.
 class OperatorFactory:
     """Makes the operators of one channel; rays, response and mask, which they share, are computed once.
 
-    `bins` is the width of the bins of images from `ElementalImages.binned`.
+    `bins` is the width of the bins of images from `ElementalImages.binned`. Without `images`, whose mask all operators
+    share, only `of_views` makes operators.
     """
 
-    def __init__(self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages, *, bins: int = 1) -> None:
+    def __init__(
+        self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages | None, *, bins: int = 1
+    ) -> None:
         self._loaded = loaded
-        self._images = images
+        self._valid = None if images is None else images.valid
         self._phases = len(layout.lattices)
         lattices = layout.lattices
         rays = np.empty((len(lattices), *lattices[0].shape, 2), np.float32)
@@ -130,11 +133,18 @@ class OperatorFactory:
         response = np.stack([response_of(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._response = np.where(whole, binned(response, bins), 0)
-        self._principal_shift = principal_shift(loaded)
+        self._poses, self._principal_shift = loaded.poses_rt_cam_ref, principal_shift(loaded)
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
         return PlaneOperator(self._homographies(place), self._rays, grid, **self._shared())
+
+    def of_views(
+        self, place: Place, grid: PlaneGrid, views: Sequence[int], valid: NDArray[np.bool_] | None
+    ) -> PlaneOperator:
+        """Return H of a plane in some views alone, in their order, with a mask (view, row, column) of their own."""
+        own = {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), len(views))}
+        return PlaneOperator(self._homographies(place, views), self._rays, grid, **self._shared() | own)
 
     def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
         """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""
@@ -156,20 +166,22 @@ class OperatorFactory:
         occluders = None if opacities is None else Occluders(opacities, [depth_of(place) for place in grids])
         return SceneOperator(homographies, self._rays, list(grids.values()), occluders=occluders, **self._shared())
 
-    def _homographies(self, place: Place) -> NDArray[np.float64]:
-        """Return the homographies from the rays of each view, and each phase of its mosaic, to a plane."""
+    def _homographies(self, place: Place, views: Sequence[int] | None = None) -> NDArray[np.float64]:
+        """Return the homographies from the rays of some views, and each phase of its mosaic, to a plane."""
         if isinstance(place, TiltedPlane):
             rt_ref_plane = np.array(place.rt_ref_plane)
         else:
             rt_ref_plane = fronto_parallel_rt_ref_plane(place)
-        homographies = plane_from_ray(self._loaded.poses_rt_cam_ref, rt_ref_plane, self._principal_shift)
-        return np.repeat(homographies, self._phases, axis=0)
+        poses, shift = self._poses, self._principal_shift
+        if views is not None:
+            poses, shift = poses[list(views)], None if shift is None else shift[list(views)]
+        return np.repeat(plane_from_ray(poses, rt_ref_plane, shift), self._phases, axis=0)
 
     def _shared(self) -> dict[str, Any]:
         """Return the arguments that the operators of all planes share."""
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
-        return {"flat": self._response, "valid": self._images.valid, "lattice_of_view": lattices}
+        return {"flat": self._response, "valid": self._valid, "lattice_of_view": lattices}
 
 
 def response_of(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:

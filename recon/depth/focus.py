@@ -58,11 +58,16 @@ def focus_measure(
     halves : two int arrays
         The views of each half, preferably the two colours of a checkerboard of nodes.
     """
-    first, second = (_detail(back_projection(operator, images, half)) for half in halves)
+    first, second = (back_projection(operator, images, half) for half in halves)
     both = (operator.sensitivity(halves[0]) >= 1) & (operator.sensitivity(halves[1]) >= 1)
+    return shared_detail(first, second, both)
+
+
+def shared_detail(first: Image, second: Image, both: NDArray[np.bool_]) -> FocusMeasure:
+    """Return the power of fine detail that two back-projections (row, column) share where `both` have data."""
     if not both.any():
         return FocusMeasure(0.0, 0.0)
-    product = (first * second)[both].astype(np.float64)
+    product = (_detail(first) * _detail(second))[both].astype(np.float64)
     return FocusMeasure(float(product.mean()), float(np.sqrt(np.mean(product**2) * _CORRELATED_SAMPLES / product.size)))
 
 

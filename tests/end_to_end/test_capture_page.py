@@ -111,7 +111,7 @@ def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
     browser.wait_until("document.getElementById('frame').naturalWidth > 0")
     browser.wait_until("document.body.innerText.includes('00015_dark_0_r1_c1')")
     assert f"of {FRAMES} frames" in browser.text()
-    assert browser.evaluate("document.querySelectorAll('#grid span').length") == 6
+    assert browser.evaluate("document.querySelectorAll('#grid button').length") == 6
     assert browser.evaluate("document.querySelectorAll('#histogram path').length") == 1
     # Pages of other tests may complain that their capture has ended
     assert [it for it in browser.complaints if running.address in it] == []

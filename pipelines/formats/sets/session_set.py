@@ -67,7 +67,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
     camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion, mosaic=noise.mosaic)
     homings = _homings_apart(folder, measured_in)
     _tell_of_mixed(folder, frames, homings)
-    views = [_view(stop, plan.centre, names, homings.get(names[0], 0)) for stop, names in frames]
+    views = [nominal_view(stop, plan.centre, names, homings.get(names[0], 0)) for stop, names in frames]
     reference = [view.node for view in views].index(plan.centre.node)
     return ElementalSet(
         folder,
@@ -77,7 +77,7 @@ def nominal_session(folder: Path, kind: SceneKind = "dark_scene", geometry: Path
         lens,
         noise.model,
         offset_from_files=False,
-        flat=None if noise.response is None else _relative_to_axis(noise.response, noise.unusable, lens),
+        flat=None if noise.response is None else relative_to_axis(noise.response, noise.unusable, lens),
         unusable=noise.unusable,
         measured_in=measured_in / GEOMETRY_FILE if is_folder(measured_in) else measured_in,
         poses="nominal",
@@ -121,7 +121,7 @@ def _at_centre(folder: Path, kind: StepKind) -> list[tuple[Path, float]]:
     return [(path, frame.exposure_s) for frame, path in taken if is_file(path)]
 
 
-def _relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:
+def relative_to_axis(response: NDArray[np.float32], unusable: NDArray[np.bool_], lens: Lens) -> NDArray[np.float32]:
     """Return the response (row, column) relative to the pixels around the lens's axis, to which planes refer."""
     near = max(lens.size_px) // 20 + 1
     row, column = round(lens.cy_px), round(lens.cx_px)
@@ -155,7 +155,7 @@ def _tell_of_mixed(folder: Path, frames: Sequence[tuple[Stop, list[str]]], homin
         )
 
 
-def _view(stop: Stop, centre: Stop, names: list[str], homing: int) -> View:
+def nominal_view(stop: Stop, centre: Stop, names: list[str], homing: int) -> View:
     """Return the view of a node, with the pose that the stage was told."""
     right_mm, down_mm = stop.target.x_mm - centre.target.x_mm, stop.target.y_mm - centre.target.y_mm
     return View(names[0], (0.0, 0.0, 0.0, -right_mm, -down_mm, 0.0), stop.node, repeats=tuple(names[1:]), homing=homing)

@@ -1,0 +1,188 @@
+"""What live planes know of the scene before it is complete: nodes, lens, poses and noise, and where these are from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from faintfield.calib.lens import Lens
+from faintfield.calib.noise_model import NoiseModel
+from faintfield.pipelines.errors import BadValue, MissingFile
+from faintfield.pipelines.formats.frames import Frame, Lattice, mosaic_period
+from faintfield.pipelines.formats.reading import is_file, is_folder
+from faintfield.pipelines.formats.results.geometry import GEOMETRY_FILE, CameraPoses, read_geometry
+from faintfield.pipelines.formats.results.noise import NOISE_FILE, FittedNoise, read_fitted_noise
+from faintfield.pipelines.formats.sets.elemental_file import Camera, ElementalSetFile
+from faintfield.pipelines.formats.sets.elemental_set import ElementalSet, with_measured_geometry
+from faintfield.pipelines.formats.sets.session_set import nominal_view, relative_to_axis
+from faintfield.pipelines.live.planes_messages import LiveOrder
+from faintfield.pipelines.planning.known import KnownLens, Sensor, StatedNoise, known_lens, known_sensor
+from faintfield.pipelines.reconstruction.channels import ChannelLayout
+from faintfield.rig.plan import CapturePlan, PlannedFrame, planned_frames
+from faintfield.rig.session.session import FrozenPlan
+
+# Most pixels of a view after binning: planes of about a million samples are computed as frames arrive, and fill a
+# screen.
+_MAX_PIXELS = 1_100_000
+
+type Node = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class LiveScene:
+    """The views of a dark scene that are planned, as an elemental set without images.
+
+    Attributes
+    ----------
+    loaded : ElementalSet
+        A view per node; the names of its images mean nothing.
+    layout : ChannelLayout
+        The pixels that count: all of them, or the green ones of frames in RGB.
+    bins : int
+        Width in pixels of the bins that are added up.
+    view_of : dict of (int, int) to int
+        Index of each node's view.
+    poses, noise : str
+        Where they are from, in words.
+    unit : str
+        Unit of the light: electrons, or DN where the noise is not known.
+    knows_noise : bool
+        Whether there is a noise model, without which PMLEM has no likelihood.
+    """
+
+    loaded: ElementalSet
+    layout: ChannelLayout
+    bins: int
+    view_of: dict[Node, int]
+    poses: str
+    noise: str
+    unit: str
+    knows_noise: bool
+
+
+def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
+    """Return what is known of the dark scene of a session that is being captured, given any of its frames.
+
+    Poses are the measured ones of a geometry.json if it has all nodes, else those that the stage is told.
+
+    Raises
+    ------
+    RigError, InputError
+        No lens is known, or a file cannot be used; the message says what to give.
+    """
+    height, width = frame.pixels_dn.shape[:2]
+    size_px = (width, height)
+    session, beside = Path(order.session), Path(order.rig).parent
+    noise_path = _found(order.noise, NOISE_FILE, session, beside)
+    geometry_path = _found(order.geometry, GEOMETRY_FILE, session, beside)
+    sensor = known_sensor(frozen.rig, Path(order.rig), noise_path, StatedNoise())
+    guess = known_lens(frozen.rig, Path(order.rig), sensor, geometry_path, order.fx_px)
+    lens, lens_words = _lens(geometry_path, guess, size_px, stated=order.fx_px is not None)
+    fitted = _noise(noise_path, sensor, guess, size_px)
+    mosaic = fitted.mosaic or frozen.rig.mosaic or frame.mosaic
+    planned = _planned_set(session, frozen.plan, lens, fitted)
+    loaded, poses = _with_poses(planned, geometry_path, lens_words)
+    plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
+    return LiveScene(
+        loaded,
+        ChannelLayout("grey", plane_of_colour, (Lattice((0, 0), (1, 1), (height, width)),)),
+        bins_of(size_px, int(np.lcm(*mosaic_period(mosaic)))),
+        {view.node: index for index, view in enumerate(loaded.settings.view) if view.node is not None},
+        poses,
+        sensor.source,
+        *(("e⁻/px", True) if _is_known(sensor) else ("DN/px", False)),
+    )
+
+
+def bins_of(size_px: tuple[int, int], period_px: int) -> int:
+    """Return the width of bins that leave about a million: 1, or whole periods of a mosaic."""
+    needed = int(np.ceil(np.sqrt(size_px[0] * size_px[1] / _MAX_PIXELS)))
+    return -(-needed // period_px) * period_px
+
+
+def dark_frames(plan: CapturePlan) -> list[PlannedFrame]:
+    """Return the planned frames of the dark scene."""
+    return [frame for frame in planned_frames(plan) if frame.kind == "dark_scene"]
+
+
+def _found(given: str | None, name: str, *folders: Path) -> Path | None:
+    """Return the file of a calibration: as given, or the first that lies in one of the folders."""
+    if given is not None:
+        return Path(given) / name if is_folder(Path(given)) else Path(given)
+    return next((folder / name for folder in folders if is_file(folder / name)), None)
+
+
+def _is_known(sensor: Sensor) -> bool:
+    """Return whether there is a noise model."""
+    return sensor.path is not None or sensor.model is not None
+
+
+def _lens(path: Path | None, guess: KnownLens, size_px: tuple[int, int], *, stated: bool) -> tuple[Lens, str]:
+    """Return the lens, and where it is from."""
+    if path is not None:
+        return read_geometry(path, CameraPoses).camera_lens(), f"lens of {path}"
+    if guess.f_px.value is None:
+        raise MissingFile(
+            "no lens is known, and live planes need one; run `faintfield geometry` on the boards of this session, or "
+            "give --geometry or --fx-px"
+        )
+    centre_px = guess.centre_px if guess.centre_px is not None and guess.size_px == size_px else None
+    cx_px, cy_px = centre_px or ((size_px[0] - 1) / 2, (size_px[1] - 1) / 2)
+    words = f"focal length of {guess.f_px.value:g} px " + ("as given" if stated else "of the simulated camera")
+    return Lens(size_px, guess.f_px.value, guess.f_px.value, cx_px, cy_px, ()), f"{words}, no distortion"
+
+
+def _noise(path: Path | None, sensor: Sensor, guess: KnownLens, size_px: tuple[int, int]) -> FittedNoise:
+    """Return the noise of the sensor; numbers as they are where nothing is known."""
+    if path is not None:
+        return read_fitted_noise(path, size_px)
+    usable = np.zeros(size_px[::-1], bool)
+    if sensor.model is None:
+        return FittedNoise(NoiseModel(0.0, 1.0, 0.0), usable, None)
+    response = guess.response
+    known = response is not None and response.shape == usable.shape
+    return FittedNoise(sensor.model, usable, np.asarray(response, np.float32) if known else None)
+
+
+def _planned_set(session: Path, plan: CapturePlan, lens: Lens, fitted: FittedNoise) -> ElementalSet:
+    """Return the set of all planned views, at the poses that the stage is told."""
+    frames = dark_frames(plan)
+    stops = sorted({frame.stop.node: frame.stop for frame in frames}.items())
+    nodes = [node for node, _ in stops]
+    if plan.centre.node not in nodes:
+        raise BadValue(
+            f"{session}: no dark_scene frame is planned at the centre node {list(plan.centre.node)}, whose camera is "
+            "the reference; take the dark scene at the grid"
+        )
+    at_centre = [frame.exposure_s for frame in frames if frame.stop == plan.centre]
+    names = ["frame"] * len(at_centre)
+    camera = Camera(lens.size_px, lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, lens.distortion)
+    settings = ElementalSetFile(
+        format=1,
+        exposure_s=sum(at_centre),
+        reference_view=nodes.index(plan.centre.node),
+        camera=camera,
+        noise=NOISE_FILE,
+        view=[nominal_view(stop, plan.centre, names, 0) for _, stop in stops],
+    )
+    flat = None if fitted.response is None else relative_to_axis(fitted.response, fitted.unusable, lens)
+    return ElementalSet(
+        session,
+        settings,
+        lens,
+        fitted.model,
+        offset_from_files=False,
+        flat=flat,
+        unusable=fitted.unusable,
+        poses="nominal",
+    )
+
+
+def _with_poses(planned: ElementalSet, path: Path | None, lens_words: str) -> tuple[ElementalSet, str]:
+    """Return the set at measured poses if there are any for all of its nodes, and which poses it has."""
+    if path is None:
+        return planned, f"nominal, as the stage is told; {lens_words}"
+    try:
+        return with_measured_geometry(planned, path), f"measured, of {path}"
+    except BadValue as failure:
+        return planned, f"nominal, as the stage is told, because {failure}"

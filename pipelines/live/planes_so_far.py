@@ -1,0 +1,270 @@
+"""Planes of the views so far: back-projections that each frame is added to at once, and PMLEM in what time is left."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from faintfield.pipelines.live.planes_messages import LiveFrame, PictureKind
+from faintfield.pipelines.live.planes_scene import LiveScene
+from faintfield.pipelines.reconstruction.channels import lattice_noise, view_electrons
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.penalised import MAX_PASSES, Objective
+from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.recon.depth.focus import FocusMeasure
+from faintfield.recon.depth.running import RunningPlane, SeenByView, seen_by_view
+from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.likelihood.images import ElementalImages, Image, binned
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.initialization import universal_penalty_weight
+from faintfield.recon.solver.pmlem import pmlem
+from faintfield.recon.solver.proximal import DualField
+
+# PMLEM is left out where the images of all nodes take more memory.
+MAX_STACK_BYTES = 2_000_000_000
+
+# PMLEM of a plane stops this near to the optimum, relative to the plane: twice as far as that of `reconstruct`.
+_TOLERANCE = 0.02
+
+# PMLEM is not interrupted before it has made so many iterates: the first is its smooth start.
+_MIN_ITERATES = 3
+
+# A plane that was zero somewhere begins at this share of the smooth start there.
+_MIN_START = 1e-3
+
+
+class _Refined(NamedTuple):
+    """PMLEM's plane with its dual field, the views that it is of, and whether it has reached the optimum."""
+
+    plane: Image
+    dual: DualField
+    views: tuple[int, ...]
+    done: bool
+
+
+class CompleteViews:
+    """Images of the nodes that have all of their frames, one after another in memory, which solvers read as they are.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of an image.
+    nodes : int
+        Number of nodes; memory is taken as they are complete.
+    frames_per_view : int
+        Number of frames that a node has when it is complete.
+    """
+
+    def __init__(self, shape: tuple[int, int], nodes: int, frames_per_view: int) -> None:
+        self._electrons = np.empty((nodes, *shape), np.float32)
+        self._valid = np.empty((nodes, *shape), bool)
+        self._frames_per_view = frames_per_view
+        self._waiting: dict[int, list[ElementalImages]] = defaultdict(list)
+        self.views: list[int] = []
+
+    def add(self, view: int, images: ElementalImages) -> None:
+        """Add a frame of a node."""
+        frames = self._waiting[view]
+        frames.append(images)
+        if len(frames) < self._frames_per_view:
+            return
+        place = len(self.views)
+        self.views.append(view)
+        self._electrons[place] = sum(frame.electrons[0] for frame in frames)
+        self._valid[place] = np.all([True if frame.valid is None else frame.valid[0] for frame in frames], axis=0)
+        del self._waiting[view]
+
+    def drop(self, view: int) -> None:
+        """Forget a node; the last one takes its place."""
+        self._waiting.pop(view, None)
+        if view in self.views:
+            place, last = self.views.index(view), len(self.views) - 1
+            self._electrons[place], self._valid[place] = self._electrons[last], self._valid[last]
+            self.views[place] = self.views[last]
+            self.views.pop()
+
+    def images(self, background_e: float | Image, read_variance_e2: float | Image) -> ElementalImages:
+        """Return the images in the order of `views`, given what all of them share."""
+        count = len(self.views)
+        valid = self._valid[:count]
+        return ElementalImages(self._electrons[:count], background_e, read_variance_e2, None if valid.all() else valid)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame that was read: its view, its images in bins, and its exposure relative to that of a view."""
+
+    view: int
+    images: ElementalImages
+    share: float
+
+
+class PlanesSoFar:
+    """Planes at some depths, from the frames that are there.
+
+    Parameters
+    ----------
+    scene : LiveScene
+        The views, and what is known of them.
+    folder : Path
+        Where the frames' files are.
+    depths_mm : sequence of float
+        Depths of the planes.
+
+    Attributes
+    ----------
+    frames : dict of int to LiveFrame
+        The frames that were added, by the number of their exposure.
+    """
+
+    def __init__(self, scene: LiveScene, folder: Path, depths_mm: Sequence[float]) -> None:
+        self.scene = scene
+        self.frames: dict[int, LiveFrame] = {}
+        self._folder, self._depths_mm = folder, depths_mm
+        loaded = scene.loaded
+        self._factory = OperatorFactory(loaded, scene.layout, None, bins=scene.bins)
+        self._grids = [plane_grid(loaded, depth).binned(scene.bins) for depth in depths_mm]
+        self._running = [RunningPlane(grid.shape) for grid in self._grids]
+        self._latest: list[SeenByView | None] = [None] * len(depths_mm)
+        self._refined: dict[int, _Refined] = {}
+        self._noise = lattice_noise(loaded, scene.layout.lattices[0], None)
+        width, height = loaded.settings.camera.size_px
+        shape, nodes = (height // scene.bins, width // scene.bins), len(loaded.settings.view)
+        self.stack_bytes = 4 * nodes * shape[0] * shape[1]
+        keeps = scene.knows_noise and self.stack_bytes <= MAX_STACK_BYTES
+        self._complete = CompleteViews(shape, nodes, loaded.frames_per_view) if keeps else None
+
+    @property
+    def nodes(self) -> set[tuple[int, int]]:
+        """Nodes of the frames that were added."""
+        return {frame.node for frame in self.frames.values()}
+
+    @property
+    def complete(self) -> int:
+        """Number of nodes that PMLEM can take."""
+        return 0 if self._complete is None else len(self._complete.views)
+
+    def add(self, frame: LiveFrame, planes_in_order: Sequence[int]) -> NDArray[np.generic]:
+        """Add a frame to all planes; return its pixels (row, column), in electrons.
+
+        Raises
+        ------
+        InputError
+            The file cannot be read, or does not fit the others.
+        """
+        read, pixels = self._read(frame)
+        for index in planes_in_order:
+            self._latest[index] = self._seen(index, read)
+            if (seen := self._latest[index]) is not None:
+                self._running[index].add(seen, _half(frame))
+        if self._complete is not None:
+            self._complete.add(read.view, read.images)
+        self.frames[frame.intent] = frame
+        return pixels
+
+    def remove(self, frame: LiveFrame) -> None:
+        """Take a frame away that is not valid any more; raises as `add` does."""
+        del self.frames[frame.intent]
+        read, _ = self._read(frame)
+        for index, running in enumerate(self._running):
+            if (seen := self._seen(index, read)) is not None:
+                running.remove(seen, _half(frame))
+        if self._complete is not None:
+            self._complete.drop(read.view)
+            for other in self.frames.values():
+                if other.node == frame.node:
+                    self._complete.add(read.view, self._read(other)[0].images)
+
+    def picture(self, index: int, kind: PictureKind) -> tuple[Image, NDArray[np.bool_], int] | None:
+        """Return a plane (row, column) in electrons per pixel, where it is covered, and from how many nodes."""
+        per_px = np.float32(1 / self.scene.bins**2)
+        running = self._running[index]
+        latest, refined = self._latest[index], self._refined.get(index)
+        if kind == "mean" and self.frames:
+            return running.mean() * per_px, running.covered, len(self.nodes)
+        if kind == "view" and latest is not None:
+            return latest.mean() * per_px, latest.coverage > 0.1 * latest.coverage.max(), 1
+        if kind == "pmlem" and refined is not None:
+            return refined.plane * per_px, running.covered, len(refined.views)
+        return None
+
+    def focus(self, index: int) -> FocusMeasure:
+        """Return the power of detail that the two halves of the views agree on, in electrons per pixel, squared."""
+        found, bins = self._running[index].focus(), self.scene.bins
+        return FocusMeasure(found.detail_e2 / bins**4, found.sigma_e2 / bins**4)
+
+    def is_refined(self, index: int) -> bool:
+        """Return whether PMLEM has reached the optimum of the nodes that are complete."""
+        if self._complete is None or not self._complete.views:
+            return True
+        refined = self._refined.get(index)
+        return refined is not None and refined.done and refined.views == tuple(self._complete.views)
+
+    def refine(self, index: int, interrupted: Callable[[], bool]) -> None:
+        """Run PMLEM on a plane, from where it was left, until its optimum is near or `interrupted`.
+
+        The weight of the penalty follows from the noise, as in `universal_penalty_weight`; no views are held out.
+        """
+        assert self._complete is not None
+        views = tuple(self._complete.views)
+        images = self._complete.images(*self._known())
+        operator = self._factory.of_views(self._depths_mm[index], self._grids[index], views, images.valid)
+        objective = Objective.of(SceneProblem(operator, images), Settings())
+        weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
+        before = self._refined.get(index)
+        start, dual = objective.start, objective.posed.dual()
+        if before is not None:
+            start, dual = np.maximum(before.plane, _MIN_START * start), before.dual
+        fit = objective.posed.fit(objective.level_e)
+        iterates = pmlem(fit, start, penalty_weight=weight, penalty=objective.penalty, tolerance=_TOLERANCE, dual=dual)
+        for count, iterate in enumerate(iterates, 1):
+            done = iterate.certificate.distance <= _TOLERANCE or count >= MAX_PASSES or iterate.passes >= MAX_PASSES
+            if done or count >= _MIN_ITERATES:
+                self._refined[index] = _Refined(iterate.plane, iterate.dual, views, done)
+                if done or interrupted():
+                    return
+
+    def _seen(self, index: int, read: _Frame) -> SeenByView | None:
+        """Return what a frame says of a plane, None if its view does not see the plane."""
+        try:
+            operator = self._factory.of_views(
+                self._depths_mm[index], self._grids[index], [read.view], read.images.valid
+            )
+        except GeometryMismatch:
+            return None
+        return seen_by_view(operator, read.images, read.share)
+
+    def _read(self, frame: LiveFrame) -> tuple[_Frame, NDArray[np.float32]]:
+        """Return a frame in electrons, in bins and in pixels."""
+        loaded = self.scene.loaded
+        [(electrons, over)] = view_electrons(loaded, self.scene.layout, [self._folder / frame.file])
+        images = ElementalImages(
+            electrons[np.newaxis],
+            self._noise.background_e(frame.exposure_s),
+            valid=~over[np.newaxis] if over.any() else None,
+        )
+        total_s = loaded.settings.exposure_s or frame.exposure_s
+        view = self.scene.view_of[frame.node]
+        return _Frame(view, images.binned(self.scene.bins), frame.exposure_s / total_s), electrons
+
+    def _known(self) -> tuple[float | Image, float | Image]:
+        """Return background and read variance of a bin of a complete view."""
+        loaded, noise = self.scene.loaded, self._noise
+        background_e, variance_e2 = loaded.background_e(noise), loaded.read_variance_e2(noise)
+        return _binned_sum(background_e, self.scene.bins), _binned_sum(variance_e2, self.scene.bins)
+
+
+def _binned_sum(value: float | NDArray[np.floating], bins: int) -> float | Image:
+    """Return a number per pixel, or a map of them, as sums over bins."""
+    if np.ndim(value) == 0:
+        return float(value) * bins**2
+    return np.asarray(binned(np.asarray(value), bins) * bins**2, np.float32)
+
+
+def _half(frame: LiveFrame) -> int:
+    """Return which half of the views a node belongs to: those of a checkerboard."""
+    return sum(frame.node) % 2

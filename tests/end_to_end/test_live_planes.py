@@ -1,0 +1,391 @@
+"""Live planes beside a simulated capture: in a real browser, and when their process dies or hangs."""
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import tifffile
+from numpy.typing import NDArray
+
+from faintfield.pipelines import cli
+from faintfield.pipelines.formats.results.geometry import CameraPoses, LensRecord, NodeRecord
+from faintfield.pipelines.live.capture_page import serve_page
+from faintfield.pipelines.live.guided import read_pixels
+from faintfield.pipelines.live.panel import CapturePanel
+from faintfield.pipelines.live.planes_client import PlanesClient, live_planes
+from faintfield.pipelines.live.planes_messages import LiveOrder, LiveStatus
+from faintfield.pipelines.live.taken import TakenFrames
+from faintfield.rig.cameras.settings import SimulatedSettings
+from faintfield.rig.capture.loop import Capture
+from faintfield.rig.capture.survey import survey
+from faintfield.rig.devices import open_rig
+from faintfield.rig.plan import Grid, nominal_poses_rt_cam_ref
+from faintfield.rig.session.resume import open_session
+from faintfield.rig.session.session import FrozenPlan, taken_frames
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
+from faintfield.rig.simulation.lab import lab_experiment
+from faintfield.rig.stages.protocol import Point, StageSettings
+from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
+from tests.patience import HANG_S
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
+
+_CAMERA = SimulatedSettings(size_px=(160, 120), unlit_photons_per_s=25.0)
+_DEPTHS_MM = (400.0, 450.0, 500.0, 550.0, 600.0)
+_AT_500_MM = 2
+
+# Between two looks at a process of the lowest priority, which would get no time if the tests did not rest.
+_POLL_S = 0.02
+
+
+def rig(nodes: int) -> RigSettings:
+    """Return a simulated rig that takes the dark scene alone."""
+    return RigSettings(
+        stage=StageSettings("simulated"),
+        camera=_CAMERA,
+        grid=Grid(nodes, nodes, 140.0 / nodes, Point(-350.0, -350.0)),
+        step=(StepSettings("dark_scene", 0.1),),
+        settle=SettleSettings(measure=False),
+        drift=DriftSettings(check=False),
+    )
+
+
+def write_calibrations(folder: Path, settings: RigSettings) -> None:
+    """Write noise.json and geometry.json as they truly are."""
+    lab, grid = lab_experiment(_CAMERA), settings.grid
+    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "saturation_dn")
+    numbers = {name: {"value": float(getattr(lab.sensor, name))} for name in names}
+    folder.mkdir()
+    (folder / "noise.json").write_text(json.dumps(numbers))
+    optics = lab.optics
+    lens = LensRecord("opencv", optics.fx_px, optics.fy_px, optics.cx_px, optics.cy_px, tuple(optics.distortion))
+    poses = nominal_poses_rt_cam_ref(grid.rows, grid.columns, grid.pitch_mm).tolist()
+    nodes = [NodeRecord(divmod(view, grid.columns), tuple(pose), 0.0, 0.0) for view, pose in enumerate(poses)]
+    geometry = CameraPoses(lens=lens, size_px=_CAMERA.size_px, reference_node=grid.centre().node, nodes=nodes)
+    (folder / "geometry.json").write_bytes(msgspec.json.encode(geometry))
+
+
+class Running:
+    """A capture in a thread, with live planes and a page; it waits after as many frames as it may take."""
+
+    def __init__(self, folder: Path, nodes: int, *, calibrated: bool = False) -> None:
+        self.folder, self.settings = folder / "session", rig(nodes)
+        known = folder / "known"
+        if calibrated:
+            write_calibrations(known, self.settings)
+        place = str(known) if calibrated else None
+        self._order = LiveOrder("", str(self.folder), str(folder / "rig.toml"), _DEPTHS_MM, place, place)
+        self._panel = CapturePanel(unattended=True)
+        self._may_take = 0
+        self._allowed = threading.Condition()
+        self._stack = ExitStack()
+        self._begin = threading.Event()
+
+    def __enter__(self) -> "Running":
+        plan = FrozenPlan(survey(open_rig(self.settings), self.settings).plan, self.settings)
+        begun, opened = threading.Event(), []
+
+        # The journal belongs to the thread that opens it
+        def capture() -> None:
+            with open_session(self.folder, plan) as session:
+                opened.append(session)
+                begun.set()
+                self._begin.wait()
+                Capture(session, open_rig(self.settings, session.journal), self._panel, read_pixels).run()
+
+        self._thread = threading.Thread(target=capture, daemon=True)
+        self._thread.start()
+        assert begun.wait(HANG_S)
+        self.taken = TakenFrames(opened[0])
+        client = self._stack.enter_context(live_planes(self._order, self.taken.of_dark_scene))
+        assert client is not None
+        self.client: PlanesClient = client
+        self._panel.on_change += [client.note_change, self._wait_for_leave]
+        self.address = self._stack.enter_context(serve_page(self._panel, self.taken, client))
+        self._begin.set()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.take(10**6)
+        self._thread.join(HANG_S)
+        self._stack.close()
+
+    def take(self, frames: int) -> None:
+        """Let the capture go on until there are so many frames."""
+        with self._allowed:
+            self._may_take = frames
+            self._allowed.notify()
+
+    def end(self) -> None:
+        """Let the capture go on to its end, and wait for it."""
+        self.take(10**6)
+        self._thread.join(HANG_S)
+        assert not self._thread.is_alive()
+
+    def _wait_for_leave(self) -> None:
+        with self._allowed:
+            assert self._allowed.wait_for(lambda: len(self.taken.of_dark_scene()) < self._may_take, HANG_S)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
+    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
+        yield tab
+
+
+def shown_levels(browser: Tab, side: str) -> NDArray[np.float64]:
+    """Return the grey levels (row, column) of the picture at one side of the wipe, as the browser has decoded it."""
+    picture = f"document.getElementById('{side}-picture')"
+    browser.wait_until(f"{picture}.complete && {picture}.naturalWidth > 0")
+    levels = browser.evaluate(
+        f"""(() => {{
+            const picture = {picture}, canvas = document.createElement("canvas");
+            canvas.width = picture.naturalWidth;
+            canvas.height = picture.naturalHeight;
+            const context = canvas.getContext("2d");
+            context.drawImage(picture, 0, 0);
+            const data = context.getImageData(0, 0, canvas.width, canvas.height).data;
+            return {{ width: canvas.width, levels: Array.from(data.filter((_, index) => index % 4 === 0)) }};
+        }})()"""
+    )
+    return np.array(levels["levels"], float).reshape(-1, levels["width"])
+
+
+def set_slider(browser: Tab, name: str, value: int) -> None:
+    """Move a slider as a person does: by its value and its event."""
+    browser.evaluate(
+        f"(() => {{ const it = document.getElementById('{name}'); it.value = {value}; "
+        "it.dispatchEvent(new Event('input')); })()"
+    )
+
+
+@needs_browser
+def test_planes_sharpen_on_the_page_while_a_session_is_captured(tmp_path: Path, browser: Tab) -> None:
+    found: dict[int, NDArray[np.float64]] = {}
+    with Running(tmp_path, 7, calibrated=True) as running:
+        browser.open(running.address)
+        for count in (2, 9, 49):
+            running.take(count)
+            browser.wait_until(f"document.getElementById('planes-words').textContent.startsWith('{count} of {count} ')")
+            set_slider(browser, "depth", _AT_500_MM)
+            # "up to date" is said when pictures, focus and PMLEM of all depths are
+            browser.wait_until("document.getElementById('planes-words').textContent.endsWith('now: up to date')")
+            assert browser.evaluate("document.getElementById('right').value") == "pmlem"
+            words = f"right: PMLEM so far, {count} nodes, black "
+            browser.wait_until(f"document.getElementById('right-words').textContent.startsWith('{words}')")
+            found[count] = shown_levels(browser, "right")
+        check_controls(browser)
+        running.end()
+    (running.folder / "noise.json").write_bytes((tmp_path / "known" / "noise.json").read_bytes())
+    out = tmp_path / "planes"
+    options = ["--geometry", str(tmp_path / "known"), "--depth-mm", "500", "--prior", "tv", "--out", str(out)]
+    assert cli.run(["reconstruct", str(running.folder), *options]) == 0
+    final = tifffile.imread(out / "plane_00500.0.tiff")
+    correlations = [float(np.corrcoef(levels.ravel(), final.ravel())[0, 1]) for levels in found.values()]
+    assert correlations == sorted(correlations)
+    assert correlations[0] < 0.8  # else two nodes would do, and the rise says little
+    assert correlations[-1] >= 0.9
+    # Pages of other tests may complain that their capture has ended
+    assert [it for it in browser.complaints if running.address in it] == []
+
+
+def check_controls(browser: Tab) -> None:
+    """Try slider, wipe, choices and nodes of a page that shows a whole capture."""
+    text = browser.text()
+    assert "49 of 49 frames of the dark scene added up, from 49 of 49 nodes" in text
+    assert "poses: measured, of " in text
+    # The slider: another depth is another picture
+    at_500_mm = shown_levels(browser, "left")
+    browser.evaluate("document.getElementById('depth').focus()")
+    set_slider(browser, "depth", 0)
+    browser.wait_until("document.querySelector('label[for=depth]').textContent === '400 mm'")
+    browser.wait_until("document.getElementById('left-picture').src.includes('plane_000_view')")
+    assert not np.array_equal(shown_levels(browser, "left"), at_500_mm)
+    # The wipe: the right picture begins where the line stands
+    for percent in (0, 30, 100):
+        set_slider(browser, "wipe", percent)
+        assert f"{percent}%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")
+        box = browser.evaluate(
+            "(() => { const box = document.getElementById('wipe-box').getBoundingClientRect();"
+            "const line = document.getElementById('wipe-line').getBoundingClientRect();"
+            "return [box.left, box.width, line.left + line.width / 2]; })()"
+        )
+        assert box[2] == pytest.approx(box[0] + box[1] * percent / 100, abs=2.0)
+    # A choice: the mean so far on the left
+    browser.evaluate(
+        "(() => { const it = document.getElementById('left'); it.value = 'mean'; "
+        "it.dispatchEvent(new Event('change')); })()"
+    )
+    browser.wait_until("document.getElementById('left-words').textContent.startsWith('left: mean so far, 49 nodes')")
+    assert browser.evaluate("document.querySelectorAll('#focus circle').length") == len(_DEPTHS_MM)
+    assert "depth in mm" in browser.evaluate("document.getElementById('focus').textContent")
+    # Nodes
+    browser.evaluate("document.querySelector('#grid button[title=\"node 2, 3\"]').click()")
+    browser.wait_until("document.getElementById('node-picture').naturalWidth > 0")
+    words = browser.evaluate("document.getElementById('node-words').textContent")
+    assert "_dark_scene_0_r2_c3" in words
+    assert "stage at -290.000, -310.000 mm" in words
+    assert "exposed for 0.1 s" in words
+    assert "written at " in words
+
+
+def content(session: Path) -> dict[str, bytes]:
+    """Return the files of a session, except for the journal, whose times differ, and the sums over it."""
+    left_out = ("journal.sqlite", "SHA256SUMS")
+    return {path.name: path.read_bytes() for path in session.rglob("*") if path.is_file() and path.name not in left_out}
+
+
+def wait_for(client: PlanesClient, holds: Callable[[LiveStatus], bool]) -> LiveStatus:
+    """Wait until the process of live planes says what is wanted."""
+    while True:
+        assert client.ended() is None
+        status = client.status()
+        if status is not None and holds(status):
+            return status
+        time.sleep(_POLL_S)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_what_happens_to_live_planes_changes_nothing_of_the_session(tmp_path: Path, number: signal.Signals) -> None:
+    (tmp_path / "without").mkdir()
+    settings = rig(3)
+    plan = FrozenPlan(survey(open_rig(settings), settings).plan, settings)
+    with open_session(tmp_path / "without" / "session", plan) as session:
+        panel = CapturePanel(unattended=True)
+        Capture(session, open_rig(settings, session.journal), panel, read_pixels).run()
+    with Running(tmp_path, 3) as running:
+        running.take(2)
+        wait_for(running.client, lambda status: status.frames == 2)
+        os.kill(running.client.pid, number)
+        if number == signal.SIGKILL:
+            while running.client.ended() is None:
+                time.sleep(_POLL_S)
+            assert running.client.ended() == "live planes ended (by signal SIGKILL); the capture goes on without them"
+        running.end()
+    verdict = verify(running.folder)
+    assert (verdict.problems, verdict.present, verdict.sealed) == ((), 9, True)
+    assert content(running.folder) == content(tmp_path / "without" / "session")
+    assert not Path(f"/proc/{running.client.pid}").exists()
+    frames = [(planned.number, taken.sha256) for planned, taken, _ in taken_frames(running.folder)]
+    assert frames == [(it.number, taken.sha256) for it, taken, _ in taken_frames(tmp_path / "without" / "session")]
+
+
+def test_the_process_ends_with_a_capture_that_was_killed_and_leaves_nothing(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    order = LiveOrder(str(out), str(tmp_path), str(tmp_path / "rig.toml"), (500.0,))
+    command = [sys.executable, "-m", "faintfield.pipelines.live.planes_process"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        process.stdin.write(msgspec.json.encode(order) + b"\n")
+        process.stdin.flush()
+        while not (out / "status.json").exists():
+            assert process.poll() is None
+            time.sleep(_POLL_S)
+        process.stdin.close()
+        assert process.wait(HANG_S) == 0
+    assert not out.exists()
+
+
+def hostile(address: str, name: str) -> int:
+    """Return the status that a request for a picture of this name gets, sent as it is written."""
+    parts = urllib.parse.urlsplit(address)
+    with closing(http.client.HTTPConnection(parts.netloc)) as connection:
+        connection.request("GET", f"{parts.path}{name}")
+        return connection.getresponse().status
+
+
+def test_only_pictures_and_nodes_are_served(tmp_path: Path) -> None:
+    with Running(tmp_path, 3) as running:
+        running.take(2)
+        wait_for(running.client, lambda status: status.frames == 2 and "mean" in status.planes[0].pictures)
+        assert hostile(running.address, "planes/plane_000_mean.png?1") == 200
+        assert hostile(running.address, "planes/node_r0_c0.png") == 200
+        assert hostile(running.address, "node/0/0") == 200
+        for name in (
+            "planes/status.json",
+            "planes/.status.json",
+            "planes/plane_000_mean.png%00",
+            "planes/plane_000_mean.png%0a",
+            "planes/plane_999_mean.png",
+            "planes/plane_%D9%A0%D9%A0%D9%A0_mean.png",
+            "planes/..%2f..%2fetc%2fpasswd",
+            "planes/../state",
+            "planes/%2e%2e/plane_000_mean.png",
+            "planes/plane_000_mean.png/..",
+            "planes/",
+            "node/-1/0",
+            "node/0/x",
+        ):
+            assert hostile(running.address, name) == 404, name
+        token = urllib.parse.urlsplit(running.address).path
+        elsewhere = running.address.replace(token, "/" + "x" * (len(token) - 2) + "/")
+        assert hostile(elsewhere, "planes/plane_000_mean.png") == 404
+
+
+def test_a_node_without_frames_has_none(tmp_path: Path) -> None:
+    with Running(tmp_path, 3) as running:
+        running.take(2)
+        wait_for(running.client, lambda status: status.frames == 2)
+        [frame] = running.taken.at(0, (0, 1))
+        assert (frame.name, frame.position_mm[1]) == ("00001_dark_scene_0_r0_c1", -350.0)
+        assert running.taken.at(0, (2, 2)) == running.taken.at(7, (0, 0)) == []
+
+
+def small_rig(tmp_path: Path) -> Path:
+    """Write the rig.toml of a rig of two nodes."""
+    path = tmp_path / "rig.toml"
+    assert cli.run(["init", str(path)]) == 0
+    text = path.read_text().replace("size_px = [640, 480]", "size_px = [64, 48]")
+    path.write_text(text.replace("rows = 7\ncolumns = 7", "rows = 1\ncolumns = 2"))
+    return path
+
+
+def test_a_whole_capture_with_live_planes_from_the_command_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, session = str(small_rig(tmp_path)), str(tmp_path / "session")
+    assert cli.run(["capture", rig, session, "--yes", "--page", "--live-sweep-mm", "400:600:3"]) == 0
+    assert "live planes" not in capsys.readouterr().err
+    assert verify(tmp_path / "session").sealed
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--live-depth-mm", "500"], "give --page, too"),
+        (["--page", "--noise", "noise.json"], "give --live-depth-mm, too"),
+        (["--page", "--live-sweep-mm", "400:900:33"], "at most 32 are computed"),
+        (["--page", "--live-sweep-mm", "-400:900:4"], "give positive depths"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
+) -> None:
+    rig, session = str(small_rig(tmp_path)), tmp_path / "session"
+    assert cli.run(["capture", rig, str(session), "--yes", *options]) == 2
+    assert words in " ".join(capsys.readouterr().err.split())
+    assert not session.exists()
+
+
+def test_a_capture_goes_on_without_live_planes_that_cannot_be_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    rig, session = str(small_rig(tmp_path)), tmp_path / "session"
+    assert cli.run(["capture", rig, str(session), "--yes", "--page", "--live-depth-mm", "500"]) == 0
+    assert "warning: there are no live planes ([Errno 2] No such file" in capsys.readouterr().err
+    assert verify(session).sealed

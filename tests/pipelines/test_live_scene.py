@@ -1,0 +1,198 @@
+"""What live planes know of a session that is not complete, and what they compute from it."""
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from faintfield.pipelines.errors import MissingFile
+from faintfield.pipelines.formats.frames import Frame, read_frame
+from faintfield.pipelines.formats.results.geometry import CameraPoses, LensRecord, NodeRecord
+from faintfield.pipelines.formats.sets.session_set import load_session
+from faintfield.pipelines.live.planes_messages import LiveFrame, LiveOrder, is_picture_name
+from faintfield.pipelines.live.planes_process import stretch
+from faintfield.pipelines.live.planes_scene import LiveScene, bins_of, live_scene
+from faintfield.pipelines.live.planes_so_far import PlanesSoFar
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.penalised import Objective, certified
+from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.solver.initialization import back_projection, universal_penalty_weight
+from faintfield.rig.cameras.settings import FolderSettings
+from faintfield.rig.plan import nominal_poses_rt_cam_ref
+from faintfield.rig.session.session import FrozenPlan, read_plan, taken_frames
+from tests.pipelines.sessions import captured, rig_toml
+
+_DEPTH_MM = 500.0
+_SIZE_PX = (320, 240)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A captured dark scene of two frames per node, with noise and geometry as if measured."""
+    text = rig_toml(["dark_scene"]).replace("frames_per_node = 1", "frames_per_node = 2")
+    folder = captured(tmp_path_factory.mktemp("live"), text.replace("pitch_mm = 100.0", "pitch_mm = 30.0"))
+    values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 12**0.5, "dark_current_e_per_s": 0.5}
+    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    write_geometry(folder / "geometry.json", 3)
+    return folder
+
+
+def write_geometry(path: Path, rows: int) -> None:
+    poses = nominal_poses_rt_cam_ref(rows, 3, 30.0) + 0.001 * np.arange(6)
+    poses[rows // 2 * 3 + 1] = 0
+    nodes = [NodeRecord(divmod(view, 3), tuple(pose), 0.1, 0.1) for view, pose in enumerate(poses.tolist())]
+    lens = LensRecord("opencv", 400.0, 400.0, 160.0, 119.0, (-0.08, 0.02))
+    content = CameraPoses(lens=lens, size_px=_SIZE_PX, reference_node=(rows // 2, 1), nodes=nodes)
+    path.write_bytes(msgspec.json.encode(content))
+
+
+def frames_of(session: Path) -> list[LiveFrame]:
+    return [
+        LiveFrame(taken.intent, taken.file, planned.stop.node, planned.exposure_s)
+        for planned, taken, _ in taken_frames(session)
+    ]
+
+
+def scene_of(session: Path, geometry: str | None = None) -> LiveScene:
+    order = LiveOrder("", str(session), str(session / "nowhere" / "rig.toml"), (_DEPTH_MM,), geometry=geometry)
+    return live_scene(order, read_plan(session), read_frame(session / "frames" / frames_of(session)[0].file))
+
+
+def binned_by(scene: LiveScene, bins: int) -> LiveScene:
+    return LiveScene(**{name: getattr(scene, name) for name in scene.__dataclass_fields__} | {"bins": bins})
+
+
+@pytest.mark.parametrize("bins", [1, 2])
+def test_frames_one_by_one_give_the_back_projection_and_pmlem_of_the_session(session: Path, bins: int) -> None:
+    loaded = load_session(session)
+    [layout] = channel_layouts(loaded)
+    images = load_channel(loaded, layout).binned(bins)
+    grid = plane_grid(loaded, _DEPTH_MM).binned(bins)
+    operator = OperatorFactory(loaded, layout, images, bins=bins).at(_DEPTH_MM, grid)
+
+    planes = PlanesSoFar(binned_by(scene_of(session), bins), session / "frames", [_DEPTH_MM])
+    frames = frames_of(session)
+    void = frames[4]
+    for frame in [frames[7], *frames[:7], *frames[8:]]:
+        planes.add(frame, [0])
+    # A frame that becomes void and is taken again, of the same file
+    planes.remove(void)
+    assert planes.complete == 8
+    planes.add(msgspec.structs.replace(void, intent=999), [0])
+    assert (planes.complete, len(planes.nodes), len(planes.frames)) == (9, 9, 18)
+
+    found = planes.picture(0, "mean")
+    assert found is not None
+    plane, covered, nodes = found
+    expected = back_projection(operator, images) / bins**2
+    assert nodes == 9
+    assert covered.mean() > 0.9
+    np.testing.assert_allclose(plane[covered], expected[covered], atol=2e-3 * np.abs(expected).max())
+
+    planes.refine(0, lambda: False)
+    assert planes.is_refined(0)
+    objective = Objective.of(SceneProblem(operator, images), Settings())
+    weight = universal_penalty_weight(operator, objective.posed.images, objective.start)
+    record, solved = certified(objective, objective.start, weight, objective.posed.dual(), Settings())
+    assert record.certificate is not None
+    assert record.certificate.reached
+    refined = planes.picture(0, "pmlem")
+    assert refined is not None
+    difference = np.linalg.norm(refined[0] - solved / bins**2) / np.linalg.norm(solved / bins**2)
+    assert difference < 0.03  # each lies within 2 % and 1 % of the optimum
+
+
+def test_pmlem_can_be_interrupted_and_goes_on_from_where_it_was(session: Path) -> None:
+    planes = PlanesSoFar(scene_of(session), session / "frames", [_DEPTH_MM])
+    for frame in frames_of(session):
+        planes.add(frame, [0])
+    assert planes.picture(0, "pmlem") is None
+    planes.refine(0, lambda: True)
+    first = planes.picture(0, "pmlem")
+    assert first is not None
+    rounds = 1
+    while not planes.is_refined(0):
+        planes.refine(0, lambda: True)
+        rounds += 1
+    assert 1 < rounds < 15
+
+
+def test_measured_poses_come_first_and_it_is_said_which(session: Path, tmp_path: Path) -> None:
+    measured = scene_of(session)
+    assert measured.poses == f"measured, of {session / 'geometry.json'}"
+    assert measured.loaded.poses_rt_cam_ref[0, 0] == 0.0
+    assert measured.loaded.poses_rt_cam_ref[0, 1] == 0.001
+    write_geometry(tmp_path / "geometry.json", 1)
+    lacking = scene_of(session, geometry=str(tmp_path))
+    assert lacking.poses.startswith("nominal, as the stage is told, because ")
+    assert "has no pose for 6 of 9 views" in lacking.poses
+    assert lacking.loaded.lens.fx_px == 400.0
+    np.testing.assert_array_equal(lacking.loaded.poses_rt_cam_ref[:, :3], 0.0)
+    np.testing.assert_allclose(lacking.loaded.poses_rt_cam_ref[0], [0, 0, 0, 30, 30, 0])
+
+
+def unknown_camera(session: Path) -> tuple[FrozenPlan, Frame]:
+    """Return the plan of a session as if its camera were not simulated, and one of its frames."""
+    frozen = read_plan(session)
+    rig = msgspec.structs.replace(frozen.rig, camera=FolderSettings("frames"))
+    return msgspec.structs.replace(frozen, rig=rig), read_frame(session / "frames" / frames_of(session)[0].file)
+
+
+def test_without_noise_there_is_a_back_projection_in_dn_and_without_a_lens_a_remedy(
+    session: Path, tmp_path: Path
+) -> None:
+    frozen, frame = unknown_camera(session)
+    order = LiveOrder("", str(tmp_path), str(tmp_path / "rig.toml"), (_DEPTH_MM,))
+    with pytest.raises(MissingFile, match=r"no lens is known, and live planes need one; run .* --geometry or --fx-px"):
+        live_scene(order, frozen, frame)
+    scene = live_scene(msgspec.structs.replace(order, fx_px=410.0), frozen, frame)
+    assert (scene.unit, scene.knows_noise, scene.loaded.lens.fx_px) == ("DN/px", False, 410.0)
+    planes = PlanesSoFar(scene, session / "frames", [_DEPTH_MM])
+    planes.add(frames_of(session)[8], [0])
+    found = planes.picture(0, "view")
+    assert found is not None
+    assert np.median(found[0][found[1]]) == pytest.approx(2 * 100.0, rel=0.1)  # of one of two frames of a view
+    assert planes.is_refined(0)  # there is nothing that PMLEM could do
+
+
+@pytest.mark.parametrize(
+    ("size_px", "period_px", "bins"),
+    [((1024, 1024), 1, 1), ((640, 480), 2, 2), ((2048, 1536), 1, 2), ((6000, 4000), 1, 5), ((6000, 4000), 2, 6)],
+)
+def test_bins_leave_about_a_million_pixels(size_px: tuple[int, int], period_px: int, bins: int) -> None:
+    assert bins_of(size_px, period_px) == bins
+
+
+def test_stretch_leaves_out_outliers_and_what_is_not_covered() -> None:
+    plane = np.linspace(0.0, 1.0, 1000).reshape(20, 50).astype(np.float32)
+    plane[0, 0], plane[19] = 1e6, -1e6
+    covered = np.ones(plane.shape, bool)
+    covered[19] = False
+    black, white = stretch(plane, covered)
+    assert black == pytest.approx(0.005, abs=0.002)
+    assert white == pytest.approx(0.95, abs=0.005)
+    assert stretch(plane, np.zeros(plane.shape, bool)) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("plane_000_view.png", True),
+        ("plane_031_pmlem.png", True),
+        ("node_r0_c12.png", True),
+        ("plane_0000_view.png", False),
+        ("plane_000_view.png\n", False),
+        ("plane_000_sigma.png", False),
+        ("plane_٠٠٠_view.png", False),
+        ("../plane_000_view.png", False),
+        ("node_r-1_c0.png", False),
+        ("status.json", False),
+        ("", False),
+    ],
+)
+def test_names_of_pictures_are_strict(name: str, known: bool) -> None:
+    assert is_picture_name(name) is known
