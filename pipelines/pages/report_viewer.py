@@ -49,7 +49,7 @@ class Fineness:
     def step(self, plane: NDArray[np.floating]) -> float:
         """Return the step for a plane; levels up to `_TOP_LEVEL` are enough for its range."""
         finite = plane[np.isfinite(plane)]
-        reach = float(np.ptp(finite)) if finite.size else 0.0
+        reach = float(finite.max()) - float(finite.min()) if finite.size else 0.0
         return max(reach / _TOP_LEVEL, self.of_noise * _noise(plane), self.of_range * reach)
 
 
@@ -299,7 +299,8 @@ def pack(numbers: NDArray[np.floating], step: float) -> Packed:
 
 def _noise(plane: NDArray[np.floating]) -> float:
     """Return the standard deviation of a plane's noise, from the differences of neighbours along rows."""
-    differences = np.abs(np.diff(plane, axis=1))
+    with np.errstate(invalid="ignore"):  # neighbours that are both infinite
+        differences = np.abs(np.diff(plane.astype(np.float64), axis=1))
     finite = differences[np.isfinite(differences)]
     return float(np.median(finite) / _MEDIAN_DIFFERENCE) if finite.size else 0.0
 

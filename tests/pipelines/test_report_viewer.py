@@ -19,7 +19,7 @@ from faintfield.pipelines.formats.image_files import Spacing, write_plane
 from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane
-from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Packed, ViewerPicture, pack, viewer_of
+from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
 
 type Command = Callable[..., CompletedProcess[str]]
 
@@ -49,6 +49,14 @@ def test_packed_numbers_come_back_within_half_a_step(shape: tuple[int, ...]) -> 
 def test_the_finest_step_uses_all_levels() -> None:
     numbers = np.array([[-3.0, 0.0, 1.0]], np.float32)
     assert _levels(pack(numbers, 4.0 / 65534).png).max() == 65534
+
+
+def test_the_step_of_a_plane_with_numbers_that_overflow_is_finite() -> None:
+    plane = np.array([[-3e38, 3e38, np.inf, np.inf, np.nan], [1.0, 2.0, 3.0, 4.0, 5.0]], np.float32)
+    step = Fineness(1 / 16, 2**-13).step(plane)
+    assert step == pytest.approx(6e38 / 2**13)
+    found = _numbers(pack(plane, step))
+    assert abs(found[0, 1] - 3e38) <= step
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
