@@ -25,7 +25,7 @@ _MAX_SAMPLES = 1_500_000
 _MIN_BUDGET, _BUDGET_PER_PICTURE, _MOST_PER_PICTURE = 1_300_000, 115_000, 250_000
 
 # Pictures by which the fineness of all is chosen, spread evenly over them.
-_SAMPLE = 8
+_SAMPLE = 16
 
 # The level of a sample without a number, and the highest of one with a number.
 UNKNOWN_LEVEL, _TOP_LEVEL = 65535, 65534
