@@ -6,22 +6,17 @@ Libraries that are not installed are left out. Contenders take turns in one run;
 """
 
 import argparse
-import itertools
 import sys
 import time
-from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
 from skimage.restoration import denoise_tv_chambolle
 
-from benchmarks.library_solver import LibraryProblem, installed_solvers, iterates_of
-from benchmarks.solvers import dark_scene, last_of, seconds_to_criterion
+from benchmarks.library_solver import installed_solvers, iterates_of
+from benchmarks.solvers import seconds_to_criterion, solved_scene
 from faintfield.recon.likelihood.images import Image
-from faintfield.recon.solver.data_fit import DataFit
-from faintfield.recon.solver.initialization import smooth_start, universal_penalty_weight
 from faintfield.recon.solver.penalties import Penalty
-from faintfield.recon.solver.pmlem import pmlem
 from faintfield.recon.solver.proximal import DualField
 
 # Seconds after which a solver is given up, and excess of the inner objective over its minimum that must be reached.
@@ -33,22 +28,13 @@ _MAX_STEPS = 20_000
 
 def compare_solutions(size_px: int) -> dict[str, tuple[float | None, float | None]]:
     """Return passes and seconds of PMLEM and of each library until the plane stays close to the optimum."""
-    operator, images = dark_scene(size_px)
-    start = smooth_start(operator, images)
-    weight = universal_penalty_weight(operator, images, start)
-    fit = DataFit(operator, images, float(start.mean()))
-
-    def ours() -> Iterator[Image]:
-        return (iterate.plane for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=1e-3))
-
-    optimum = last_of(itertools.islice(ours(), 60))
-    problem = LibraryProblem(operator, images, start, weight, optimum)
-    found = {"faintfield, PMLEM": seconds_to_criterion(ours, optimum, _LIMIT_S)}
-    assert problem.norm > 0  # found before the clock starts
+    problem, ours = solved_scene(size_px)
+    _ = problem.norm  # found before the clock starts
+    found = {"faintfield, PMLEM": seconds_to_criterion(ours, problem.optimum, _LIMIT_S)}
     for name, solver in installed_solvers().items():
         if solver is not None:
             found[f"{name}, primal-dual"] = seconds_to_criterion(
-                partial(iterates_of, solver, problem), optimum, _LIMIT_S
+                partial(iterates_of, solver, problem), problem.optimum, _LIMIT_S
             )
     return found
 

@@ -27,26 +27,19 @@ _LIMIT_S = 15.0
 
 def compare_solvers(size_px: int) -> dict[str, float | None]:
     """Return passes and seconds to the criterion, and the time of the others relative to PMLEM."""
-    operator, images = dark_scene(size_px)
-    start = smooth_start(operator, images)
-    weight = universal_penalty_weight(operator, images, start)
-    fit = DataFit(operator, images, float(start.mean()))
-
-    def ours() -> Iterator[Image]:
-        return (iterate.plane for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=1e-3))
-
-    optimum = last_of(iterate for iterate in itertools.islice(ours(), 60))
+    problem, ours = solved_scene(size_px)
+    operator, images, start, weight = problem.operator, problem.images, problem.start, problem.weight
     epsilon = 0.005 * float(np.quantile(start, 0.99)) ** 2
 
     def late() -> Iterator[Image]:
         steps = pmlem_one_step_late(operator, images, start, penalty_weight=weight, epsilon=epsilon)
         return (iterate.plane for iterate in steps)
 
-    settled = last_of(itertools.islice(late(), 200))  # its own limit: its penalty is smoothed
+    settled = _last(itertools.islice(late(), 200))  # its own limit: its penalty is smoothed
     found = {
-        "pmlem": seconds_to_criterion(ours, optimum),
+        "pmlem": seconds_to_criterion(ours, problem.optimum),
         "one_step_late": seconds_to_criterion(late, settled),
-        "pyproximal": _of_library(LibraryProblem(operator, images, start, weight, optimum)),
+        "pyproximal": _of_library(problem),
     }
     result: dict[str, float | None] = {}
     for name, (passes, seconds) in found.items():
@@ -57,7 +50,21 @@ def compare_solvers(size_px: int) -> dict[str, float | None]:
     return result
 
 
-def dark_scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
+def solved_scene(size_px: int) -> tuple[LibraryProblem, Callable[[], Iterator[Image]]]:
+    """Return dark views with the optimum of total variation, and what yields PMLEM's planes from its start."""
+    operator, images = _dark_scene(size_px)
+    start = smooth_start(operator, images)
+    weight = universal_penalty_weight(operator, images, start)
+    fit = DataFit(operator, images, float(start.mean()))
+
+    def ours() -> Iterator[Image]:
+        return (iterate.plane for iterate in pmlem(fit, start, penalty_weight=weight, tolerance=1e-3))
+
+    optimum = _last(itertools.islice(ours(), 60))
+    return LibraryProblem(operator, images, start, weight, optimum), ours
+
+
+def _dark_scene(size_px: int) -> tuple[PlaneOperator, ElementalImages]:
     """Return dark views (one electron per pixel, read noise 3.5) of rectangles of several levels."""
     problem, generator = BenchmarkProblem.of_size(size_px), np.random.default_rng(4)
     operator, truth = problem.operator(), np.full(problem.grid().shape, 0.3)
@@ -106,7 +113,7 @@ def _mean(part: NDArray[np.floating]) -> float:
     return float(part.mean(dtype=np.float64))
 
 
-def last_of[Item](items: Iterable[Item]) -> Item:
+def _last[Item](items: Iterable[Item]) -> Item:
     """Return the last of some items, of which there is at least one."""
     for item in items:
         last = item

@@ -392,10 +392,16 @@ def test_the_film_goes_through_the_depths_until_it_is_stopped(page: Tab) -> None
 
 def test_the_film_plays_by_itself_only_once_it_is_started(page: Tab) -> None:
     words = "document.getElementById('v-depth-words').value"
+    playing = "[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '■ Stop')"
     first = page.evaluate(words)
+    _drawn(page)
+    assert not page.evaluate(playing)
+    assert page.evaluate(words) == first
     _press(page, " ")
+    assert page.evaluate(playing)
     page.wait_until(f"{words} !== {json.dumps(first)}")
     _press(page, " ")
+    assert not page.evaluate(playing)
 
 
 def test_the_depth_moves_by_slider_and_by_key(page: Tab) -> None:
