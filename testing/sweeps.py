@@ -12,6 +12,7 @@ from scipy.stats import norm, poisson
 from faintfield.recon.likelihood.images import Image
 from faintfield.recon.likelihood.pixel_models import LEAST_SQUARES, POISSON_GAUSSIAN, SHIFTED_POISSON
 from faintfield.recon.operator import kernels
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.geometry import scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
@@ -304,7 +305,9 @@ def _planes(generator: np.random.Generator, dtype: np.dtype[np.floating]) -> Sce
     homographies = np.stack([_homographies(generator, views, depth) for depth in depths_mm])
     flat = generator.uniform(0.4, 1.0, _DETECTOR) * (generator.random(_DETECTOR) > 0.1)
     valid = generator.random((views, *_DETECTOR)) > 0.1
-    return scene_geometry(homographies, _rays(), grids, flat, valid, None, dtype), hiding_of(None, grids, dtype)
+    return scene_geometry(homographies, DetectorMaps(_rays(), flat, dtype), grids, valid, None), hiding_of(
+        None, grids, dtype
+    )
 
 
 def _hidden_planes(generator: np.random.Generator, dtype: np.dtype[np.floating]) -> Scene:
@@ -314,7 +317,7 @@ def _hidden_planes(generator: np.random.Generator, dtype: np.dtype[np.floating])
     homographies = np.stack([_homographies(generator, 3, depth) for depth in depths_mm])
     opacities = [(generator.random(grid.shape) < 0.1) * generator.uniform(0, 1, grid.shape) for grid in grids]
     opacities[2][3:6, 40:60] = 1.0
-    geometry = scene_geometry(homographies, _rays(), grids, None, None, None, dtype)
+    geometry = scene_geometry(homographies, DetectorMaps(_rays(), None, dtype), grids, None, None)
     return geometry, hiding_of(Occluders(opacities, depths_mm), grids, dtype)
 
 
@@ -325,7 +328,7 @@ def _mosaic(generator: np.random.Generator, dtype: np.dtype[np.floating]) -> Sce
     rays = np.concatenate([_rays(), _rays() + 0.5 / _FOCAL_PX])
     flat = generator.uniform(0.4, 1.0, (2, *_DETECTOR))
     homographies = _homographies(generator, 5, 500.0)[np.newaxis]
-    geometry = scene_geometry(homographies, rays, grids, flat, None, lattice_of_view, dtype)
+    geometry = scene_geometry(homographies, DetectorMaps(rays, flat, dtype), grids, None, lattice_of_view)
     return geometry, hiding_of(None, grids, dtype)
 
 
@@ -339,5 +342,5 @@ def _surface(generator: np.random.Generator, dtype: np.dtype[np.floating]) -> Sc
     codes = (3000 * np.sin(np.arange(_DETECTOR[1]) / 20) * np.ones((3, *_DETECTOR))).astype(np.int16)
     codes[generator.random(codes.shape) < 0.05] = UNSEEN
     relief = Relief(codes, 1e-3, 0.0)
-    geometry = scene_geometry(homographies, _rays(), grids, None, None, None, dtype, (slopes, relief))
+    geometry = scene_geometry(homographies, DetectorMaps(_rays(), None, dtype), grids, None, None, (slopes, relief))
     return geometry, hiding_of(None, grids, dtype)

@@ -13,6 +13,7 @@ from faintfield.pipelines.formats.sets.elemental_set import ElementalSet
 from faintfield.pipelines.reconstruction.channels import ChannelLayout
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image, binned
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -129,28 +130,28 @@ class OperatorFactory:
         rays = np.empty((len(lattices), *lattices[0].shape, 2), np.float32)
         for part, at in zip(rays, lattices, strict=True):  # one at a time: they are as large as two images each
             part[:] = loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]]
-        self._rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
+        rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
         response = np.stack([response_of(loaded, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
-        self._response = np.where(whole, binned(response, bins), 0)
+        self._maps = DetectorMaps(rays, np.where(whole, binned(response, bins), 0))
         self._poses, self._principal_shift = loaded.poses_rt_cam_ref, principal_shift(loaded)
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
-        return PlaneOperator(self._homographies(place), self._rays, grid, **self._shared())
+        return PlaneOperator(self._homographies(place), self._maps, grid, **self._shared())
 
     def of_views(
         self, place: Place, grid: PlaneGrid, views: Sequence[int], valid: NDArray[np.bool_] | None
     ) -> PlaneOperator:
         """Return H of a plane in some views alone, in their order, with a mask (view, row, column) of their own."""
         own = {"valid": valid, "lattice_of_view": np.tile(np.arange(self._phases), len(views))}
-        return PlaneOperator(self._homographies(place, views), self._rays, grid, **self._shared() | own)
+        return PlaneOperator(self._homographies(place, views), self._maps, grid, **self._shared() | own)
 
     def of_surface(self, inverse_depth: NDArray[np.floating], grid: PlaneGrid) -> SurfaceOperator:
         """Return H of the surface with these 1/depths in 1/mm, on the samples of a grid at unit depth."""
         matrices = ray_from_surface(self._loaded.poses_rt_cam_ref, self._principal_shift)
         matrices = np.repeat(matrices, self._phases, axis=0)
-        return SurfaceOperator(matrices, self._rays, grid, inverse_depth, **self._shared())
+        return SurfaceOperator(matrices, self._maps, grid, inverse_depth, **self._shared())
 
     def of_scene(self, grids: Mapping[Place, PlaneGrid], opacities: Sequence[Image] | None = None) -> SceneOperator:
         """Return H of all planes together, in the order of `grids`.
@@ -164,7 +165,7 @@ class OperatorFactory:
         """
         homographies = np.stack([self._homographies(place) for place in grids])
         occluders = None if opacities is None else Occluders(opacities, [depth_of(place) for place in grids])
-        return SceneOperator(homographies, self._rays, list(grids.values()), occluders=occluders, **self._shared())
+        return SceneOperator(homographies, self._maps, list(grids.values()), occluders=occluders, **self._shared())
 
     def _homographies(self, place: Place, views: Sequence[int] | None = None) -> NDArray[np.float64]:
         """Return the homographies from the rays of some views, and each phase of its mosaic, to a plane."""
@@ -181,7 +182,7 @@ class OperatorFactory:
         """Return the arguments that the operators of all planes share."""
         views = len(self._loaded.settings.view)
         lattices = np.tile(np.arange(self._phases), views)
-        return {"flat": self._response, "valid": self._valid, "lattice_of_view": lattices}
+        return {"valid": self._valid, "lattice_of_view": lattices}
 
 
 def response_of(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
 from faintfield.recon.operator.placement import BLOCK_PX, LARGEST_ADVANCE
@@ -24,42 +25,35 @@ type Surface = tuple[NDArray[np.float64], Relief]
 
 def scene_geometry(
     plane_from_ray: NDArray[Any],
-    rays: NDArray[Any],
+    maps: DetectorMaps,
     grids: Sequence[PlaneGrid],
-    flat: NDArray[Any] | None,
     valid: NDArray[np.bool_] | None,
     lattice_of_view: NDArray[np.intp] | None,
-    dtype: np.dtype[Any],
     surface: Surface | None = None,
 ) -> SceneGeometry:
-    """Return the geometry of planes (plane, view, 3, 3) and rays (lattice, row, column, 2); `reach` covers whole rows.
+    """Return the geometry of planes (plane, view, 3, 3) and the detector's pixels; `reach` covers whole rows.
 
     With a `surface`, the only plane is the one at 1/depth `origin` of its relief, and pixels meet it nearer or farther.
 
     Raises
     ------
     GeometryMismatch
-        Shapes do not fit together, a number is not finite, or a response is negative.
+        Shapes do not fit together, or a number is not finite.
     """
-    lattices, detector = len(rays), rays.shape[1:3]
+    (lattices, rows, columns), padded, dtype = maps.shape, maps.layers.shape[3], maps.layers.dtype
     planes, views = len(grids), plane_from_ray.shape[1] if plane_from_ray.ndim == 4 else 0
-    if plane_from_ray.shape != (planes, views, 3, 3) or rays.shape != (lattices, *detector, 2) or 0 in (planes, views):
+    if plane_from_ray.shape != (planes, views, 3, 3) or 0 in (planes, views):
         raise GeometryMismatch(
-            f"homographies {plane_from_ray.shape} of {planes} planes and rays {rays.shape} do not fit; "
-            "give (plane, view, 3, 3), (lattice, row, column, 2)"
+            f"homographies {plane_from_ray.shape} do not fit {planes} planes; give (plane, view, 3, 3)"
         )
-    flat = np.ones((1, *detector)) if flat is None else flat.reshape(-1, *flat.shape[-2:])
+    if not np.isfinite(plane_from_ray).all():
+        raise GeometryMismatch("a pose is not a finite number; check the calibration it came from")
     valid = np.zeros((0, 0, 0), bool) if valid is None else np.ascontiguousarray(valid)
     lattice_of_view = np.zeros(views, np.intp) if lattice_of_view is None else np.array(lattice_of_view, np.intp)
-    _check_shapes(flat, valid, lattice_of_view, (views, lattices, *detector))
-    _check_numbers(plane_from_ray, rays, flat)
-    rows, columns = (int(size) for size in detector)
-    padded = -(-columns // BLOCK_PX) * BLOCK_PX
-    maps = np.full((3, lattices, rows, padded), np.nan, dtype)
-    maps[..., :columns] = rays[..., 0], rays[..., 1], np.broadcast_to(flat, (lattices, rows, columns))
+    _check_views(valid, lattice_of_view, (views, lattices, rows, columns))
     homographies = np.stack([grid.index_from_plane() @ h for grid, h in zip(grids, plane_from_ray, strict=True)])
     middle = views // 2, lattice_of_view[views // 2]
-    advances = [_advance(matrices[middle[0]], maps[:2, middle[1], :, :columns]) for matrices in homographies]
+    advances = [_advance(matrices[middle[0]], maps.layers[:2, middle[1], :, :columns]) for matrices in homographies]
     starts = np.cumsum([0, *(grid.shape[0] * grid.shape[1] for grid in grids[:-1])])
     slopes, relief = surface or (np.zeros((0, 3, 3)), Relief(np.zeros((0, 0, 0), np.int16), 0.0, 0.0))
     homographies = np.concatenate([homographies.reshape(-1, 3, 3), slopes])
@@ -68,7 +62,7 @@ def scene_geometry(
         np.column_stack([starts, [grid.shape for grid in grids], advances]).astype(np.intp),
         lattice_of_view,
         (rows, columns, padded),
-        maps.reshape(-1),
+        maps.layers.reshape(-1),
         valid.reshape(-1).view(np.uint8),
         relief.codes.reshape(-1),
         dtype.type(relief.step),
@@ -148,30 +142,13 @@ def _nodes(count: int) -> NDArray[np.intp]:
     return np.unique([*range(0, count, _NODE_PX), count - 1])
 
 
-def _check_shapes(
-    flat: NDArray[Any],
-    valid: NDArray[Any],
-    lattice_of_view: NDArray[np.intp],
-    sizes: tuple[int, int, int, int],
-) -> None:
-    """Refuse maps of pixels of the wrong shape, and lattices that do not exist."""
+def _check_views(valid: NDArray[Any], lattice_of_view: NDArray[np.intp], sizes: tuple[int, int, int, int]) -> None:
+    """Refuse masks of the wrong shape, and lattices that do not exist."""
     views, lattices, *detector = sizes
     if valid.size and valid.shape != (views, *detector):
         raise GeometryMismatch(f"valid has shape {valid.shape}, the pixels {(views, *detector)}; give it that shape")
-    if flat.shape not in ((1, *detector), (lattices, *detector)):
-        raise GeometryMismatch(
-            f"flat {flat.shape} does not fit rays {(lattices, *detector, 2)}; give one per lattice, or one"
-        )
     if lattice_of_view.shape != (views,) or not 0 <= lattice_of_view.min() <= lattice_of_view.max() < lattices:
         raise GeometryMismatch(
             f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {views} views one of {lattices} "
             "lattices, counted from 0"
         )
-
-
-def _check_numbers(plane_from_ray: NDArray[Any], rays: NDArray[Any], flat: NDArray[Any]) -> None:
-    """Refuse numbers that are not finite, and negative light."""
-    if not all(np.isfinite(part).all() for part in (plane_from_ray, rays, flat)):
-        raise GeometryMismatch("a pose, ray or flat field is not a finite number; check the calibration they came from")
-    if (flat < 0).any():
-        raise GeometryMismatch(f"the flat field is negative somewhere, {flat.min():.3g} at least; measure it again")

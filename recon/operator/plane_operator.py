@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.likelihood.images import Image
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.geometry import Surface, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.kernels import SceneGeometry
@@ -34,7 +35,7 @@ class PlaneOperator(SceneOperator):
     def __init__(
         self,
         plane_from_ray: NDArray[np.floating],
-        rays: NDArray[np.floating],
+        rays: NDArray[np.floating] | DetectorMaps,
         grid: PlaneGrid,
         *,
         flat: NDArray[np.floating] | None = None,

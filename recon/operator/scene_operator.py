@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.operator import kernels
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.geometry import Surface, scene_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders, hiding_of
@@ -35,8 +36,9 @@ class SceneOperator:
     plane_from_ray : array (plane, view, 3, 3)
         Homographies from a ray (x, y, 1) to the coordinates (x, y, 1) of each plane in mm; the homogeneous scale is
         positive for points in front of the camera.
-    rays : array (row, column, 2) or (lattice, row, column, 2)
-        Where each detector pixel looks: x, y at unit depth, lens distortion undone.
+    rays : array (row, column, 2) or (lattice, row, column, 2), or DetectorMaps
+        Where each detector pixel looks: x, y at unit depth, lens distortion undone. Operators that are given the same
+        maps, which include `flat`, share their memory.
     grids : sequence of PlaneGrid
         The samples of each plane.
     flat : array (row, column) or (lattice, row, column), optional
@@ -70,7 +72,7 @@ class SceneOperator:
     def __init__(
         self,
         plane_from_ray: NDArray[np.floating],
-        rays: NDArray[np.floating],
+        rays: NDArray[np.floating] | DetectorMaps,
         grids: Sequence[PlaneGrid],
         *,
         flat: NDArray[np.floating] | None = None,
@@ -85,10 +87,10 @@ class SceneOperator:
         self.dtype: np.dtype[np.floating[Any]] = np.dtype(dtype)
         grids = tuple(grids)
         self.workers = workers or int(numba.config.NUMBA_NUM_THREADS)
-        rays = rays[np.newaxis] if rays.ndim == 3 else rays
-        geometry = scene_geometry(plane_from_ray, rays, grids, flat, valid, lattice_of_view, self.dtype, surface)
+        maps = DetectorMaps.of(rays, flat, dtype)
+        geometry = scene_geometry(plane_from_ray, maps, grids, valid, lattice_of_view, surface)
         self._make_sweeps, self._hiding = sweeps, hiding_of(occluders, grids, self.dtype)
-        self.maps_shape: tuple[int, int, int] = (rays.shape[0], rays.shape[1], rays.shape[2])
+        self.maps_shape = maps.shape
         self._kept_maps: dict[float, Image] | None = None
         self.images_shape = (plane_from_ray.shape[1], *self.maps_shape[1:])
         self.all_views, self.lattice_of_view = np.arange(self.images_shape[0]), geometry.lattice_of_view

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.errors import GeometryMismatch
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.placement import UNSEEN
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -75,7 +76,7 @@ class SurfaceOperator(PlaneOperator):
     def __init__(
         self,
         ray_from_surface: NDArray[np.floating],
-        rays: NDArray[np.floating],
+        rays: NDArray[np.floating] | DetectorMaps,
         grid: PlaneGrid,
         inverse_depth: NDArray[np.floating],
         *,
@@ -85,17 +86,17 @@ class SurfaceOperator(PlaneOperator):
         dtype: type[np.float32] | type[np.float64] = np.float32,
         workers: int | None = None,
     ) -> None:
-        rays = rays[np.newaxis] if rays.ndim == 3 else rays
+        maps = DetectorMaps.of(rays, flat, dtype)
+        rays = np.ascontiguousarray(maps.rays)
         matrices = ray_from_surface.astype(np.float64)
         lattices = np.zeros(len(matrices), np.intp) if lattice_of_view is None else np.asarray(lattice_of_view)
-        _check_surface(matrices, rays, grid, inverse_depth, lattices)
+        _check_surface(matrices, len(rays), grid, inverse_depth, lattices)
         self._relief = draw_relief(inverse_depth, grid, matrices, rays, lattices.tolist(), workers)
         at_infinity, slopes = homographies_of_surface(matrices)
         super().__init__(
             at_infinity + self._relief.origin * slopes,
-            rays,
+            maps,
             grid,
-            flat=flat,
             valid=valid,
             lattice_of_view=lattice_of_view,
             dtype=dtype,
@@ -111,20 +112,18 @@ class SurfaceOperator(PlaneOperator):
 
 def _check_surface(
     ray_from_surface: NDArray[np.float64],
-    rays: NDArray[np.floating],
+    lattices: int,
     grid: PlaneGrid,
     inverse_depth: NDArray[np.floating],
     lattice_of_view: NDArray[np.intp],
 ) -> None:
     """Refuse what cannot be drawn; the rest is checked with the geometry."""
-    if ray_from_surface.ndim != 3 or ray_from_surface.shape[1:] != (3, 4) or rays.ndim != 4 or rays.shape[3] != 2:
-        raise GeometryMismatch(
-            f"matrices {ray_from_surface.shape} and rays {rays.shape} do not fit; give (view, 3, 4), (row, column, 2)"
-        )
-    if lattice_of_view.shape != (len(ray_from_surface),) or not set(lattice_of_view.tolist()) <= set(range(len(rays))):
+    if ray_from_surface.ndim != 3 or ray_from_surface.shape[1:] != (3, 4):
+        raise GeometryMismatch(f"matrices of shape {ray_from_surface.shape} do not fit; give (view, 3, 4)")
+    if lattice_of_view.shape != (len(ray_from_surface),) or not set(lattice_of_view.tolist()) <= set(range(lattices)):
         raise GeometryMismatch(
             f"lattice_of_view has shape {lattice_of_view.shape}; give each of the {len(ray_from_surface)} views one of "
-            f"{len(rays)} lattices, counted from 0"
+            f"{lattices} lattices, counted from 0"
         )
     if inverse_depth.shape != grid.shape:
         raise GeometryMismatch(
@@ -132,7 +131,7 @@ def _check_surface(
         )
     if np.isinf(inverse_depth).any() or (inverse_depth < 0).any():
         raise GeometryMismatch("a depth of the surface is zero or negative; give 1/depth ≥ 0, or NaN for no surface")
-    if not (np.isfinite(ray_from_surface).all() and np.isfinite(rays).all()):
-        raise GeometryMismatch("a pose or ray is not a finite number; check the calibration they came from")
+    if not np.isfinite(ray_from_surface).all():
+        raise GeometryMismatch("a pose is not a finite number; check the calibration it came from")
     if (np.linalg.det(ray_from_surface[:, :, :3]) <= 0).any():
         raise GeometryMismatch("a view sees a mirror image of the directions of the reference; check its pose")

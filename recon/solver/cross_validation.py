@@ -158,7 +158,7 @@ class _Fold:
             penalty_weight=weight * self._share**0.5,
             penalty=self._penalty,
             tolerance=_TOLERANCE,
-            dual=self._problem.dual() if near is None else near.dual,
+            dual=self._problem.dual() if near is None else near.dual.copy(),
         )
         for done, iterate in enumerate(iterates, 1):
             if iterate.certificate.distance <= _TOLERANCE or max(done, iterate.passes) >= _MAX_PASSES:

@@ -93,12 +93,16 @@ class DataFit:
         """Return the metric of a single plane from the light of its samples."""
         likelihood = self._images.likelihood
         fixed = likelihood.name == "least-squares"
-        light_e = np.full_like(samples, likelihood.level_e) if fixed else np.maximum(samples, self._min_light_e)
-        response = np.ones_like(self._coverage)
-        np.divide(self._coverage, self.sensitivity, out=response, where=self.sensitivity > 0)
-        (precision,) = self._operator.planes_of(1 / (light_e * response + self._known_e2))
-        metric = self._coverage * blurred(precision, (1,)).reshape(samples.shape)
-        return np.asarray(_positive(metric), samples.dtype)
+        # Each array is as large as the plane: work in place
+        variance_e2 = np.full_like(samples, likelihood.level_e) if fixed else np.maximum(samples, self._min_light_e)
+        seen = self.sensitivity > 0
+        np.multiply(variance_e2, self._coverage, out=variance_e2, where=seen)
+        np.divide(variance_e2, self.sensitivity, out=variance_e2, where=seen)
+        variance_e2 += self._known_e2
+        (precision,) = self._operator.planes_of(np.reciprocal(variance_e2, out=variance_e2))
+        metric = blurred(precision, (1,)).reshape(samples.shape)
+        metric *= self._coverage
+        return _positive(metric)
 
     def _averaged(self, known_e2: NDArray[np.float64], level_e: float) -> float | Image:
         """Return b + σ² for each sample, averaged such that the inverse of its sum with typical light is kept."""

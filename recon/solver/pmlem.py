@@ -78,7 +78,7 @@ class PmlemIterate:
     inner_steps : int
         Steps of inner problems so far.
     dual : DualField
-        The penalty's dual field, from which a similar problem can start.
+        The penalty's dual field, from which a similar problem can start. The next iterate changes it.
     """
 
     plane: Image
@@ -114,7 +114,7 @@ def pmlem(
     tolerance : float
         The distance that the caller wants to reach, which sets the accuracy of inner problems.
     dual : DualField, optional
-        That of a similar problem, not changed; by default that of one constant plane (row, column).
+        That of a similar problem, which is changed; by default that of one constant plane (row, column).
 
     Raises
     ------
@@ -143,52 +143,56 @@ class _Pmlem:
         self._inner_steps = 0
 
     def iterates(self, plane: Image, dual: DualField) -> Iterator[PmlemIterate]:
-        """Iterate without end."""
+        """Iterate without end; arrays as large as the plane are dropped before the next of their kind is made."""
         metric = self._fit.metric(plane)
-        accepted: PmlemIterate | None = None
-        gradient = np.zeros_like(plane)
+        accepted, point = None, plane
         passes, lowest = 0, np.inf
         while True:
-            value, new_gradient = self._fit.value_and_gradient(plane)
+            value, gradient = self._fit.value_and_gradient(plane)
             passes += 1
             objective = value + self._weight * dual.penalty_and_slack(plane, self._penalty)[0]
             if np.isnan(objective):
                 raise NotConverged(f"pass {passes} left the finite numbers; give a smaller penalty weight")
             if accepted is None or np.isinf(lowest) or objective <= lowest + _ROUNDING * abs(lowest):
                 lowest = min(lowest, objective)
-                gradient = new_gradient
+                del point
                 certificate = self._certificate(plane, gradient, metric, dual)
                 accepted = PmlemIterate(plane, objective, certificate, passes, self._inner_steps, dual)
                 yield accepted
                 self._scale = max(self._scale * _RELAXATION, 1.0)
                 if passes <= _PASSES_WITH_NEW_METRIC:
+                    del metric
                     metric = self._fit.metric(plane)
+                point = plane - gradient / (metric * metric.dtype.type(self._scale))
             else:
                 self._scale *= 2
+                point = (accepted.plane + point) / 2  # half the way
             while self._scale > _MAX_SCALE:
                 yield accepted  # no step lowers the objective within rounding
-            plane, dual = self._step(accepted, gradient, metric, dual)
+            del plane, gradient
+            plane = self._minimum(accepted.plane, point, metric, dual)
 
-    def _step(self, here: PmlemIterate, gradient: Image, metric: Image, dual: DualField) -> tuple[Image, DualField]:
-        """Return the minimum of quadratic and penalty, and its dual field, starting from the last dual field."""
-        scaled = metric if self._scale == 1 else metric * metric.dtype.type(self._scale)
-        point = here.plane - gradient / scaled
+    def _minimum(self, here: Image, point: Image, metric: Image, dual: DualField) -> Image:
+        """Return the minimum of quadratic and penalty; start from a dual field and replace it by that of the minimum.
+
+        The quadratic has its own minimum at `point` and the curvature `scale · metric`; both parts are divided by that
+        scale.
+        """
         if self._weight == 0:
             plane = np.maximum(point, 0)
         else:
-            dual = dual.copy()
-            size = norm(here.plane, scaled)
+            size = norm(here, metric)
 
             def gap_tolerance(plane: Image) -> float:
-                step = distance(plane, here.plane, scaled)
+                step = distance(plane, here, metric)
                 return 0.5 * max(_INNER_OF_STEP * step, _INNER_OF_TOLERANCE * self._tolerance * size) ** 2
 
-            found = dual.prox(point, scaled, self._weight, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
+            found = dual.prox(point, metric, self._weight / self._scale, self._penalty, gap_tolerance, _MAX_INNER_STEPS)
             plane = found.plane
             self._inner_steps += found.steps
         if not self._fit.may_reach_zero:
-            np.maximum(plane, here.plane.dtype.type(_MIN_FALL) * here.plane, out=plane)
-        return plane, dual
+            np.maximum(plane, here.dtype.type(_MIN_FALL) * here, out=plane)
+        return plane
 
     def _certificate(self, plane: Image, gradient: Image, metric: Image, dual: DualField) -> Certificate:
         """Return the certificate of a plane in the metric it was found with."""
@@ -196,7 +200,10 @@ class _Pmlem:
         after = dual.primal(plane - gradient / metric, reach)
         residual = distance(plane, np.maximum(after, 0), metric)
         slack = self._weight * dual.penalty_and_slack(plane, self._penalty)[1]
-        slack += float(np.sum(metric * plane * np.maximum(-after, 0), dtype=np.float64))
+        below = np.minimum(after, 0, out=after)
+        below *= metric
+        below *= plane
+        slack -= float(np.sum(below, dtype=np.float64))
         size = norm(plane, metric)
         parts = (residual + np.sqrt(residual**2 + 2 * slack), residual, np.sqrt(2 * slack))
         return Certificate(*(_relative(part, size) for part in parts))

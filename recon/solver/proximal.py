@@ -206,7 +206,7 @@ def step_sizes(reach: Image) -> Image:
     largest = reach.copy()
     np.maximum(largest[:-1], reach[1:], out=largest[:-1])
     np.maximum(largest[:, :-1], reach[:, 1:], out=largest[:, :-1])
-    return reach.dtype.type(0.125) / largest
+    return np.divide(reach.dtype.type(0.125), largest, out=largest)
 
 
 def _set_primal(vectors: Image, point: Image, reach: Image, plane: Image, workers: int) -> None:

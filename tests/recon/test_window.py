@@ -11,6 +11,7 @@ from faintfield.calib.homography import plane_from_ray, ray_from_surface
 from faintfield.calib.lens import Lens
 from faintfield.recon.errors import GeometryMismatch
 from faintfield.recon.likelihood.images import ElementalImages
+from faintfield.recon.operator.detector_maps import DetectorMaps
 from faintfield.recon.operator.geometry import scene_geometry, window_geometry
 from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.plane_operator import PlaneOperator
@@ -68,8 +69,12 @@ def test_a_small_window_of_a_large_plane_is_found_on_the_detector(corner: tuple[
 def test_few_pixels_are_looked_at_for_a_small_window() -> None:
     """Views that overlay the samples see a window of 29 x 29 in as many pixels; rows come in blocks of 64."""
     rays = np.stack(np.meshgrid(np.arange(400.0), np.arange(300.0)), axis=-1)
-    args = (np.eye(3)[np.newaxis, np.newaxis], rays[np.newaxis], [PlaneGrid((300, 400), 1.0, (0.0, 0.0))])
-    whole = scene_geometry(*args, None, None, None, np.dtype(np.float64))
+    args = (
+        np.eye(3)[np.newaxis, np.newaxis],
+        DetectorMaps(rays, dtype=np.float64),
+        [PlaneGrid((300, 400), 1.0, (0.0, 0.0))],
+    )
+    whole = scene_geometry(*args, None, None)
     reach = window_geometry(whole, PlaneGrid((29, 29), 1.0, (207.0, 131.0)), (131, 207)).reach[0]
     looked_at = reach[:, 1] - reach[:, 0]
     assert (looked_at[131:160] > 0).all()
