@@ -4,23 +4,30 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/pip --disable-pip-version-check --quiet
+PYTEST := $(BIN)/python -m pytest -n 2 --dist worksteal --durations 10 --durations-min 0.1
 OUT ?= demo
 SAMPLE ?= 300
 MODULES ?= recon calib rig/session rig/capture rig/stages
 
-.PHONY: demo test campaigns lint bench mutants results lock clean help
+SHELL := bash
+TIMEFORMAT = %R s elapsed, %U s + %S s of CPU (budget: 180 s, 330 s in all; CONTRIBUTING.md)
+
+.PHONY: demo test deep lint bench mutants results lock clean help
 
 help: ## list the tasks
-	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
+	@grep -E '^[a-z%-]+:.*##' Makefile | sed -E 's/:[^#]*##/\t/' | expand -t 8
 
 demo: $(VENV)/compiled ## the whole experiment, simulated; the last line is the path of its report
 	$(BIN)/faintfield demo $(OUT)
 
-test: $(VENV)/compiled ## all tests, on two cores
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+test: $(VENV)/compiled ## the quick tests, on two cores
+	@TIMEFORMAT='$(TIMEFORMAT)'; time $(PYTEST)
 
-campaigns: $(VENV)/compiled ## thousands of damaged files, kills, faults and arrangements: an hour, before a release
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m campaign
+test-%: $(VENV)/compiled ## those of one package: make test-rig, -calib, -recon, -pipelines
+	@TIMEFORMAT='$(TIMEFORMAT)'; time $(PYTEST) tests/$*
+
+deep: $(VENV)/compiled ## damaged files, kills, faults, full demo, mutants, installs: an hour, before a release; goes on where it stopped
+	.ci/deep
 
 lint: $(VENV)/installed ## style, types and import contracts
 	$(BIN)/ruff check .

@@ -1,5 +1,7 @@
 """The objects of the simulated experiments: toys, a resolution chart, a shaded ball."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +58,7 @@ class _Canvas:
         # Divided by the opacity, the colour of partly covered samples is that of their covered part
         inside = colour * light / np.maximum(opacity, 1e-3)[:, :, np.newaxis]
         reflectance = np.clip(inside, 0, 1).astype(np.float32)
+        reflectance.flags.writeable = opacity.flags.writeable = False  # shared by all scenes that hold the object
         return TexturedPlane(name, reflectance, opacity, _TEXTURE_PITCH_MM, (0, 0, 0, x_mm, y_mm, depth_mm))
 
     def _pixels(self, points_mm: list[tuple[float, float]]) -> NDArray[np.int32]:
@@ -68,6 +71,7 @@ def _levels(colour: Colour) -> tuple[int, int, int]:
     return red, green, blue
 
 
+@cache
 def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
     """Return a toy truck 190 mm long, seen from the side, at x, y and a depth."""
     canvas = _Canvas(200, 120)
@@ -93,6 +97,7 @@ def toy_truck(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
     return canvas.plane("truck", x_mm, y_mm, depth_mm, shading=0.25)
 
 
+@cache
 def toy_airplane(x_mm: float, y_mm: float, depth_mm: float) -> TexturedPlane:
     """Return a toy airplane 265 mm long, seen from above, at x, y and a depth."""
     canvas = _Canvas(280, 250)

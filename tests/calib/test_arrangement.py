@@ -1,7 +1,6 @@
 """What the pictures of a grid say of their order, against scenes whose order is known."""
 
 from collections.abc import Callable
-from itertools import product
 
 import numpy as np
 import pytest
@@ -42,8 +41,17 @@ def aligned() -> Views:
     return light_field(grid=(5, 6), aligned_px=ALIGNED_PX)
 
 
-@pytest.mark.parametrize("wanted", [Orientation(*flags) for flags in product((False, True), repeat=3)], ids=str)
-def test_each_of_eight_orders_is_found_in_aligned_pictures(wanted: Orientation, aligned: Views) -> None:
+@pytest.mark.parametrize(
+    "wanted",
+    [
+        Orientation(False, False, True),
+        Orientation(False, True, True),
+        Orientation(True, True),
+        Orientation(True, False, True),
+    ],
+    ids=str,
+)
+def test_order_is_found_in_aligned_pictures(wanted: Orientation, aligned: Views) -> None:
     misnamed = _misnamed(aligned, wanted)
     found = _seen(misnamed)
     assert found.orientation == wanted
@@ -55,9 +63,7 @@ def test_each_of_eight_orders_is_found_in_aligned_pictures(wanted: Orientation, 
     assert all(placed[node] is aligned[node] for node in aligned)
 
 
-@pytest.mark.parametrize(
-    ("aligned_px", "least_px", "largest_px"), [(0.0, -3.8, -1.0), (ALIGNED_PX, -1.4, 1.4), (ALL_WITH_IT_PX, 0.4, 3.2)]
-)
+@pytest.mark.parametrize(("aligned_px", "least_px", "largest_px"), [(0.0, -3.8, -1.0), (ALL_WITH_IT_PX, 0.4, 3.2)])
 def test_the_range_of_disparities_holds_all_layers_and_little_more(
     aligned_px: float, least_px: float, largest_px: float
 ) -> None:
@@ -89,8 +95,7 @@ def test_an_edge_of_brightness_is_no_edge_of_depth() -> None:
     assert abs(_seen(views).side_z) < 4
 
 
-@pytest.mark.parametrize("ratio", [1.5, 0.6])
-@pytest.mark.parametrize("transpose", [False, True])
+@pytest.mark.parametrize(("ratio", "transpose"), [(1.5, False), (0.6, True)])
 def test_another_pitch_along_columns_is_measured(ratio: float, transpose: bool) -> None:
     found = _seen(_misnamed(light_field(grid=(5, 5), ratio=ratio), Orientation(transpose)))
     assert found.orientation == Orientation(transpose)
@@ -108,9 +113,10 @@ def test_a_square_pitch_is_called_square(aligned: Views) -> None:
     assert _seen(aligned).ratio == 1.0
 
 
-@pytest.mark.parametrize("along", ["row", "column"])
-@pytest.mark.parametrize("reversed_order", [False, True])
-@pytest.mark.parametrize("transpose", [False, True])
+@pytest.mark.parametrize(
+    ("along", "reversed_order", "transpose"),
+    [("row", True, False), ("row", False, True), ("column", False, False), ("column", True, True)],
+)
 def test_a_single_row_or_column(along: str, reversed_order: bool, transpose: bool) -> None:
     views = light_field(grid=(1, 7) if along == "row" else (7, 1), aligned_px=ALIGNED_PX)
     wanted = Orientation(transpose, reversed_order, reversed_order)
@@ -149,8 +155,8 @@ def test_an_order_that_is_given_is_kept_and_contradicted(aligned: Views) -> None
     assert not _seen(aligned, Orientation()).contradicted
 
 
-@pytest.mark.parametrize("snr", [3.0, 1.0])
-def test_noise_leaves_the_range_and_the_axes(snr: float, aligned: Views) -> None:
+def test_noise_leaves_the_range_and_the_axes(aligned: Views) -> None:
+    snr = 1.0
     found = _seen(with_noise(_misnamed(aligned, Orientation(transpose=True)), snr))
     assert found.seen
     assert found.orientation.transpose
@@ -159,20 +165,19 @@ def test_noise_leaves_the_range_and_the_axes(snr: float, aligned: Views) -> None
     assert found.disparity_px[1] > 1.2
 
 
-@pytest.mark.parametrize("snr", [0.16, 0.05])
-def test_dark_pictures_keep_their_names(snr: float, aligned: Views) -> None:
+def test_dark_pictures_keep_their_names(aligned: Views) -> None:
+    snr = 0.16
     found = _seen(with_noise(aligned, snr))
     assert found.orientation == Orientation()
     assert not found.undecided
     assert found.odd == []
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_pictures_of_noise_and_of_different_scenes_show_nothing(seed: int) -> None:
-    generator = np.random.default_rng(seed)
+def test_pictures_of_noise_and_of_different_scenes_show_nothing() -> None:
+    generator = np.random.default_rng(0)
     noise = {node: generator.random((96, 128), np.float32) for node in np.ndindex(5, 5)}
     assert not _seen(noise).seen
-    scenes = {(r, c): light_field(grid=(1, 1), seed=100 * seed + 5 * r + c)[0, 0] for r, c in np.ndindex(5, 5)}
+    scenes = {(r, c): light_field(grid=(1, 1), seed=5 * r + c)[0, 0] for r, c in np.ndindex(5, 5)}
     assert not _seen(scenes).seen
 
 

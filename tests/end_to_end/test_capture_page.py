@@ -38,12 +38,10 @@ from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
-from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
+from tests.end_to_end.browser import Tab
 from tests.faults.besieging import besiege
 from tests.faults.capturing import FRAMES, SMALL_RIG, in_process
 from tests.patience import HANG_S
-
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
 
 class Running:
@@ -87,13 +85,6 @@ def running(tmp_path: Path) -> Iterator[Running]:
         yield running
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
-        yield tab
-
-
-@needs_browser
 def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
     browser.open(running.address)
     browser.wait_until("document.getElementById('title').textContent === 'Homing'")
@@ -117,7 +108,6 @@ def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
     assert [it for it in browser.complaints if running.address in it] == []
 
 
-@needs_browser
 def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.CaptureFixture[str]) -> None:
     browser.open(running.address)
     browser.click("go")
@@ -140,7 +130,6 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
         assert [event.detail["answer"] for event in journal.events("prompt")] == ["go", "skip", "stop"]
 
 
-@needs_browser
 def test_no_name_becomes_a_part_of_the_page(browser: Tab) -> None:
     hostile = "</li><script>document.title = 'mine'</script><img src=x onerror=\"document.title = 'mine'\">"
     panel = CapturePanel(unattended=False)
@@ -156,7 +145,6 @@ def test_no_name_becomes_a_part_of_the_page(browser: Tab) -> None:
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
 
 
-@needs_browser
 def test_the_page_is_dark_red(running: Running, browser: Tab) -> None:
     browser.call("Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False)
     browser.open(running.address)
@@ -337,17 +325,9 @@ def besieged(address: str, idle: int, slow: int, body_bytes: int) -> Iterator[No
     assert besieger.exitcode == 0
 
 
-@pytest.mark.parametrize(
-    ("idle", "slow", "body_bytes", "max_files"),
-    [
-        pytest.param(300, 30, 80_000_000, 256, id="300 idle"),
-        pytest.param(2000, 200, 600_000_000, 1024, id="2000 idle", marks=pytest.mark.slow),
-    ],
-)
-def test_a_besieged_page_leaves_the_capture_alone(
-    tmp_path: Path, idle: int, slow: int, body_bytes: int, max_files: int
-) -> None:
-    with Besieged(tmp_path / "session", max_files) as capture:
+@pytest.mark.deep
+def test_besieged_page_leaves_capture_alone(tmp_path: Path) -> None:
+    with Besieged(tmp_path / "session", max_files=1024) as capture:
         capture.answer("Homing")
         capture.answer("Step 1 of 3: Bright set")
         capture.wait_for("Step 2 of 3: Dark-scene set")
@@ -355,7 +335,7 @@ def test_a_besieged_page_leaves_the_capture_alone(
         # Whatever a capture and its page need has been in memory once
         capture.forget_highest_memory()
         before_mb = capture.memory_mb("VmRSS")
-        with besieged(capture.address, idle, slow, body_bytes):
+        with besieged(capture.address, idle=2000, slow=200, body_bytes=600_000_000):
             capture.answer("Step 2 of 3: Dark-scene set")
             capture.wait_for("Step 3 of 3: Dark frames")
             assert capture.memory_mb("VmHWM") - before_mb < 50.0

@@ -1,5 +1,6 @@
-"""`faintfield demo`, whole: the paper's experiment in the dark, and what its reconstruction takes."""
+"""`faintfield demo`: small from capture to report; in deep the accuracy of `--quick` and of full size."""
 
+import importlib
 import json
 import os
 import subprocess
@@ -11,97 +12,45 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
+from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
+from faintfield.pipelines.paper import demo as paper
+from faintfield.pipelines.reconstruction import request
 
 METHODS = [method for method in get_args(Method.__value__) if method not in JOINT_METHODS]
+DEPTHS_MM = (500.0, 700.0)
+MOST_BYTES_OF_THE_REPORT = 5_000_000
+SNR = 0.16
 _ROOT = Path(__file__).parents[2]
 _MAIN = "from faintfield.pipelines.cli import main; main({words!r})"
 
 
-def _run(words: list[str], **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", _MAIN.format(words=words)],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=_ROOT,
-        **options,
-    )
+def _run(*words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", _MAIN.format(words=list(words))]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=_ROOT)
 
 
-@pytest.fixture(scope="session")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("demo") / "demo"
+def _metrics(out: Path) -> dict[str, Any]:
+    return dict(json.loads((out / "metrics.json").read_text()))
 
 
-@pytest.fixture(scope="session")
-def ended(out: Path) -> subprocess.CompletedProcess[str]:
-    return _run(["demo", str(out), "--quick", "--json"])
+def _check_sensor(metrics: dict[str, Any]) -> None:
+    for name, truth in (("read_noise_e", 12**0.5), ("dark_current_e_per_s", 0.2), ("gain_dn_per_e", 2.0)):
+        measured = metrics["noise"][name]
+        assert measured["truth"] == pytest.approx(truth)
+        assert abs(measured["value"] - truth) <= 3 * measured["se"]
+        assert measured["se"] < 0.01 * truth
 
 
-@pytest.fixture(scope="session")
-def metrics(ended: subprocess.CompletedProcess[str], out: Path) -> dict[str, Any]:
-    assert ended.returncode == 0, ended.stderr
-    found = json.loads((out / "metrics.json").read_text())
-    assert {**json.loads(ended.stdout)["metrics"], "record_sha256": found["record_sha256"]} == found
-    return dict(found)
-
-
-@pytest.fixture(scope="session")
-def errors(metrics: dict[str, Any]) -> dict[tuple[str, str, float], float]:
-    return {(row["method"], row["poses"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
-
-
-def test_the_camera_was_found_where_it_was(metrics: dict[str, Any]) -> None:
-    assert metrics["geometry"]["nodes"] == 25
-    assert metrics["geometry"]["centre_rms_mm"] <= 0.05
-
-
-@pytest.mark.parametrize(("name", "truth"), [("read_noise_e", 12**0.5), ("dark_current_e_per_s", 0.2)])
-def test_the_sensor_was_measured_as_it_is(name: str, truth: float, metrics: dict[str, Any]) -> None:
-    measured = metrics["noise"][name]
-    assert measured["truth"] == pytest.approx(truth)
-    assert abs(measured["value"] - truth) <= 3 * measured["se"]
-    assert measured["se"] < 0.01 * truth
-
-
-@pytest.mark.parametrize("depth_mm", [500.0, 700.0])
-def test_measured_poses_serve_as_well_as_true_ones_and_nominal_ones_do_not(
-    depth_mm: float, errors: dict[tuple[str, str, float], float]
-) -> None:
-    measured, true, nominal = (errors["pmlem", poses, depth_mm] for poses in ("measured", "true", "nominal"))
-    assert measured <= 1.1 * true
-    assert nominal > 1.3 * measured  # on the small grid; twice as much on the full one, see test_full_demo.py
-    assert measured <= errors["backprojection", "measured", depth_mm] / 3
-
-
-def test_errors_are_told_of_every_plane_and_method(metrics: dict[str, Any]) -> None:
-    depths = (500.0, 700.0)
-    rows = {(row["method"], row["poses"], row["depth_mm"]) for row in metrics["planes"]}
-    assert rows == {(method, "measured", depth) for method in METHODS for depth in depths} | {
-        ("pmlem", poses, depth) for poses in ("nominal", "true") for depth in depths
-    }
-    for row in metrics["planes"]:
-        assert {"mse_bright", "mse_texture", "psnr_db"} <= set(row)
-
-
-def test_the_dark_views_have_the_papers_snr(metrics: dict[str, Any], out: Path) -> None:
-    assert metrics["snr"]["asked"] == pytest.approx(0.16, rel=1e-6)
-    region_px = np.count_nonzero(read_frame(out / "truth" / "object_region.png").pixels_dn > 127)
+def _check_light(metrics: dict[str, Any], out: Path) -> None:
+    assert metrics["snr"]["asked"] == pytest.approx(SNR, rel=1e-6)
+    region = read_frame(out / "truth" / "object_region.png").pixels_dn > 127
     # A ratio of two means of squares of nearly normal numbers, each with √2 of its mean as standard deviation
-    deviation = 1.16 * np.sqrt(2 / region_px + 2 / (320 * 240))
-    assert metrics["snr"]["measured"] == pytest.approx(0.16, abs=4 * deviation)
+    deviation = 1.16 * np.sqrt(2 / np.count_nonzero(region) + 2 / region.size)
+    assert metrics["snr"]["measured"] == pytest.approx(SNR, abs=4 * deviation)
     assert metrics["photons_per_px"]["linear"] == pytest.approx(3.84)
     assert metrics["photons_per_px"]["from_moments"] == pytest.approx(1.92, abs=0.01)
-
-
-def test_its_session_is_whole_and_has_nothing_left_to_do(metrics: dict[str, Any], out: Path) -> None:
-    assert metrics
-    assert _run(["verify", str(out / "session")]).returncode == 0
-    methods = [word for name in METHODS for word in ("--method", name)]
-    again = _run(["run", str(out / "session"), *methods, "--prior", "tv", "--json"])
-    assert [step["ran"] for step in json.loads(again.stdout)["steps"]] == [False] * 4
 
 
 class _Pictures(HTMLParser):
@@ -117,23 +66,75 @@ class _Pictures(HTMLParser):
             self.alternatives.append(attributes["alt"] or "")
 
 
-def test_the_report_shows_what_was_measured_and_what_it_is_compared_with(metrics: object, out: Path) -> None:
-    assert metrics
+def test_small_demo_from_capture_to_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nine nodes, and two methods that are fast."""
+    methods = ["backprojection", "pmlem-osl"]
+    monkeypatch.setattr(paper, "QUICK", paper.DemoSize(3, 150.0, (320, 240), 4))
+    monkeypatch.setattr(importlib.import_module("faintfield.pipelines.commands.demo"), "_METHODS", methods)
+    monkeypatch.setattr(request, "DEFAULT_METHOD", "pmlem-osl")
+    out = tmp_path / "demo"
+    assert run(["demo", str(out), "--quick", "--json"]) == 0
+    metrics = _metrics(out)
+    printed = json.loads(capsys.readouterr().out)["metrics"]
+    assert {**printed, "record_sha256": metrics["record_sha256"]} == metrics
+    assert metrics["geometry"]["nodes"] == 9
+    assert metrics["geometry"]["centre_rms_mm"] <= 0.05
+    _check_sensor(metrics)
+    _check_light(metrics, out)
+    errors = {(row["method"], row["poses"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
+    assert set(errors) == {(method, "measured", depth) for method in methods for depth in DEPTHS_MM} | {
+        ("pmlem-osl", poses, depth) for poses in ("nominal", "true") for depth in DEPTHS_MM
+    }
+    for depth in DEPTHS_MM:
+        assert errors["pmlem-osl", "measured", depth] <= 1.1 * errors["pmlem-osl", "true", depth]
+        assert errors["pmlem-osl", "measured", depth] <= errors["backprojection", "measured", depth] / 3
     shown = _Pictures((out / "report.html").read_text()).alternatives
-    for depth in ("500", "700"):
-        assert f"noise-free set: back-projection at {depth} mm" in shown
-        for method in ("back-projection", "MLEM", "PMLEM (one-step-late, TV)", "PMLEM"):
-            assert f"{method}, measured poses at {depth} mm" in shown
-        for poses in ("nominal", "true"):
-            assert f"PMLEM, {poses} poses at {depth} mm" in shown
+    for depth in DEPTHS_MM:
+        assert f"noise-free set: back-projection at {depth:g} mm" in shown
+        assert f"back-projection, measured poses at {depth:g} mm" in shown
+        for poses in ("measured", "nominal", "true"):
+            assert f"PMLEM (one-step-late, TV), {poses} poses at {depth:g} mm" in shown
     assert "The noise reference" in shown
+    words = [word for name in methods for word in ("--method", name)]
+    assert run(["verify", str(out / "session")]) == 0
+    capsys.readouterr()
+    assert run(["run", str(out / "session"), *words, "--prior", "tv", "--json"]) == 0
+    assert [step["ran"] for step in json.loads(capsys.readouterr().out)["steps"]] == [False] * 4
 
 
-@pytest.mark.slow
+@pytest.mark.deep
+@pytest.mark.parametrize("size", ["--quick", "full"])
+def test_demo_is_as_accurate_as_promised(size: str, tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    ended = _run("demo", str(out), *([size] if size == "--quick" else []))
+    assert ended.returncode == 0, ended.stderr
+    metrics = _metrics(out)
+    assert metrics["geometry"]["nodes"] == (25 if size == "--quick" else 49)
+    assert metrics["geometry"]["centre_rms_mm"] <= 0.05
+    _check_sensor(metrics)
+    _check_light(metrics, out)
+    errors = {(row["method"], row["poses"], row["depth_mm"]): row["mse_bright"] for row in metrics["planes"]}
+    assert {key[0] for key in errors} == set(METHODS)
+    for depth in DEPTHS_MM:
+        measured, true, nominal = (errors["pmlem", poses, depth] for poses in ("measured", "true", "nominal"))
+        assert measured <= errors["backprojection", "measured", depth] / 3
+        if size == "--quick":
+            assert measured <= 1.1 * true
+            assert nominal > 1.3 * measured
+        else:
+            assert measured <= 0.012
+            assert measured <= 1.05 * true
+            assert nominal >= 2 * measured
+    assert (out / "report.html").stat().st_size <= MOST_BYTES_OF_THE_REPORT
+
+
+@pytest.mark.deep
 @pytest.mark.parametrize(("prior", "beside"), [("tv", 110e6), ("auto", 210e6)])
-def test_memory_of_a_reconstruction_is_bounded_by_its_images(prior: str, beside: float, tmp_path: Path) -> None:
+def test_memory_of_reconstruction_is_bounded_by_images(prior: str, beside: float, tmp_path: Path) -> None:
     """At most 1.5 times the images as float32 and 200 MB, 100 more by a prior, with the kernels compiled already."""
-    simulated = _run(["simulate", str(tmp_path / "scene")])
+    simulated = _run("simulate", str(tmp_path / "scene"))
     assert simulated.returncode == 0, simulated.stderr
     words = ["reconstruct", str(tmp_path / "scene"), "--out", str(tmp_path / "planes"), "--depth-mm", "500"]
     words += ["--prior", prior]
@@ -156,10 +157,9 @@ def test_memory_of_a_reconstruction_is_bounded_by_its_images(prior: str, beside:
     assert (peak_kb - files_kb) * 1024 <= 1.5 * images_bytes + beside
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_foreign_folder_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "thesis.tex").touch()
-    refused = _run(["demo", str(tmp_path / "theirs")])
-    assert (refused.returncode, refused.stdout) == (1, "")
-    assert refused.stderr.startswith("faintfield: OutputExists: ")
+    assert run(["demo", str(tmp_path / "theirs")]) == 1
+    assert capsys.readouterr().err.startswith("faintfield: OutputExists: ")
     assert os.listdir(tmp_path / "theirs") == ["thesis.tex"]

@@ -1,20 +1,27 @@
-"""The shell and Python examples of each document run as they stand, one after the other, in one folder."""
+"""The shell and Python examples of each document run one after the other, in one folder; in deep as they stand."""
 
-import os
 import re
+import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
 import pytest
 
+from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile
 
 _ROOT = Path(__file__).parents[2]
 _SKIPPED = ("make ", "git clone ")
-# The Python blocks of api.md share their names, as in a notebook.
-DOCUMENTS = {"README.md": False, "docs/guide.md": False, "docs/api.md": True}
+DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md")
+
+# Smaller numbers for the examples of the README, so that all of them run with the quick tests.
+SMALLER = {
+    "--size-px 480 360": "--size-px 240 180",
+    "--fx-px 600": "--fx-px 300",
+    "--sweep-mm 400:800:17": "--sweep-mm 400:800:3",
+    "--size-px 160 120 --rows 5 --columns 5": "--size-px 64 48 --rows 3 --columns 3",
+}
 
 
 def _blocks(document: str, *kinds: str) -> list[tuple[str, str]]:
@@ -24,32 +31,40 @@ def _blocks(document: str, *kinds: str) -> list[tuple[str, str]]:
     return [(kind, content) for kind, content in found if kind in kinds]
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/guide.md"])
-def test_there_are_examples_for_the_shell_and_for_python(document: str) -> None:
-    assert {kind for kind, _ in _blocks(document, "sh", "python")} == {"sh", "python"}
-
-
-@pytest.mark.parametrize(
-    "document", [pytest.param(it, marks=() if it == "docs/api.md" else pytest.mark.slow) for it in DOCUMENTS]
-)
-def test_its_examples_run_one_after_the_other(document: str, tmp_path: Path) -> None:
-    environment = os.environ | {
-        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
-        "PYTHONWARNINGS": "error",
-    }
-    blocks = _blocks(document, "sh", "python")
-    if DOCUMENTS[document]:
-        blocks = [("python", "\n".join(content for _, content in blocks))]
+def _run_examples(blocks: list[tuple[str, str]]) -> None:
+    """Run the examples in the present folder; the Python blocks share their names, as in a notebook."""
+    names: dict[str, object] = {}
     for kind, content in blocks:
-        lines = [line for line in content.splitlines() if not line.startswith(_SKIPPED)]
-        command = ["bash", "-euo", "pipefail", "-c"] if kind == "sh" else [sys.executable, "-c"]
-        ended = subprocess.run(
-            [*command, "\n".join(lines)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert ended.returncode == 0, f"{content}\n{ended.stderr}"
+        if kind == "python":
+            exec(content, names)
+            continue
+        for line in content.splitlines():
+            if line.startswith("faintfield "):
+                assert run(shlex.split(line, comments=True)[1:]) == 0, line
+            elif not line.startswith(_SKIPPED):
+                subprocess.run(["bash", "-euo", "pipefail", "-c", line], check=True)
 
 
-def test_the_settings_file_of_the_readme_is_one() -> None:
+def test_examples_of_readme_run_with_smaller_numbers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = _blocks("README.md", "sh", "python")
+    for old, new in SMALLER.items():
+        assert any(old in content for _, content in blocks), old
+        blocks = [(kind, content.replace(old, new)) for kind, content in blocks]
+    assert {kind for kind, _ in blocks} == {"sh", "python"}
+    _run_examples(blocks)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("document", DOCUMENTS)
+def test_examples_run_as_they_stand(document: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = _blocks(document, "sh", "python")
+    assert blocks
+    _run_examples(blocks)
+
+
+def test_settings_file_of_readme_is_valid() -> None:
     blocks = _blocks("README.md", "toml")
     assert blocks
     for _, content in blocks:

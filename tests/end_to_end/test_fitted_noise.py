@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import tomli_w
 
 from faintfield.pipelines.commands.noise import noise
@@ -22,7 +23,8 @@ def texture_errors(elemental_set: Path, out: Path) -> dict[float, float]:
     return {row["depth_mm"]: float(np.sqrt(row["mse_texture"])) for row in rows}
 
 
-def test_the_fitted_model_serves_as_well_as_the_true_one(tmp_path: Path) -> None:
+@pytest.mark.deep
+def test_fitted_noise_model_equals_true_one(tmp_path: Path) -> None:
     size_px = (192, 144)
     simulate(tmp_path / "set", size_px=size_px, seed=4)
     truth = texture_errors(tmp_path / "set", tmp_path / "with_truth")

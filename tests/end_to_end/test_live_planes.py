@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import urllib.parse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, closing
 from pathlib import Path
 
@@ -38,10 +38,8 @@ from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, RigSettings, SettleSettings, StepSettings
 from faintfield.rig.simulation.lab import lab_experiment
 from faintfield.rig.stages.protocol import Point, StageSettings
-from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
+from tests.end_to_end.browser import Tab
 from tests.patience import HANG_S
-
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
 
 _CAMERA = SimulatedSettings(size_px=(160, 120), unlit_photons_per_s=25.0)
 _DEPTHS_MM = (400.0, 450.0, 500.0, 550.0, 600.0)
@@ -140,12 +138,6 @@ class Running:
             assert self._allowed.wait_for(lambda: len(self.taken.of_dark_scene()) < self._may_take, HANG_S)
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
-        yield tab
-
-
 def shown_levels(browser: Tab, side: str) -> NDArray[np.float64]:
     """Return the grey levels (row, column) of the picture at one side of the wipe, as the browser has decoded it."""
     picture = f"document.getElementById('{side}-picture')"
@@ -164,15 +156,6 @@ def shown_levels(browser: Tab, side: str) -> NDArray[np.float64]:
     return np.array(levels["levels"], float).reshape(-1, levels["width"])
 
 
-def set_slider(browser: Tab, name: str, value: int) -> None:
-    """Move a slider as a person does: by its value and its event."""
-    browser.evaluate(
-        f"(() => {{ const it = document.getElementById('{name}'); it.value = {value}; "
-        "it.dispatchEvent(new Event('input')); })()"
-    )
-
-
-@needs_browser
 def test_planes_sharpen_on_the_page_while_a_session_is_captured(tmp_path: Path, browser: Tab) -> None:
     found: dict[int, NDArray[np.float64]] = {}
     with Running(tmp_path, 7, calibrated=True) as running:
@@ -180,7 +163,7 @@ def test_planes_sharpen_on_the_page_while_a_session_is_captured(tmp_path: Path, 
         for count in (2, 9, 49):
             running.take(count)
             browser.wait_until(f"document.getElementById('planes-words').textContent.startsWith('{count} of {count} ')")
-            set_slider(browser, "depth", _AT_500_MM)
+            browser.set_slider("depth", _AT_500_MM)
             # "up to date" is said when pictures, focus and PMLEM of all depths are
             browser.wait_until("document.getElementById('planes-words').textContent.endsWith('now: up to date')")
             assert browser.evaluate("document.getElementById('right').value") == "pmlem"
@@ -210,13 +193,13 @@ def check_controls(browser: Tab) -> None:
     # The slider: another depth is another picture
     at_500_mm = shown_levels(browser, "left")
     browser.evaluate("document.getElementById('depth').focus()")
-    set_slider(browser, "depth", 0)
+    browser.set_slider("depth", 0)
     browser.wait_until("document.querySelector('label[for=depth]').textContent === '400 mm'")
     browser.wait_until("document.getElementById('left-picture').src.includes('plane_000_view')")
     assert not np.array_equal(shown_levels(browser, "left"), at_500_mm)
     # The wipe: the right picture begins where the line stands
     for percent in (0, 30, 100):
-        set_slider(browser, "wipe", percent)
+        browser.set_slider("wipe", percent)
         assert f"{percent}%" in browser.evaluate("document.getElementById('right-picture').style.clipPath")
         box = browser.evaluate(
             "(() => { const box = document.getElementById('wipe-box').getBoundingClientRect();"
@@ -258,7 +241,7 @@ def wait_for(client: PlanesClient, holds: Callable[[LiveStatus], bool]) -> LiveS
         time.sleep(_POLL_S)
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.deep)])
 def test_what_happens_to_live_planes_changes_nothing_of_the_session(tmp_path: Path, number: signal.Signals) -> None:
     (tmp_path / "without").mkdir()
     settings = rig(3)
@@ -283,7 +266,8 @@ def test_what_happens_to_live_planes_changes_nothing_of_the_session(tmp_path: Pa
     assert frames == [(it.number, taken.sha256) for it, taken, _ in taken_frames(tmp_path / "without" / "session")]
 
 
-def test_the_process_ends_with_a_capture_that_was_killed_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.deep
+def test_process_of_planes_ends_with_killed_capture(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     order = LiveOrder(str(out), str(tmp_path), str(tmp_path / "rig.toml"), (500.0,))
@@ -336,15 +320,6 @@ def test_only_pictures_and_nodes_are_served(tmp_path: Path) -> None:
         assert hostile(elsewhere, "planes/plane_000_mean.png") == 404
 
 
-def test_a_node_without_frames_has_none(tmp_path: Path) -> None:
-    with Running(tmp_path, 3) as running:
-        running.take(2)
-        wait_for(running.client, lambda status: status.frames == 2)
-        [frame] = running.taken.at(0, (0, 1))
-        assert (frame.name, frame.position_mm[1]) == ("00001_dark_scene_0_r0_c1", -350.0)
-        assert running.taken.at(0, (2, 2)) == running.taken.at(7, (0, 0)) == []
-
-
 def small_rig(tmp_path: Path) -> Path:
     """Write the rig.toml of a rig of two nodes."""
     path = tmp_path / "rig.toml"
@@ -361,24 +336,6 @@ def test_a_whole_capture_with_live_planes_from_the_command_line(
     assert cli.run(["capture", rig, session, "--yes", "--page", "--live-sweep-mm", "400:600:3"]) == 0
     assert "live planes" not in capsys.readouterr().err
     assert verify(tmp_path / "session").sealed
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (["--live-depth-mm", "500"], "give --page, too"),
-        (["--page", "--noise", "noise.json"], "give --live-depth-mm, too"),
-        (["--page", "--live-sweep-mm", "400:900:33"], "at most 32 are computed"),
-        (["--page", "--live-sweep-mm", "-400:900:4"], "give positive depths"),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], words: str
-) -> None:
-    rig, session = str(small_rig(tmp_path)), tmp_path / "session"
-    assert cli.run(["capture", rig, str(session), "--yes", *options]) == 2
-    assert words in " ".join(capsys.readouterr().err.split())
-    assert not session.exists()
 
 
 def test_a_capture_goes_on_without_live_planes_that_cannot_be_started(

@@ -14,6 +14,8 @@ import tifffile
 from faintfield.pipelines.cli import run
 from faintfield.recon.metrics import mean_square_error, peak_snr_db
 
+pytestmark = pytest.mark.deep
+
 # The plane of the middle pieces: its points move by so much from node to node
 _DISPARITY_PX = -2.0
 

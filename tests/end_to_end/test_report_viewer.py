@@ -3,7 +3,6 @@
 import base64
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,56 +13,13 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines import pages
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.pages.page import smaller_uri
 from faintfield.pipelines.pages.report_viewer import Viewer, pack
-from tests.end_to_end.browser import CHROMIUM, Tab, open_browser
-
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here: the page is not tried in one")
-
-# Of files and pages, all numbers of a set this small and a little more.
-MOST_BYTES = 700_000
+from tests.end_to_end.browser import Tab
 
 FOLDERS = {"back-projection": "backprojection", "PMLEM (one-step-late, TV)": "pmlem-osl"}
 DEPTHS_MM = (500, 600, 700)
 VIRTUAL_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowUp": 38, "ArrowDown": 40, "Backspace": 8}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("viewer")
-    assert run(["simulate", str(folder / "set"), "--size-px", "96", "72", "--rows", "3", "--columns", "3"]) == 0
-    words = ["--method", "backprojection", "--method", "pmlem-osl", "--passes", "3", "--out", str(folder / "out")]
-    assert run(["reconstruct", str(folder / "set"), "--sweep-mm", "500:700:3", *words]) == 0
-    return folder / "out"
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Tab]:
-    with open_browser(tmp_path_factory.mktemp("browser")) as tab:
-        yield tab
-
-
-@pytest.fixture
-def page(browser: Tab, folder: Path) -> Iterator[Tab]:
-    browser.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": "light"}])
-    _resize(browser, 1200)
-    browser.open("about:blank")
-    browser.open((folder / "report.html").as_uri())
-    browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
-    browser.evaluate("document.querySelector('.v-stage').scrollIntoView()")
-    _drawn(browser)
-    yield browser
-    assert browser.complaints == []
-
-
-def _resize(tab: Tab, width: int) -> None:
-    tab.call("Emulation.setDeviceMetricsOverride", width=width, height=1000, deviceScaleFactor=1, mobile=width < 500)
-
-
-def _drawn(tab: Tab) -> None:
-    """Wait until what was asked for is drawn."""
-    tab.evaluate("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
 def _state(tab: Tab, name: str) -> float:
@@ -88,7 +44,7 @@ def _drag(tab: Tab, start: tuple[float, float], by: tuple[float, float]) -> None
     for part in (0.5, 1.0):
         _mouse(tab, "mouseMoved", start[0] + part * by[0], start[1] + part * by[1], **held)
     _mouse(tab, "mouseReleased", start[0] + by[0], start[1] + by[1], button="left")
-    _drawn(tab)
+    tab.draw()
 
 
 def _press(tab: Tab, *keys: str, shift: bool = False) -> None:
@@ -99,7 +55,7 @@ def _press(tab: Tab, *keys: str, shift: bool = False) -> None:
         code = {"windowsVirtualKeyCode": VIRTUAL_KEYS[key]} if key in VIRTUAL_KEYS else {}
         tab.call("Input.dispatchKeyEvent", type="keyDown", key=key, modifiers=8 * shift, **text, **code)
         tab.call("Input.dispatchKeyEvent", type="keyUp", key=key)
-    _drawn(tab)
+    tab.draw()
 
 
 def _choose(tab: Tab, side: str, words: str) -> None:
@@ -109,7 +65,7 @@ def _choose(tab: Tab, side: str, words: str) -> None:
         f"one.value = [...one.options].find(it => it.text === {json.dumps(words)}).value; "
         "one.dispatchEvent(new Event('change')); })()"
     )
-    _drawn(tab)
+    tab.draw()
 
 
 def _chosen(tab: Tab, side: str) -> str:
@@ -120,14 +76,14 @@ def _click(tab: Tab, words: str) -> None:
     tab.evaluate(
         f"[...document.querySelectorAll('#viewer button')].find(it => it.textContent === {json.dumps(words)}).click()"
     )
-    _drawn(tab)
+    tab.draw()
 
 
 def _set_wipe(tab: Tab, share: float) -> None:
     tab.evaluate(
         f"(it => {{ it.value = {share}; it.dispatchEvent(new Event('input')); }})(document.getElementById('v-wipe'))"
     )
-    _drawn(tab)
+    tab.draw()
 
 
 def _told(tab: Tab, side: str = "B") -> str:
@@ -150,34 +106,27 @@ def _bar_px(tab: Tab) -> int:
     return int(np.argmin(white))
 
 
-def _plane(folder: Path, title: str, depth_mm: int) -> tuple[NDArray[np.float32], dict[str, Any]]:
+def _plane(report: Path, title: str, depth_mm: int) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Return a plane's numbers as its file has them, and its record."""
-    record = json.loads((folder / FOLDERS[title] / "reconstruction.json").read_text())
+    record = json.loads((report.parent / FOLDERS[title] / "reconstruction.json").read_text())
     name = f"plane_{depth_mm:07.1f}.tiff"
     found = next(one for one in record["planes"] if one["file"] == name)
-    return tifffile.imread(folder / FOLDERS[title] / name), found
+    return tifffile.imread(report.parent / FOLDERS[title] / name), found
 
 
-def test_the_page_leads_with_the_best_plane_beside_a_view(page: Tab) -> None:
-    assert _chosen(page, "A") == "One view, as recorded"
-    assert _chosen(page, "B").startswith("PMLEM (one-step-late, TV), ")
-    viewer, first = (page.evaluate(f"document.getElementById('{one}').offsetTop") for one in ("viewer", "result"))
-    assert viewer < first
-
-
-def test_the_numbers_under_the_cross_are_those_of_the_files(page: Tab, folder: Path) -> None:
+def test_the_numbers_under_the_cross_are_those_of_the_files(page: Tab, report: Path) -> None:
     left, top, width, height = _box(page)
     size = _state(page, "size")
     rng = np.random.default_rng(1)
     for title in FOLDERS:
         for depth_mm in DEPTHS_MM:
             _choose(page, "B", f"{title}, {depth_mm} mm")
-            plane, record = _plane(folder, title, depth_mm)
+            plane, record = _plane(report, title, depth_mm)
             row, column = (int(rng.integers(1, count - 1)) for count in plane.shape)
             u0, v0 = width / 2 - 0.5 * size, height / 2 - _state(page, "v") * size
             sample_px = size / plane.shape[1]
             _mouse(page, "mouseMoved", left + u0 + (column + 0.5) * sample_px, top + v0 + (row + 0.5) * sample_px)
-            _drawn(page)
+            page.draw()
             told = re.search(
                 r"(-?[\d.]+) e⁻ per pixel \(± (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)", _told(page)
             )
@@ -195,7 +144,7 @@ def test_the_numbers_under_the_cross_are_those_of_the_files(page: Tab, folder: P
 def test_both_pictures_are_read_at_one_place(page: Tab) -> None:
     left, top, width, height = _box(page)
     _mouse(page, "mouseMoved", left + 0.3 * width, top + 0.6 * height)
-    _drawn(page)
+    page.draw()
     places = [re.search(r"column (\d+), row (\d+)", _told(page, side)) for side in "AB"]
     assert places[0] is not None
     assert places[1] is not None
@@ -215,24 +164,24 @@ def test_keys_zoom_about_the_middle_and_0_shows_all(page: Tab) -> None:
     assert _state(page, "zoom") == 1
 
 
-def test_1_shows_one_sample_per_pixel(page: Tab, folder: Path) -> None:
-    _resize(page, 60 + 40)  # narrower than the plane
+def test_1_shows_one_sample_per_pixel(page: Tab, report: Path) -> None:
+    page.resize(60 + 40)  # narrower than the plane
     _press(page, "1")
-    assert _state(page, "size") == pytest.approx(_plane(folder, "back-projection", 500)[0].shape[1])
+    assert _state(page, "size") == pytest.approx(_plane(report, "back-projection", 500)[0].shape[1])
 
 
 def test_the_wheel_zooms_about_the_cursor_once_the_pictures_are_clicked(page: Tab) -> None:
     left, top, width, height = _box(page)
     x, y = left + 0.255 * width, top + 0.5 * height
     _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-1)
-    _drawn(page)
+    page.draw()
     assert _state(page, "zoom") == 1
     _drag(page, (x, y), (0, 0))
     before = _told(page)
     _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-600)
     page.wait_until("Number(document.querySelector('.v-stage').dataset.zoom) > 2")
     _mouse(page, "mouseMoved", x, y)
-    _drawn(page)
+    page.draw()
     assert _told(page) == before
 
 
@@ -301,19 +250,10 @@ def test_the_wipe_moves_by_drag_and_by_key(page: Tab) -> None:
     assert float(page.evaluate("document.getElementById('v-wipe').value")) == pytest.approx(0.27, abs=0.006)
 
 
-def test_pictures_are_chosen_and_swapped(page: Tab) -> None:
-    _choose(page, "A", "back-projection, 500 mm")
-    _choose(page, "B", "back-projection, 700 mm")
-    assert _told(page, "A").startswith("A: back-projection, 500 mm")
-    _press(page, "x")
-    assert (_chosen(page, "A"), _chosen(page, "B")) == ("back-projection, 700 mm", "back-projection, 500 mm")
-    assert page.evaluate("document.getElementById('v-depth').value") == "0"
-
-
-def test_minimum_and_maximum_set_the_grey_levels(page: Tab, folder: Path) -> None:
+def test_minimum_and_maximum_set_the_grey_levels(page: Tab, report: Path) -> None:
     title, depth_mm = "PMLEM (one-step-late, TV)", 700
     _choose(page, "B", f"{title}, {depth_mm} mm")
-    plane, _ = _plane(folder, title, depth_mm)
+    plane, _ = _plane(report, title, depth_mm)
     _set_wipe(page, 0)
     black, white = float(np.quantile(plane, 0.2)), float(np.quantile(plane, 0.9))
     for end, value in (("black", black), ("white", white)):
@@ -335,33 +275,11 @@ def test_minimum_and_maximum_set_the_grey_levels(page: Tab, folder: Path) -> Non
         assert pixels[int(y), int(x)] == pytest.approx(expected, abs=2)
 
 
-def test_a_handle_on_the_histogram_is_dragged(page: Tab) -> None:
-    page.evaluate("document.querySelector('#v-white-light').scrollIntoView({block: 'center'})")
-    left, top, width, height = _box(page, "#v-white-light")
-    low, high, at = page.evaluate(
-        "(it => [it.min, it.max, it.value].map(Number))(document.getElementById('v-white-light'))"
-    )
-    thumb = 16
-    x = left + thumb / 2 + (at - low) / (high - low) * (width - thumb)
-    _drag(page, (x, top + height / 2), (-0.3 * width, 0))
-    now = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
-    assert now < at - 0.2 * (high - low)
-    said = page.evaluate("document.getElementById('v-white-light').getAttribute('aria-valuetext')")
-    assert said == f"{now:g} e⁻ per pixel"
-    _click(page, "As opened")
-    _press(page, "m")
-    automatic = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
-    assert automatic != now
-    _press(page, "Backspace")
-    white = page.evaluate("Number(document.getElementById('v-white-number-light').value)")
-    assert white == pytest.approx(at, rel=1e-3)
-
-
-def test_the_scale_bar_is_as_long_as_it_says_at_any_zoom(page: Tab, folder: Path) -> None:
+def test_the_scale_bar_is_as_long_as_it_says_at_any_zoom(page: Tab, report: Path) -> None:
     lengths = set()
     for depth_mm in DEPTHS_MM:
         _choose(page, "A", f"back-projection, {depth_mm} mm")
-        plane, record = _plane(folder, "back-projection", depth_mm)
+        plane, record = _plane(report, "back-projection", depth_mm)
         for _ in range(3):
             per_mm = _state(page, "size") / (plane.shape[1] * record["pitch_mm"])
             said = page.evaluate("document.querySelector('.v-stage').dataset.barA")
@@ -390,23 +308,9 @@ def test_the_film_goes_through_the_depths_until_it_is_stopped(page: Tab) -> None
     assert page.evaluate("[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '▶ Film')")
 
 
-def test_the_film_plays_by_itself_only_once_it_is_started(page: Tab) -> None:
-    words = "document.getElementById('v-depth-words').value"
-    playing = "[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '■ Stop')"
-    first = page.evaluate(words)
-    _drawn(page)
-    assert not page.evaluate(playing)
-    assert page.evaluate(words) == first
-    _press(page, " ")
-    assert page.evaluate(playing)
-    page.wait_until(f"{words} !== {json.dumps(first)}")
-    _press(page, " ")
-    assert not page.evaluate(playing)
-
-
 def test_the_depth_moves_by_slider_and_by_key(page: Tab) -> None:
     page.evaluate("(it => { it.value = 0; it.dispatchEvent(new Event('input')); })(document.getElementById('v-depth'))")
-    _drawn(page)
+    page.draw()
     assert "500 mm" in _chosen(page, "B")
     _press(page, "]")
     assert "600 mm" in _chosen(page, "B")
@@ -417,7 +321,7 @@ def test_the_depth_moves_by_slider_and_by_key(page: Tab) -> None:
     assert "700 mm" in _chosen(page, "B")
 
 
-def test_the_keyboard_reads_a_sample_aloud(page: Tab, folder: Path) -> None:
+def test_the_keyboard_reads_a_sample_aloud(page: Tab, report: Path) -> None:
     _choose(page, "B", "back-projection, 600 mm")
     _press(page, "ArrowRight", "ArrowDown", shift=True)
     status = "document.querySelector('#viewer [role=status]').textContent"
@@ -426,65 +330,8 @@ def test_the_keyboard_reads_a_sample_aloud(page: Tab, folder: Path) -> None:
     said = page.evaluate(status)
     place = re.search(r"B: back-projection, 600 mm\s+(\S+) e⁻ per pixel .*column (\d+), row (\d+)", said)
     assert place is not None, said
-    plane, _ = _plane(folder, "back-projection", 600)
+    plane, _ = _plane(report, "back-projection", 600)
     assert float(place[1].replace("−", "-")) == pytest.approx(float(plane[int(place[3]), int(place[2])]), abs=2e-3)
-
-
-def test_reset_shows_what_the_page_opened_with(page: Tab) -> None:
-    opened = [_state(page, "zoom"), _state(page, "wipe"), _chosen(page, "A"), _chosen(page, "B")]
-    _press(page, "+", ".", "x", "l")
-    assert page.evaluate("document.querySelector('.v-stage').dataset.layout") == "pair"
-    _click(page, "Reset")
-    assert [_state(page, "zoom"), _state(page, "wipe"), _chosen(page, "A"), _chosen(page, "B")] == opened
-    assert page.evaluate("document.querySelector('.v-stage').dataset.layout") == "wipe"
-
-
-def test_every_control_is_named_and_reached_by_the_keyboard(page: Tab) -> None:
-    names = page.evaluate(
-        "[...document.querySelectorAll('#viewer input, #viewer select, #viewer button, #viewer [tabindex]')]"
-        ".map(it => it.ariaLabel || [...(it.labels ?? [])].map(one => one.textContent).join() || it.textContent)"
-    )
-    assert len(names) > 15
-    assert all(name.strip() for name in names)
-    assert page.evaluate("[...document.querySelectorAll('#viewer output')].every(it => it.ariaLive !== 'polite')")
-    assert page.evaluate("document.querySelectorAll('#viewer [tabindex]:not([tabindex=\"0\"])').length") == 0
-
-
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_stand_out_from_what_is_behind_them(scheme: str, page: Tab) -> None:
-    page.call("Emulation.setEmulatedMedia", media="", features=[{"name": "prefers-color-scheme", "value": scheme}])
-    page.wait_until(f"document.documentElement.className === '{scheme}'")
-    colours = page.evaluate("""['button', 'select', 'label', 'output', 'legend']
-        .flatMap(tag => [...document.querySelectorAll('#viewer ' + tag)])
-        .filter(it => it.textContent && !it.disabled).map(it => {
-          let behind = it;
-          while (getComputedStyle(behind).backgroundColor === 'rgba(0, 0, 0, 0)') behind = behind.parentElement;
-          return [getComputedStyle(it).color, getComputedStyle(behind).backgroundColor];
-        })""")
-    for pair in colours:
-        light = sorted(_luminance(colour) for colour in pair)
-        assert (light[1] + 0.05) / (light[0] + 0.05) >= 4.5, pair
-
-
-def _luminance(colour: str) -> float:
-    """Return the relative luminance of an opaque colour by WCAG 2."""
-    values = np.array([float(word) for word in re.findall(r"[\d.]+", colour)[:3]]) / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
-@pytest.mark.parametrize("width", [390, 1024, 1400])
-def test_it_fits_any_screen(width: int, page: Tab) -> None:
-    _resize(page, width)
-    _drawn(page)
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
-    left, _, wide, _ = _box(page)
-    assert left >= 0
-    assert left + wide <= width
-
-
-def test_the_page_is_small(folder: Path) -> None:
-    assert (folder / "report.html").stat().st_size < MOST_BYTES
 
 
 def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
@@ -525,7 +372,7 @@ def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
 def test_colours_and_samples_without_numbers_are_read_out(browser: Tab, tmp_path: Path) -> None:
     numbers = np.random.default_rng(3).normal(1.0, 0.5, (30, 40, 3)).astype(np.float32)
     numbers[5, 6] = np.nan
-    _resize(browser, 1200)
+    browser.resize(1200)
     browser.open("about:blank")
     browser.open(_page_of(numbers, tmp_path))
     browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
@@ -534,7 +381,7 @@ def test_colours_and_samples_without_numbers_are_read_out(browser: Tab, tmp_path
     for row, column in ((10, 20), (29, 39), (5, 6)):
         x = left + width / 2 + ((column + 0.5) / 40 - 0.5) * size
         _mouse(browser, "mouseMoved", x, top + height / 2 + ((row + 0.5) / 40 - v) * size)
-        _drawn(browser)
+        browser.draw()
         told = re.search(r"R (.+), G (.+), B (.+) e⁻ per pixel", _told(browser))
         assert told is not None, _told(browser)
         if (row, column) == (5, 6):

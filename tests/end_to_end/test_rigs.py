@@ -34,7 +34,7 @@ RIGS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.parametrize("name", RIGS)
 def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Path) -> None:
     camera, checks = RIGS[name]

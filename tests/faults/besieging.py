@@ -50,7 +50,7 @@ class _Dripping:
 
     def _open(self) -> None:
         self.connection = _connect(self._address)
-        self._bytes = (bytes([it]) for it in b"GET /" + b"x" * 10_000)
+        self._bytes = (bytes([letter]) for letter in b"GET /" + b"x" * 10_000)
 
 
 def _bad_requests(address: str, body_bytes: int) -> Iterator[tuple[bytes, int]]:
@@ -64,7 +64,7 @@ def _bad_requests(address: str, body_bytes: int) -> Iterator[tuple[bytes, int]]:
     yield b"GET " + token + b"state HTTP/1.1\r\n" + host + length, body_bytes
     yield b"GET " + token + b"state HTTP/1.1\r\n" + host + b"X: ", body_bytes
     yield b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n" + host + b"\r\n", 0
-    yield b"GET / HTTP/1.1\r\n" + host + b"".join(b"X-%d: y\r\n" % it for it in range(10_000)) + b"\r\n", 0
+    yield b"GET / HTTP/1.1\r\n" + host + b"".join(b"X-%d: y\r\n" % number for number in range(10_000)) + b"\r\n", 0
     yield b"GET /" + token[:-2] + b"/state HTTP/1.1\r\n" + host + b"\r\n", 0
     yield b"OPTIONS * HTTP/1.1\r\n" + host + b"\r\n", 0
     yield b"GET / HTTP/1.1\r\n" + host + b"Connection: Upgrade\r\nUpgrade: websocket\r\n\r\n", 0

@@ -7,10 +7,9 @@ number) and the sum of the journal. A frame that is exposed again has another nu
 
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
 
 import pytest
 
@@ -21,7 +20,7 @@ from faintfield.pipelines.formats.results.plane_files import PARTS
 from faintfield.rig.session.disk import PART
 from faintfield.rig.session.session import JOURNAL, SUMS
 from faintfield.rig.session.verify import verify
-from tests.faults.io_faults import KINDS, Action, Ended, Fault, Trial, compiled, faults
+from tests.faults.io_faults import KINDS, Action, Ended, Fault, Faults, Trial, compiled, faults
 from tests.patience import HANG_S
 
 _RIG = """
@@ -90,18 +89,21 @@ def rig_toml(*, few: bool) -> str:
     return text + "".join(_STEP.format(*step) for step in steps)
 
 
-def prepare_inputs(folder: Path) -> None:
-    """Write the inputs of all commands, each into a folder of the command's name."""
-    for name in COMMANDS:
+def prepare_inputs(folder: Path, names: Iterable[str]) -> None:
+    """Write the inputs of commands, each into a folder of the command's name."""
+    for name in names:
         (folder / name).mkdir(parents=True)
-    (folder / "capture" / "rig.toml").write_text(rig_toml(few=True))
-    rig, session = folder / "rig.toml", folder / "noise" / "session"
-    rig.write_text(rig_toml(few=False))
-    assert run(["capture", str(rig), str(session), "--yes"]) == 0
-    for name in ("geometry", "run"):
-        shutil.copytree(session, folder / name / "session")
-    small = ["--size-px", "48", "36", "--rows", "2", "--columns", "2"]
-    assert run(["simulate", str(folder / "reconstruct" / "set"), *small]) == 0
+        if name == "capture":
+            (folder / name / "rig.toml").write_text(rig_toml(few=True))
+        elif name == "reconstruct":
+            small = ["--size-px", "48", "36", "--rows", "2", "--columns", "2"]
+            assert run(["simulate", str(folder / name / "set"), *small]) == 0
+        elif (folder / "session").exists():
+            shutil.copytree(folder / "session", folder / name / "session")
+        else:
+            (folder / "rig.toml").write_text(rig_toml(few=False))
+            assert run(["capture", str(folder / "rig.toml"), str(folder / "session"), "--yes"]) == 0
+            shutil.copytree(folder / "session", folder / name / "session")
 
 
 def results(folder: Path) -> dict[str, bytes]:
@@ -119,16 +121,10 @@ def _frames(found: dict[str, bytes]) -> set[str]:
     return {_EXPOSURE.sub("", name) for name in found if name.startswith("out/frames/")}
 
 
-class Server(Protocol):
-    """Runs trials, as `Faults` does."""
-
-    def run(self, trial: Trial) -> Ended: ...
-
-
 class Bench:
     """Where commands are tried: each finds its own inputs, untouched, at the same place every time."""
 
-    def __init__(self, folder: Path, server: Server) -> None:
+    def __init__(self, folder: Path, server: Faults) -> None:
         self._inputs, self._trials, self._server = folder / "inputs", folder / "trials", server
         self._undisturbed: dict[str, dict[str, bytes]] = {}
         self._calls: dict[str, list[str]] = {}
@@ -202,14 +198,14 @@ def _is_temporary(file: str) -> bool:
 
 
 @contextmanager
-def bench_in(folder: Path) -> Iterator[Bench]:
+def bench_in(folder: Path, names: Sequence[str]) -> Iterator[Bench]:
     """Prepare the inputs, and start the process that runs the trials."""
     library = compiled(folder)
     if library is None:
         pytest.skip("there is no C compiler, cc, to compile io_faults.c with")
-    prepare_inputs(folder / "inputs")
+    prepare_inputs(folder / "inputs", names)
     shutil.copytree(folder / "inputs", folder / "trials")
-    warm_up = [words(folder / "trials" / name) for name, words in COMMANDS.items()]
+    warm_up = [COMMANDS[name](folder / "trials" / name) for name in names]
     with faults(library, warm_up) as server:
         yield Bench(folder, server)
 

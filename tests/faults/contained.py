@@ -183,18 +183,8 @@ def faults_of(
 ) -> list[str]:
     """Return what is wrong with how a child ended, and with what it left in the folder around all of its files.
 
-    Parameters
-    ----------
-    ended : Ended
-        The end of the child.
-    folder : Path
-        The folder.
-    before : State
-        The state of the folder before the child was started.
-    may_change : tuple of str
-        Patterns of the files that it may change, add or remove.
-    copies : tuple of str
-        Patterns of the files that are copied as they are, and may be as damaged as their originals.
+    `before` is the state of the folder before the child was started, `may_change` are patterns of the files that it may
+    change, add or remove, and `copies` of those that it copies as they are, as damaged as their originals.
     """
     after = state_of(folder)
     changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}

@@ -19,27 +19,16 @@ type Nature = Literal["wire", "controller", "mechanics"]
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that can go wrong.
+    """What can go wrong: the part affected, and what makes it happen on a bench.
 
-    Parameters
-    ----------
-    name : str
-        Name of the fault.
-    nature : str
-        Part that it affects. Faults of the mechanics show in no report; only a drift check finds them.
-    strike : callable
-        Makes it happen on a bench.
-    kind : type
-        Controllers that can have it.
-    recovery_s : float
-        Longest recovery, without homing.
+    Faults of the mechanics show in no report; only a drift check finds them. `kind` is that of the controllers that can
+    have it.
     """
 
     name: str
     nature: Nature
     strike: Callable[[Bench], None]
     kind: type = object
-    recovery_s: float = 2.0
 
     def __str__(self) -> str:
         return self.name
@@ -228,7 +217,7 @@ _COMMON = (
     Fault("every line damaged", "wire", _damage_every_line),
     Fault("unplugged", "wire", Bench.unplug),
     Fault("unplugged and back", "wire", _unplug_and_return),
-    Fault("port gone for three seconds", "wire", _vanish, recovery_s=8.0),
+    Fault("port gone for three seconds", "wire", _vanish),
     Fault("computer busy", "wire", _keep_host_busy),
     Fault("restart", "controller", lambda bench: bench.firmware.restart()),
     Fault("restart unseen", "controller", _restart_unseen),
@@ -265,7 +254,6 @@ _MARLIN = (
 )
 
 FAULTS = (*_COMMON, *_GRBL, *_HAL, *_MARLIN)
-"""All faults."""
 
 
 def faults_of(controller: type[SimulatedFirmware]) -> tuple[Fault, ...]:

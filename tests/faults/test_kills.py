@@ -36,9 +36,17 @@ def capture_until_killed(folder: Path, step: str, *, after: bool, countdown: int
     assert process.exitcode == -signal.SIGKILL
 
 
-@pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
-@pytest.mark.parametrize("step", STEPS)
-def test_killed_at_a_step(tmp_path: Path, step: str, after: bool) -> None:
+# Each step with whether the kill is after it; these are quick
+SMOKE = (("writing", False), ("naming", True))
+MOMENTS = [
+    pytest.param(step, after, marks=() if (step, after) in SMOKE else pytest.mark.deep)
+    for step in STEPS
+    for after in (False, True)
+]
+
+
+@pytest.mark.parametrize(("step", "after"), MOMENTS)
+def test_capture_killed_at_a_step(tmp_path: Path, step: str, after: bool) -> None:
     folder = tmp_path / "session"
     # Some steps occur twice for each frame: these numbers hit both
     for kills, countdown in enumerate((1, 2), start=1):
@@ -50,7 +58,7 @@ def test_killed_at_a_step(tmp_path: Path, step: str, after: bool) -> None:
 
 
 def kill_at_random(folder: Path, kills: int, generator: np.random.Generator, max_life_s: float) -> int:
-    """Kill captures of one session at random instants until it is complete; return how many kills that took."""
+    """Kill captures of one session at random instants until it is complete, and return the number of kills."""
     for kill in range(kills):
         if (folder / "SHA256SUMS").exists():
             return kill
@@ -65,18 +73,11 @@ def kill_at_random(folder: Path, kills: int, generator: np.random.Generator, max
     return kills
 
 
-def test_killed_at_random_instants(tmp_path: Path) -> None:
-    assert _random_kills(tmp_path, kills=12, seed=1) == 12
-
-
-@pytest.mark.slow
-def test_killed_at_a_hundred_random_instants(tmp_path: Path) -> None:
-    assert _random_kills(tmp_path, kills=100, seed=2) == 100
-
-
-def _random_kills(tmp_path: Path, kills: int, seed: int) -> int:
-    """Kill this number of processes, over as many sessions as needed, and check each; return the number of kills."""
-    generator = np.random.default_rng(seed)
+@pytest.mark.deep
+def test_capture_killed_at_random_instants(tmp_path: Path) -> None:
+    """Kill sixty processes, over as many sessions as needed, and check each session."""
+    kills = 60
+    generator = np.random.default_rng(2)
     done = session = 0
     while done < kills:
         folder = tmp_path / f"session{session}"
@@ -86,4 +87,4 @@ def _random_kills(tmp_path: Path, kills: int, seed: int) -> int:
         if not (folder / "SHA256SUMS").exists():
             capture_small(folder)
         assert_whole(folder, here)
-    return done
+    assert done == kills

@@ -1,4 +1,4 @@
-"""Kill `noise`, `geometry` and `run` at any instant: run again, they end with the results of an undisturbed run."""
+"""Kill commands at any instant: run again, they end with the results of an undisturbed run."""
 
 import signal
 import time
@@ -11,7 +11,6 @@ from tests.faults.command_trials import Bench
 from tests.faults.io_faults import TIME_OVER, Fault
 from tests.patience import HANG_S
 
-_NAMES = ("noise", "geometry", "run")
 _CHANGING = {"create", "write", "sync", "rename", "remove", "make", "allocate"}
 
 
@@ -33,7 +32,8 @@ def assert_recovers(bench: Bench, name: str) -> None:
     again = bench.run(name)
     assert again.code == 0, again.complaint
     bench.assert_finished(name)
-    assert verify(bench.folder(name) / "session").problems == ()
+    if name != "reconstruct":
+        assert verify(bench.folder(name) / "session").problems == ()
 
 
 def assert_recovers_from_all(bench: Bench, name: str, faults: list[Fault]) -> None:
@@ -44,22 +44,22 @@ def assert_recovers_from_all(bench: Bench, name: str, faults: list[Fault]) -> No
         assert_recovers(bench, name)
 
 
-@pytest.mark.parametrize("name", _NAMES)
-def test_a_killed_command_ends_well_when_it_is_run_again(bench: Bench, name: str) -> None:
-    assert_recovers_from_all(bench, name, kills(bench.calls(name), changing=5, others=1))
+def test_killed_command_ends_well_when_run_again(small_bench: Bench) -> None:
+    faults = kills(small_bench.calls("reconstruct"), changing=4, others=1)
+    assert_recovers_from_all(small_bench, "reconstruct", faults)
 
 
-@pytest.mark.campaign
+@pytest.mark.deep
 @pytest.mark.timeout(10 * HANG_S)
-@pytest.mark.parametrize("name", _NAMES)
-def test_a_hundred_kills(bench: Bench, name: str) -> None:
-    faults = kills(bench.calls(name), changing=60, others=20)
+@pytest.mark.parametrize("name", ["noise", "geometry", "run"])
+def test_command_killed_at_many_instants(bench: Bench, name: str) -> None:
+    faults = kills(bench.calls(name), changing=40, others=10)
     assert_recovers_from_all(bench, name, faults)
     bench.renew(name)
     begun_s = time.monotonic()
     assert bench.run(name).code == 0
     whole_s = time.monotonic() - begun_s
-    for share in np.random.default_rng(16).uniform(0.0, 1.0, 100 - len(faults)):
+    for share in np.random.default_rng(16).uniform(0.0, 1.0, 10):
         bench.renew(name)
         ended = bench.run(name, limit_s=float(share) * whole_s)
         assert ended.code in (TIME_OVER, 0)

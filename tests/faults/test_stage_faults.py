@@ -1,232 +1,197 @@
-"""Every fault of a stage, at every moment, ends in a named failure or a recovery, and never in a wrong frame."""
+"""Faults of a stage at every moment of a capture: a named failure or a recovery, no frame from a wrong place."""
 
-import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from faintfield.rig.errors import RigError, StageError
+from faintfield.rig.errors import StageLost
+from faintfield.rig.session.journal import Journal
+from faintfield.rig.session.session import is_sealed, taken_frames
+from faintfield.rig.session.verify import verify
+from faintfield.rig.settings import DriftSettings
 from faintfield.rig.simulation.controller.bench import Bench, PtyLink
-from faintfield.rig.stages.drift import DriftWatch, recover
-from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point
+from tests.faults.capturing import SMALL_RIG
+from tests.faults.laboratory import ON_TARGET_MM, Lab, MakeLink, TruthfulCamera, error_mm
 from tests.faults.stage_faults import FAULTS, Fault, faults_of
 from tests.rig.stages.benches import CONTROLLERS, Controller
 from tests.rig.stages.socket_link import SocketLink
 
-DRIFT_LIMIT_MM = 0.5
-# Half a step of 1/80 mm and the rounding of reports
-ON_TARGET_MM = 0.5 / 80.0 + 0.0055
-MOMENTS = {"connecting": 1.02, "homing": 5.0, "moving": 0.35, "exposing": 0.35}
+DRIFTING = msgspec.structs.replace(SMALL_RIG, drift=DriftSettings())
+FRAMES_ON_GRID = 12  # of SMALL_RIG; the last frames, at the centre, are dark
+FAULTS_PER_CAPTURE = 6
+LONGEST_S = 900.0  # of the simulated clock
+
+type Prepare = Callable[[Bench, TruthfulCamera], None]
 
 
-@dataclass(frozen=True)
-class KeptFrame:
-    """A frame that was kept, and the true positions of the camera at the beginning and the end of its exposure."""
+def at_exposure(number: int, fault: Fault, delay_s: float = 0.0) -> Prepare:
+    """Return what lets a fault strike some time after an exposure begins."""
 
-    number: int
-    target: Point
-    began: Point
-    ended: Point
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        def strike() -> None:
+            bench.clock.after(delay_s, lambda: fault.strike(bench))
 
-    def error_mm(self) -> float:
-        return max(math.dist(self.target, self.began), math.dist(self.target, self.ended))
+        camera.on_exposure = {number: strike if delay_s else lambda: fault.strike(bench)}
 
-
-@dataclass
-class RehearsedCapture:
-    """A small capture, with the rules by which frames are taken and kept, on a bench with faults."""
-
-    bench: Bench
-    struck: list[tuple[float, Fault]] = field(default_factory=list)  # when, in s, and what
-    kept: list[KeptFrame] = field(default_factory=list)
-    failures: list[RigError] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.stage: Gantry = self.bench.stage()
-        self.watch = DriftWatch(self.stage, limit_mm=DRIFT_LIMIT_MM)
-        self.on_move: Callable[[], None] = lambda: None
-        self.on_expose: Callable[[], None] = lambda: None
-
-    def strike(self, fault: Fault) -> None:
-        """Let a fault strike, and record when."""
-        self.struck.append((self.bench.clock.now_s(), fault))
-        fault.strike(self.bench)
-
-    def run(self) -> None:
-        """Take four frames, recovering from failures as a capture does; record every failure."""
-        try:
-            self.start()
-            for target in self.targets():
-                for _ in range(3):
-                    with self.recovering():
-                        self.take(target)
-                        break
-            self.watch.check()
-        except RigError as failure:
-            self.failures.append(failure)
-        finally:
-            self.stage.close()
-
-    def start(self) -> None:
-        """Connect and begin the drift watch, repeatedly if it fails."""
-        with self.recovering():
-            self.stage.connect()
-        for _ in range(3):
-            with self.recovering():
-                self.watch.begin()
-                break
-
-    def targets(self) -> list[Point]:
-        """Return the positions of the frames."""
-        travel = self.stage.travel()
-        x, y = travel.x_mm[0] + 100.0, travel.y_mm[0] + 100.0
-        return [Point(x, y), Point(x + 50.0, y), Point(x + 50.0, y + 50.0), Point(x, y + 50.0)]
-
-    def take(self, target: Point) -> None:
-        """Move, settle, verify, expose, verify again, keep."""
-        self.on_move()
-        with self.bounded(30.0):
-            self.stage.move_to(*target)
-        self.bench.clock.sleep_s(0.2)
-        self.stage.verify_at(*target)
-        began = self.bench.true_position()
-        self.on_expose()
-        self.bench.clock.sleep_s(1.0)
-        self.stage.verify_at(*target)
-        frame = KeptFrame(len(self.kept), target, began, self.bench.true_position())
-        self.kept.append(frame)
-        self.watch.note(frame.number)
-
-    def accepted(self) -> list[KeptFrame]:
-        """Return the frames that are neither doubtful nor unchecked."""
-        doubtful = {*self.watch.doubtful, *self.watch.unchecked}
-        return [frame for frame in self.kept if frame.number not in doubtful]
-
-    @contextmanager
-    def recovering(self) -> Iterator[None]:
-        """Record a failure of the stage and recover; raise if that is impossible."""
-        try:
-            yield
-        except StageError as failure:
-            self.failures.append(failure)
-            self.recover()
-
-    def recover(self) -> None:
-        """Recover, homing if necessary.
-
-        The stage must be ready within the time that recovery from all faults so far may take, one after the other,
-        counted from the last one: it may strike during the recovery, and may bring a port back.
-        """
-        started_s = self.bench.clock.now_s()
-        self.stage.recover()
-        last_s = max([started_s, *(when_s for when_s, _ in self.struck)])
-        assert self.bench.clock.now_s() - last_s <= sum(fault.recovery_s for _, fault in self.struck)
-        recover(self.stage, lambda question: True, self.watch)
-
-    @contextmanager
-    def bounded(self, bound_s: float) -> Iterator[None]:
-        """Assert that the block takes no longer than `bound_s` of simulated time, also when it fails."""
-        started_s = self.bench.clock.now_s()
-        try:
-            yield
-        finally:
-            assert self.bench.clock.now_s() - started_s <= bound_s
-
-    def check_frames(self, faults: list[Fault]) -> None:
-        """Assert that no frame from a wrong position is accepted, and that failures say what to do."""
-        for frame in self.accepted():
-            assert frame.error_mm() <= DRIFT_LIMIT_MM + ON_TARGET_MM
-        if not any(fault.nature == "mechanics" for fault in faults):
-            assert all(frame.error_mm() <= ON_TARGET_MM for frame in self.kept)
-        for failure in self.failures:
-            assert "; " in str(failure), "a failure says what is wrong; and what to do"
-            assert "\n" not in str(failure)
+    return prepare
 
 
-def once(action: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that calls `action` the first time only."""
-    pending = [action]
-    return lambda: pending.pop()() if pending else None
+def at_time(after_s: float, fault: Fault) -> Prepare:
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        bench.clock.after(after_s, lambda: fault.strike(bench))
+
+    return prepare
 
 
-def test_there_are_enough_faults() -> None:
-    assert all(len(faults_of(controller)) >= 20 for controller in CONTROLLERS)
-    assert len({fault.name for fault in FAULTS}) == len(FAULTS)
+MOMENTS: dict[str, Callable[[Fault], Prepare]] = {
+    "connecting": lambda fault: at_time(1.02, fault),
+    "homing": lambda fault: at_time(5.0, fault),
+    "exposing": lambda fault: at_exposure(3, fault),
+    "moving": lambda fault: at_exposure(3, fault, 0.35),
+}
 
 
+def capture_with(lab: Lab, prepare: Prepare) -> None:
+    """Capture with a fault, resume without if that fails, and assert that every frame is from its node."""
+    failure = lab.run(prepare)
+    assert lab.ended_s < LONGEST_S
+    if failure is not None:
+        assert "; " in str(failure), "a failure says what is wrong; and what to do"
+        assert not is_sealed(lab.folder)
+        assert lab.run() is None
+    lab.assert_true_positions()
+
+
+@pytest.mark.deep
 @pytest.mark.parametrize("moment", MOMENTS)
-@pytest.mark.parametrize(
-    ("controller", "fault"),
-    [(controller, fault) for controller in CONTROLLERS for fault in faults_of(controller)],
-    ids=lambda it: it.__name__ if isinstance(it, type) else str(it),
-)
-def test_one_fault(controller: Controller, fault: Fault, moment: str) -> None:
-    capture = RehearsedCapture(Bench(controller))
-
-    def strike() -> None:
-        capture.bench.clock.after(MOMENTS[moment], lambda: capture.strike(fault))
-
-    if moment == "moving":
-        capture.on_move = once(strike)
-    elif moment == "exposing":
-        capture.on_expose = once(strike)
-    else:
-        strike()
-    capture.run()
-    capture.check_frames([fault])
-    if not capture.failures:
-        assert len(capture.kept) == 4
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_each_fault_spoils_no_frame(controller: Controller, moment: str, tmp_path: Path) -> None:
+    wrong = {}
+    for number, fault in enumerate(faults_of(controller)):
+        if fault.nature != "mechanics":
+            try:
+                capture_with(Lab(tmp_path / str(number), controller), MOMENTS[moment](fault))
+            except AssertionError as failure:
+                wrong[fault.name] = str(failure)
+    assert wrong == {}
 
 
-def test_an_undisturbed_capture_keeps_everything() -> None:
-    for controller in CONTROLLERS:
-        capture = RehearsedCapture(Bench(controller))
-        capture.run()
-        assert len(capture.kept) == 4
-        assert not capture.failures
-        assert capture.accepted() == capture.kept
+def _disconnected(controller: Controller, link: MakeLink, name: str, folder: Path) -> None:
+    fault = next(fault for fault in FAULTS if fault.name == name)
+    capture_with(Lab(folder, controller, link=link), at_exposure(3, fault, 0.35))
 
 
+def test_pulled_cable_ends_no_capture(tmp_path: Path) -> None:
+    _disconnected(CONTROLLERS[0], PtyLink, "unplugged and back", tmp_path / "session")
+
+
+@pytest.mark.deep
 @pytest.mark.parametrize("controller", CONTROLLERS)
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
-@pytest.mark.parametrize("name", ["unplugged", "unplugged and back", "restart", "noise", "controller mute"])
-def test_faults_through_the_operating_system(
-    controller: Controller, link: type[PtyLink] | type[SocketLink], name: str
-) -> None:
-    made = link()
-    fault = next(fault for fault in FAULTS if fault.name == name)
-    capture = RehearsedCapture(Bench(controller, made))
-    capture.on_move = once(lambda: fault_soon(capture, fault))
-    capture.run()
-    made.close()
-    capture.check_frames([fault])
-    assert capture.failures or name == "noise"
+@pytest.mark.parametrize("name", ["unplugged", "restart", "noise", "controller mute"])
+def test_faults_of_a_real_port(controller: Controller, link: MakeLink, name: str, tmp_path: Path) -> None:
+    _disconnected(controller, link, name, tmp_path / "session")
 
 
-def fault_soon(capture: RehearsedCapture, fault: Fault) -> None:
-    """Strike while the stage is on its way."""
-    capture.bench.clock.after(0.35, lambda: capture.strike(fault))
+@pytest.mark.parametrize(
+    ("controller", "gone_s"), [(controller, 3.0) for controller in CONTROLLERS] + [(CONTROLLERS[0], 30.0)]
+)
+def test_port_that_returns_ends_no_capture(tmp_path: Path, controller: Controller, gone_s: float) -> None:
+    lab = Lab(tmp_path / "session", controller, msgspec.structs.replace(SMALL_RIG, drift=DriftSettings(every_nodes=2)))
+
+    def vanish(bench: Bench) -> None:
+        bench.unplug()
+        bench.clock.after(gone_s, bench.plug)
+
+    assert lab.run(at_exposure(3, Fault("gone", "wire", vanish), 0.4)) is None
+    lab.assert_true_positions()
 
 
+def test_port_that_stays_away_is_given_up(tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", CONTROLLERS[0])
+    assert isinstance(lab.run(at_exposure(3, Fault("gone", "wire", Bench.unplug))), StageLost)
+    assert 120.0 < lab.ended_s < 240.0
+    assert lab.run() is None
+    lab.assert_true_positions()
+
+
+def test_stage_jogged_during_an_exposure_repeats_the_frame(tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", CONTROLLERS[0])
+    jog = Fault("jog", "controller", lambda bench: bench.firmware.receive(b"$J=G91 G21 X-0.5 F6000\n"))
+    assert lab.run(at_exposure(3, jog)) is None
+    lab.assert_true_positions()
+    with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
+        assert [frame for _, frame in journal.uncommitted()] == [2]
+        assert len(journal.events("stage_failed")) == 1
+
+
+def capture_with_random_faults(controller: Controller, generator: np.random.Generator, usual_s: float) -> None:
+    """Capture with faults at random times, and resume without; judge the frames by where the stage truly was."""
+    faults = faults_of(controller)
+    loud = [fault for fault in faults if fault.nature != "mechanics"]
+    silent = [fault for fault in faults if fault.nature == "mechanics"]
+    drawn = [loud[index] for index in generator.integers(len(loud), size=FAULTS_PER_CAPTURE)]
+    # Two drifts between two checks may cancel, which no check can find: so one at most
+    hidden = generator.random() < 0.3
+    if hidden:
+        drawn[0] = silent[generator.integers(len(silent))]
+    times_s = generator.uniform(0.0, usual_s, FAULTS_PER_CAPTURE).tolist()
+    story = ", ".join(f"{fault} at {at_s:.3f} s" for at_s, fault in zip(times_s, drawn, strict=True))
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        for at_s, fault in zip(times_s, drawn, strict=True):
+            at_time(at_s, fault)(bench, camera)
+
+    # In memory if possible, since journals flush after each entry
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
+        lab = Lab(Path(folder) / "session", controller, DRIFTING)
+        failure = lab.run(prepare)
+        assert failure is None or "; " in str(failure), story
+        for _ in range(3):
+            if not is_sealed(lab.folder):
+                lab.run()
+        verdict = verify(lab.folder)
+        assert (verdict.problems, verdict.sealed) == ((), True), story
+        # Lost steps show in no report: the next drift check finds those beyond its limit. None follows the dark frames
+        limit_mm = ON_TARGET_MM + (DriftSettings().limit_mm if hidden else 0.0)
+        for frame, committed, path in taken_frames(lab.folder):
+            if not hidden or (frame.number < FRAMES_ON_GRID and committed.file not in verdict.suspect):
+                assert error_mm(path, frame.stop.target) <= limit_mm, f"{committed.file}; {story}"
+
+
+@pytest.mark.parametrize("captures", [3, pytest.param(60, marks=pytest.mark.deep)])
 @pytest.mark.parametrize("controller", CONTROLLERS)
-@settings(max_examples=150, deadline=None)
-@given(data=st.data())
-def test_no_exposure_at_a_wrong_place_whatever_goes_wrong(controller: Controller, data: st.DataObject) -> None:
-    capture = RehearsedCapture(Bench(controller))
-    known = faults_of(controller)
-    silent = [fault for fault in known if fault.nature == "mechanics"]
-    loud = [fault for fault in known if fault.nature != "mechanics"]
-    # Two drifts between two checks may cancel: no check by homing can find them, so one at most is drawn.
-    faults = data.draw(st.lists(st.sampled_from(loud), max_size=4)) + data.draw(
-        st.lists(st.sampled_from(silent), max_size=1)
-    )
-    for fault in faults:
-        when_s = data.draw(st.floats(0.0, 90.0))
-        capture.bench.clock.after(when_s, lambda fault=fault: capture.strike(fault))  # type: ignore[misc]
-    capture.run()
-    capture.check_frames(faults)
+def test_random_faults_spoil_no_frame(controller: Controller, captures: int, tmp_path: Path) -> None:
+    lab = Lab(tmp_path / "session", controller, DRIFTING)
+    assert lab.run() is None
+    lab.assert_true_positions()
+    assert verify(lab.folder).suspect == ()
+    generator = np.random.default_rng(20)
+    for _ in range(captures):
+        capture_with_random_faults(controller, generator, lab.ended_s)
+
+
+def test_camera_of_the_laboratory_sees_motion(tmp_path: Path) -> None:
+    bench = Bench(CONTROLLERS[0])
+    stage = bench.stage()
+    stage.connect()
+    stage.home()
+    stage.move_to(-100.0, -100.0)
+    camera, errors_mm = TruthfulCamera(bench), []
+    motions: list[Callable[[], None]] = [
+        lambda: None,
+        lambda: bench.firmware.mechanics.queue((-101.0, -100.0), 50.0, 500.0),
+        lambda: setattr(bench.firmware.mechanics.axes[0], "slip_mm", 0.02),
+        lambda: None,
+    ]
+    for number, motion in enumerate(motions):
+        bench.clock.after(0.05, motion)
+        (tmp_path / "frame").write_bytes(camera.expose(0.1, number).content or b"")
+        errors_mm.append(error_mm(tmp_path / "frame", Point(-101.0, -100.0)))
+        bench.clock.sleep_s(1.0)
+    assert errors_mm == pytest.approx([1.0, np.inf, np.inf, 0.02])

@@ -1,9 +1,11 @@
-"""Commands run in this process, sets made by hand, and one small simulated scene that tests share."""
+"""Commands run in this process, sets made by hand, and the scene and session that all tests share."""
 
+import fcntl
 import os
 import shutil
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -11,12 +13,16 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.commands.run import run as run_session
 from faintfield.pipelines.formats.image_files import encoded, write_frame
 from faintfield.pipelines.reconstruction import penalised, surface, surface_depths, surface_files
+from faintfield.pipelines.reconstruction.options import Options
 from faintfield.recon.surface.estimate import SurfaceEstimate
+from tests.pipelines.sessions import captured, rig_toml
 from tests.pipelines.surfaces import Searches, found_at_once
 
 type Command = Callable[..., CompletedProcess[str]]
@@ -52,12 +58,75 @@ def done(faintfield: Command) -> Command:
     return call
 
 
+def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
+    """Return a new folder that `make` fills, once for all processes of a run; to be read only."""
+    base = factory.getbasetemp()
+    shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
+    shared.mkdir(exist_ok=True)
+    folder, complete = shared / name, shared / f"{name}.complete"
+    with (shared / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not complete.exists():
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir()
+            make(folder)
+            complete.touch()
+    return folder
+
+
+@contextmanager
+def drawing_nothing() -> Iterator[None]:
+    """Leave drawings empty: text takes most of the time of a page."""
+
+    def save(_: Figure, file: Any, format: str, **__: object) -> None:
+        file.write("<svg></svg>" if format == "svg" else encoded(np.zeros((4, 4), np.uint8), ".png"))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", save)
+        yield
+
+
+@pytest.fixture
+def undrawn() -> Iterator[None]:
+    """Pages with empty drawings, for tests of something else."""
+    with drawing_nothing():
+        yield
+
+
 @pytest.fixture(scope="session")
 def simulated_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small dark set with its truth, to be read only."""
-    folder = tmp_path_factory.mktemp("simulated") / "scene"
-    assert run([str(word) for word in ("simulate", folder, *SMALL)]) == 0
-    return folder
+
+    def make(folder: Path) -> None:
+        assert run([str(word) for word in ("simulate", folder / "scene", *SMALL)]) == 0
+
+    return made_once(tmp_path_factory, "simulated", make) / "scene"
+
+
+@pytest.fixture(scope="session")
+def recorded_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A captured session without results, bright enough for its views to agree; to be read only."""
+    text = rig_toml(camera="unlit_photons_per_s = 20000.0")
+    return made_once(tmp_path_factory, "recorded", lambda folder: captured(folder, text)) / "session"
+
+
+@pytest.fixture(scope="session")
+def calibrated_session(recorded_session: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The session with noise, geometry and the back-projection at 700 mm, to be read only."""
+
+    def make(folder: Path) -> None:
+        shutil.copytree(recorded_session, folder / "session")
+        with drawing_nothing():
+            outcome = run_session(folder / "session", options=Options(depth_mm=[700.0], method=["backprojection"]))
+        assert [step.step for step in outcome.steps if step.ran] == ["noise", "geometry", "reconstruct"]
+
+    return made_once(tmp_path_factory, "calibrated", make) / "session"
+
+
+@pytest.fixture
+def session(calibrated_session: Path, tmp_path: Path) -> Path:
+    """A copy of the calibrated session that a test may change."""
+    return Path(shutil.copytree(calibrated_session, tmp_path / "session"))
 
 
 @pytest.fixture

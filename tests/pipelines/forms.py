@@ -4,6 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+GOLDEN = Path(__file__).parent / "golden"
+
 
 def form(value: Any) -> Any:
     """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements."""
@@ -22,3 +24,31 @@ def form_of_result(path: Path) -> Any:
     if "inputs" in content:
         content["inputs"] = sorted({type(digest).__name__ for digest in content["inputs"].values()})
     return form(content)
+
+
+def layout(value: Any) -> Any:
+    """Return a JSON value with the type of each scalar in its place; keys in their order, lists by their first item.
+
+    A quantity has a value with its error, or none with the reason: which of the two is a matter of the frames.
+    """
+    if isinstance(value, dict) and list(value) in (["value", "se", "ci95"], ["value", "why"]):
+        assert (value["value"] is None) == ("why" in value)
+        return "quantity"
+    if isinstance(value, dict):
+        return [(key, layout(part)) for key, part in value.items()]
+    if isinstance(value, list):
+        return [layout(part) for part in value[:1]]
+    return type(value).__name__
+
+
+def check_layout(made: Path, golden: str, *later: str) -> None:
+    """The keys of a result, their order, and the types of their values are those of a golden file; some came later."""
+    found, wanted = (json.loads(path.read_text()) for path in (made, GOLDEN / golden))
+    assert list(found)[-1 - len(later) :] == [*later, "record_sha256"]
+    for name in (*later, "record_sha256"):
+        del found[name]
+    for record in (found, wanted):
+        assert all(isinstance(warning, str) for warning in record.pop("warnings", []))
+    for plane in found.get("planes", []):
+        del plane["fit"], plane["emva1288"]  # came later
+    assert layout(found) == layout(wanted)

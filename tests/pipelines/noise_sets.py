@@ -3,12 +3,15 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import tifffile
 import tomli_w
 from numpy.typing import NDArray
 
+from faintfield.pipelines.commands.noise import noise
+from faintfield.pipelines.formats.results.noise import NoiseRecord
 from tests.calib.noise.darkroom import Chip, expose
 
 
@@ -41,3 +44,13 @@ def take_set(
         keys = {"kind": "flat", "exposure_s": 0.1, "temperature_c": -10.0, "level": level, "photons": light}
         taken += [(expose(chip, 0.1, rng, light), keys) for _ in range(frames)]
     return taken
+
+
+def measure_sensor(folder: Path, out: Path | None = None) -> NoiseRecord:
+    """Call `faintfield noise` without drawing its pages, which take nearly all of the time."""
+    pages = "faintfield.pipelines.pages"
+    with (
+        mock.patch(f"{pages}.noise_page.draw_page", return_value=b"page"),
+        mock.patch(f"{pages}.emva_page.emva_page", return_value="page"),
+    ):
+        return noise(folder, out=out)

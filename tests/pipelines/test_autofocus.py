@@ -24,6 +24,8 @@ from faintfield.recon.errors import NothingInFocus
 from tests.calib.light_fields import Layer, light_field, with_noise
 from tests.pipelines.conftest import Command
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 type Node = tuple[int, int]
 
 NODES, SIZE_PX = 5, (128, 96)
@@ -76,7 +78,7 @@ def _reordered(scene: Path, folder: Path, seen_by: Callable[[int, int], Node]) -
     return load_set(folder)
 
 
-def test_depths_of_a_scene_in_order_are_found(scene: Path, tmp_path: Path) -> None:
+def test_depths_of_scene_in_order_are_found(scene: Path, tmp_path: Path) -> None:
     found = best_focus(load_set(scene), tmp_path)
     assert (found.p_value, found.shuffles) == (0.002, 499)
     assert found.z_shuffled is not None
@@ -89,12 +91,10 @@ def test_depths_of_a_scene_in_order_are_found(scene: Path, tmp_path: Path) -> No
     ("seen_by", "remedy"),
     [
         (lambda r, c: (r, NODES - 1 - c), "reversed columns (--flip-columns)"),
-        (lambda r, c: (NODES - 1 - r, c), "reversed rows (--flip-rows)"),
-        (lambda r, c: (c, r), "rows and columns exchanged (--transpose)"),
         (lambda r, c: (NODES - 1 - c, r), "rows and columns exchanged, and rows reversed (--transpose --flip-rows)"),
     ],
 )
-def test_another_order_of_the_pictures_is_refused_with_its_option(
+def test_another_order_of_pictures_is_refused_with_its_option(
     seen_by: Callable[[int, int], Node], remedy: str, scene: Path, tmp_path: Path
 ) -> None:
     loaded = _reordered(scene, tmp_path / "set", seen_by)
@@ -102,32 +102,22 @@ def test_another_order_of_the_pictures_is_refused_with_its_option(
         best_focus(loaded, tmp_path)
 
 
-def _noise(node: Node) -> NDArray[np.floating]:
-    return np.random.default_rng([1, *node]).uniform(0, 200, SIZE_PX[::-1])
-
-
-def _one_picture(node: Node) -> NDArray[np.floating]:
-    del node
-    return 200 * light_field(CARDS, (1, 1), SIZE_PX)[0, 0]
-
-
 def _other_scene(node: Node) -> NDArray[np.floating]:
     return 200 * light_field(CARDS, (1, 1), SIZE_PX, seed=2010 + NODES * node[0] + node[1])[0, 0]
 
 
-@pytest.mark.parametrize("picture", [_noise, _one_picture, _other_scene])
-def test_views_that_show_no_depth_are_refused(
-    picture: Callable[[Node], NDArray[np.floating]], tmp_path: Path, faintfield: Command
-) -> None:
-    ended = faintfield("reconstruct", _grid(tmp_path / "set", picture), "--depth-mm", "auto", "--out", tmp_path / "out")
+def test_views_that_show_no_depth_are_refused(tmp_path: Path, faintfield: Command) -> None:
+    ended = faintfield(
+        "reconstruct", _grid(tmp_path / "set", _other_scene), "--depth-mm", "auto", "--out", tmp_path / "out"
+    )
     assert ended.returncode == 1
     assert re.search(r"NothingInFocus: .* no better than shuffled ones \(p = [0-9.]+ of 499 shuffles", ended.stderr)
     assert not (tmp_path / "out" / "reconstruction.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.parametrize("kind", ["noise", "other scenes", "shuffled views"])
-def test_of_sets_that_mean_nothing_no_more_are_accepted_than_is_stated(kind: str, scene: Path, tmp_path: Path) -> None:
+def test_meaningless_sets_are_accepted_as_rarely_as_stated(kind: str, scene: Path, tmp_path: Path) -> None:
     loaded = load_set(scene)
     range_mm = searched_range_mm(loaded)
     views = binned_views(loaded, range_mm[0], tmp_path, min_bins_px=8)
@@ -150,7 +140,7 @@ def _small_scene(random: np.random.Generator, size_px: tuple[int, int]) -> NDArr
     return light_field(CARDS, (1, 1), size_px, seed=int(random.integers(2**40)))[0, 0]
 
 
-def test_shuffles_are_different_and_all_there_are_of_few_views() -> None:
+def test_shuffles_differ_and_are_complete() -> None:
     for count, shuffles in ((3, 4), (4, 22), (5, 118), (6, 499), (25, 499)):
         found = {tuple(places.tolist()) for places in _shuffles(count)}
         assert len(found) == len(_shuffles(count)) == shuffles
@@ -158,9 +148,8 @@ def test_shuffles_are_different_and_all_there_are_of_few_views() -> None:
         assert all(sorted(places) == list(range(count)) for places in found)
 
 
-@pytest.mark.parametrize("far_px", [0.0, pytest.param(-0.2, marks=pytest.mark.slow)])
-def test_the_farthest_plane_is_found_up_to_infinity(far_px: float, tmp_path: Path) -> None:
-    layers = (Layer(far_px), *CARDS[1:])
+def test_farthest_plane_is_found_up_to_infinity(tmp_path: Path) -> None:
+    layers = (Layer(0.0), *CARDS[1:])
     views = light_field(layers, (NODES, NODES), SIZE_PX)
     found = best_focus(load_set(_grid(tmp_path / "set", lambda node: 200 * views[node])), tmp_path)
     disparities_px = -1000 / np.array(found.depth_mm)
@@ -180,7 +169,7 @@ def _turned_away(folder: Path, settings: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("change", [_lost, _turned_away])
-def test_one_view_that_sees_nothing_does_not_hide_the_others(
+def test_one_view_that_sees_nothing_does_not_hide_others(
     change: Callable[[Path, dict[str, Any]], None], scene: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(scene, tmp_path / "set"))
@@ -199,20 +188,13 @@ def _imported(views: dict[Node, NDArray[np.float32]], folder: Path, *options: ob
     return load_set(out)
 
 
-def test_the_depth_of_the_plane_that_views_are_aligned_on_does_not_matter(tmp_path: Path) -> None:
+def test_depth_of_alignment_does_not_matter(tmp_path: Path) -> None:
     views = with_noise(light_field(CARDS, (NODES, NODES), SIZE_PX, aligned_px=2.2), 20)
     found = []
-    for name, options in (("own", ()), ("six", ("--disparity-px", 6)), ("twelve", ("--disparity-px", 12))):
+    for name, options in (("own", ()), ("twelve", ("--disparity-px", 12))):
         loaded = _imported(views, tmp_path / name, *options)
         at_zero, slope = loaded.inverse_depth_of_disparity()
         depths = np.array(best_focus(loaded, tmp_path).depth_mm)
         found.append(np.sort((1 / depths - at_zero) / slope))
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=0.1)
-
-
-def test_the_page_says_what_p_is_about(scene: Path, tmp_path: Path, done: Command) -> None:
-    done("reconstruct", scene, "--depth", "auto", "--out", tmp_path, "--method", "backprojection")
-    page = " ".join((tmp_path / "report.html").read_text().split())
-    assert "views shuffled 499 times: none agreed as well (p = 0.002)" in page
-    assert "This is about the set, not about each plane." in page

@@ -1,6 +1,5 @@
 """`faintfield noise --compare`: a camera that is as it was, one that has changed, and one that is another."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,21 +7,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from faintfield.pipelines.cli import run
 from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.errors import BadValue, MissingFile, WrongSize
 from faintfield.pipelines.formats.files import sha256, write_record
 from faintfield.pipelines.formats.results.noise import NOISE_FILE, NOISE_MAPS, NoiseRecord, read_noise
 from faintfield.pipelines.formats.results.noise_fit import Measured
 from tests.calib.noise.darkroom import Chip, specimen
-from tests.pipelines.noise_sets import take_set, write_frames
-
-GOLDEN = Path(__file__).parent / "golden"
+from tests.pipelines.forms import GOLDEN
+from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 
 
 def measure(folder: Path, chip: Chip, seed: int, **settings: Any) -> Path:
     rng = np.random.default_rng(seed)
-    noise(write_frames(folder, take_set(chip, rng, photons=(4000.0, 20000.0)), **settings))
+    measure_sensor(write_frames(folder, take_set(chip, rng, photons=(4000.0, 20000.0)), **settings))
     return folder
 
 
@@ -100,23 +97,6 @@ def test_the_limit_grows_with_the_number_of_comparisons(before: Path) -> None:
     assert {it.sigma for it in known} == {0}
 
 
-def test_reasons_for_missing_values_are_told_for_each(
-    before: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    later = altered(
-        before, tmp_path / "later", gain_dn_per_e=Measured(None, why="too few electrons"), fit=msgspec.UNSET
-    )
-    assert run(["noise", "--compare", str(before), str(later), "--json"]) == 0
-    out, err = capfd.readouterr()
-    found = {it["name"]: it for it in json.loads(out)["quantities"]}
-    assert found["gain_dn_per_e"]["verdict"] == "not comparable"
-    assert found["gain_dn_per_e"]["why"] == "B: too few electrons"
-    assert "A: no series of flats reaches" in found["saturation_e"]["why"]
-    assert "B: not in this file: it is of an older version" in found["saturation_e"]["why"]
-    assert "not comparable: B: too few electrons" in err
-    assert "changed: nothing" in err
-
-
 def of_a_mosaic(folder: Path, seed: int, **changes: Any) -> Path:
     """The golden record of a mosaic with a map of random offsets, and the second green changed."""
     golden = msgspec.json.decode((GOLDEN / "noise_of_a_mosaic.json").read_bytes(), type=NoiseRecord)
@@ -166,21 +146,3 @@ def test_maps_that_are_missing_or_of_another_record_are_named(before: Path, tmp_
     assert (offsets.why or "").startswith("B: no offset map")
     with pytest.raises(BadValue, match=NOISE_MAPS):
         noise(compare=(before, altered(before, tmp_path / "other", maps_sha256=sha256(before / NOISE_FILE))))
-
-
-@pytest.mark.parametrize(
-    "arguments", [[], ["folder", "--compare", "a", "b"], ["--compare", "a", "b", "--out", "c"], ["--compare", "a"]]
-)
-def test_neither_both_nor_half_is_a_usage_error(arguments: list[str]) -> None:
-    assert run(["noise", *arguments]) == 2
-
-
-def test_records_by_hand_compare_as_far_as_they_go(tmp_path: Path) -> None:
-    """Numbers without intervals, and an efficiency that is one number."""
-    text = {"offset_dn": {"value": 1}, "gain_dn_per_e": {"value": 2}, "read_noise_e": {"value": 3}}
-    text |= {"dark_current_e_per_s": {"value": 0}, "quantum_efficiency": 0.5}  # type: ignore[dict-item]
-    (tmp_path / NOISE_FILE).write_text(json.dumps(text))
-    found = noise(compare=(tmp_path, tmp_path))
-    assert isinstance(msgspec.json.decode((tmp_path / NOISE_FILE).read_bytes(), type=NoiseRecord), NoiseRecord)
-    assert found.comparisons == 0
-    assert {it.verdict for it in found.quantities} == {"not comparable"}

@@ -76,14 +76,6 @@ def test_a_set_that_is_written_is_read_back_as_it_was(settings: ElementalSetFile
     np.testing.assert_array_equal(loaded.poses_rt_cam_ref, [view.rt_cam_ref for view in settings.view])
 
 
-def test_whole_numbers_will_do_where_the_format_has_real_ones(
-    make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
-) -> None:
-    folder = make_set(grey_images)
-    edit(folder, lambda settings: settings["view"][1].update(rt_cam_ref=[0, 0, 0, -10, 0, 0]))
-    assert load_set(folder).settings.view[1].rt_cam_ref == (0.0, 0.0, 0.0, -10.0, 0.0, 0.0)
-
-
 def _first_view(**values: Any) -> Callable[[dict[str, Any]], object]:
     return lambda settings: settings["view"][0].update(values)
 
@@ -108,48 +100,24 @@ NOT_A_NUMBER = float("nan")
 
 REFUSED: dict[str, tuple[Callable[[dict[str, Any]], object], type[InputError], str]] = {
     "misspelt key of a table": (_camera(fx_pix=1.0), UnknownKey, "'camera.fx_pix' is not a key .* mean 'fx_px'"),
-    "misspelt key at the top": (_top(exposure=1.0), UnknownKey, "'exposure' is not a key .* mean 'exposure_s'"),
-    "misspelt key of a view": (_second_view(nodes=[0, 1]), UnknownKey, r"'view.*\.nodes' is not .* mean 'node'"),
-    "key like no other": (_noise(zzz=1.0), UnknownKey, "'noise.zzz' is not a key that is read; remove it"),
-    "missing key": (lambda s: s["camera"].pop("fy_px"), BadValue, "camera: .*missing required field `fy_px`"),
-    "missing table": (lambda s: s.pop("noise"), BadValue, "missing required field `noise`"),
     "wrong type": (_top(exposure_s="long"), BadValue, "exposure_s: Expected `float`, got `str`"),
-    "short pose": (_first_view(rt_cam_ref=[0.0] * 5), BadValue, r"view.*rt_cam_ref: Expected `array` of length 6"),
     "another format": (_top(format=2), BadValue, "format = 2; choose from 1$"),
     "pose that is no number": (
         _second_view(rt_cam_ref=[NOT_A_NUMBER] * 6),
         BadValue,
         r"view\[1\].rt_cam_ref\[0\] = nan",
     ),
-    "infinite pose": (
-        _second_view(rt_cam_ref=[0, 0, 0, float("inf"), 0, 0]),
-        BadValue,
-        r"view\[1\].rt_cam_ref\[3\] = inf",
-    ),
-    "principal point that is no number": (_second_view(cx_px=NOT_A_NUMBER), BadValue, r"view\[1\].cx_px = nan"),
     "missing image": (_second_view(image="gone.tiff"), MissingFile, "gone.tiff is named but missing"),
     "repeated image": (_second_view(image="view_0.tiff"), BadValue, "image = view_0.tiff is named by more than one"),
     "repeated node": (_second_view(node=[0, 0]), BadValue, r"node = \(0, 0\) is named by more than one"),
     "path that climbs out": (_second_view(image="../view_1.tiff"), BadValue, "'../view_1.tiff' leaves the folder"),
-    "absolute path": (_second_view(image="/etc/hostname"), BadValue, "'/etc/hostname' leaves the folder"),
-    "no name": (_second_view(image=""), BadValue, "'' leaves the folder"),
     "reference that is not at zero": (_first_view(rt_cam_ref=[0, 0, 0, 1, 0, 0]), BadValue, "own is zero"),
     "reference beyond the views": (_top(reference_view=2), BadValue, "reference_view = 2, but there are 2 views"),
-    "negative reference": (_top(reference_view=-1), BadValue, "reference_view = -1"),
-    "no views": (_top(view=[]), BadValue, "there are 0 views"),
     "no exposure": (_top(exposure_s=0.0), BadValue, "exposure_s = 0.0; it must be positive"),
-    "exposure that is no number": (_top(exposure_s=NOT_A_NUMBER), BadValue, "exposure_s = nan"),
     "ragged mosaic": (_camera(mosaic=["RG", "B"]), BadValue, "camera.mosaic"),
-    "empty mosaic": (_camera(mosaic=[]), BadValue, "camera.mosaic"),
     "no focal length": (_camera(fx_px=0.0), BadValue, "camera: focal lengths must be positive"),
-    "no size": (_camera(size_px=[0, 12]), BadValue, "camera: size_px must be positive"),
-    "nine distortion coefficients": (_camera(distortion=[0.0] * 9), BadValue, "at most 8 coefficients, got 9"),
     "no gain": (_noise(gain_dn_per_e=0.0), BadValue, "noise: gain_dn_per_e"),
-    "negative read noise": (_noise(read_noise_e=-1.0), BadValue, "noise: read_noise_e"),
-    "offset that is no number": (_noise(offset_dn=NOT_A_NUMBER), BadValue, "noise.offset_dn = nan; numbers are finite"),
     "quantum efficiency above one": (_noise(quantum_efficiency=1.5), BadValue, "noise: quantum_efficiency"),
-    "missing noise file": (_top(noise="noise.json"), MissingFile, "noise.json is named but missing"),
-    "missing flat field": (_camera(flat="flat.tiff"), MissingFile, "flat.tiff is named but missing"),
 }
 
 
@@ -167,17 +135,11 @@ def test_what_cannot_be_is_refused_with_the_files_path_and_the_place(
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("content", [b"format = ", b"\xff\xfe", b"format = 1\nformat = 1\n"])
+@pytest.mark.parametrize("content", [b"format = ", b"format = 1\nformat = 1\n"])
 def test_what_is_no_toml_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "elemental.toml").write_bytes(content)
     with pytest.raises(BadValue, match=r"elemental.toml: is not TOML"):
         load_set(tmp_path)
-
-
-def test_a_folder_without_settings_and_no_folder_are_both_missing(tmp_path: Path) -> None:
-    for place in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(MissingFile, match=r"elemental.toml: no such file"):
-            load_set(place)
 
 
 def test_a_link_that_leads_out_of_the_folder_leaves_it(
@@ -195,7 +157,6 @@ def test_a_link_that_leads_out_of_the_folder_leaves_it(
     [
         (np.ones((16, 12), np.float32), "flat.tiff: is 12 x 16 px, the camera 16 x 12 px"),
         (np.full((12, 16), -0.5, np.float32), "flat.tiff: a flat field is .* from -0.5"),
-        (np.full((12, 16), np.inf, np.float32), "flat.tiff: a flat field is .* to inf"),
     ],
 )
 def test_flat_fields_that_do_not_fit_are_refused(
@@ -260,9 +221,7 @@ def test_the_depth_of_a_disparity_is_that_of_similar_triangles(
 @pytest.mark.parametrize(
     ("unit", "depth", "both"),
     [
-        ("mm", "400 mm", "250 to 400 mm"),
         ("disparity_px", "disparity 0 px", "disparities -1.5 to 0 px"),
-        ("relative", "depth 400", "depths 250 to 400"),
     ],
 )
 def test_depths_are_worded_in_the_unit_of_the_set(tmp_path: Path, unit: DepthUnit, depth: str, both: str) -> None:
@@ -279,16 +238,3 @@ def test_a_disparity_beyond_infinity_is_refused_with_that_of_infinity(tmp_path: 
     loaded = _loaded(_rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1), (1, 0)]), tmp_path)
     with pytest.raises(BadValue, match=r"disparity of 3 px .* below 2\.5 px, that of infinitely far"):
         loaded.depth_of_disparity(3.0)
-
-
-def test_disparities_need_nodes(tmp_path: Path) -> None:
-    loaded = _loaded(_rectified_set(10.0, 100.0, 2.5, [(0, 0), (0, 1)], with_nodes=False), tmp_path)
-    with pytest.raises(BadValue, match="need the node of every view"):
-        loaded.depth_of_disparity(1.0)
-
-
-def test_settings_are_frozen(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
-    settings = load_set(make_set(grey_images)).settings
-    with pytest.raises(AttributeError):
-        settings.exposure_s = 2.0  # type: ignore[misc]
-    assert msgspec.structs.replace(settings, exposure_s=2.0).exposure_s == 2.0

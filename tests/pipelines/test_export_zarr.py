@@ -1,7 +1,6 @@
 """`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -137,7 +136,6 @@ def test_arrays_of_others_are_left_alone(scene: Path, tmp_path: Path, done: Comm
     ("words", "said"),
     [
         (("--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700), "not in equal steps"),
-        (("--sweep-mm", "500:700:2", "--pitch-mm", 5), "planes are of 2 sizes"),
         (("--depth-mm", 500, "--method", "mlem"), "holds planes of 2 calls or methods"),
     ],
 )
@@ -152,10 +150,3 @@ def test_planes_that_fit_no_stack_are_refused(
     assert ended.returncode == 1
     assert said in ended.stderr
     assert not (tmp_path / "stack.zarr").exists()
-
-
-def test_without_zarr_the_extra_is_named(tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "zarr", None)
-    ended = faintfield("export", "zarr", tmp_path, tmp_path / "stack.zarr")
-    assert ended.returncode == 1
-    assert "pip install 'faintfield[zarr]'" in ended.stderr

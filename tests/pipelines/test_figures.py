@@ -2,29 +2,25 @@
 
 import csv
 import json
+import shutil
 import statistics
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.paper import figure4
 from faintfield.pipelines.paper.figure4 import SNRS, StagedObject, is_monotone, mean_curves, over_best, stage_object
-from faintfield.pipelines.paper.figure_methods import BEST, METHODS, OURS, FigureMethod
+from faintfield.pipelines.paper.figure_methods import METHODS
 from faintfield.pipelines.paper.figure_records import CurvePoint, ErrorPoint
 from faintfield.recon.metrics import expected_snr_from_powers
-from faintfield.recon.solver.initialization import back_projection
 from faintfield.rig.simulation.objects import shaded_ball, star_chart
+from tests.pipelines.conftest import Command
 
-type Command = Callable[..., CompletedProcess[str]]
-
-FEW_SNRS = figure4.SNRS[::3]
+FEW_SNRS = figure4.SNRS[::7]
 OBJECTS = {"truck", "airplane", "boat", "ball"}
 
 
@@ -34,7 +30,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("figures") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figure4, "SNRS", FEW_SNRS)
-        assert run(["figures", str(out), "--size-px", "128", "96", "--only", "2", "3"]) == 0
+        assert run(["figures", str(out), "--size-px", "96", "72", "--only", "2", "3"]) == 0
         assert run(["figures", str(out), "--size-px", "64", "48", "--only", "4", "--seeds", "1"]) == 0
     return out
 
@@ -59,12 +55,12 @@ def test_figure_4_has_every_object_snr_method_and_draw(errors: list[dict[str, An
     assert set(found) == wanted
 
 
-def test_the_snrs_are_the_papers() -> None:
+def test_snrs_are_papers() -> None:
     assert SNRS == (0.16, 0.17, 0.18, 0.19, 0.20, 0.21, 0.22, 0.23)
 
 
 @pytest.mark.parametrize("method", ["backprojection", "pmlem-clipped", "pmlem-osl", "pmlem"])
-def test_the_mean_error_falls_with_the_snr(method: str, errors: list[dict[str, Any]]) -> None:
+def test_mean_error_falls_with_snr(method: str, errors: list[dict[str, Any]]) -> None:
     for name in OBJECTS:
         means = [
             np.mean([row["mse"] for row in errors if (row["object"], row["snr"], row["method"]) == (name, snr, method)])
@@ -73,22 +69,15 @@ def test_the_mean_error_falls_with_the_snr(method: str, errors: list[dict[str, A
         assert all(after < before for before, after in pairwise(means)), (name, means)
 
 
-def test_penalised_errors_lie_on_the_papers_axis_and_clipped_ones_above(errors: list[dict[str, Any]]) -> None:
+def test_penalised_errors_lie_on_the_axis_of_the_paper(errors: list[dict[str, Any]]) -> None:
     by_method = {method.name: [row["mse"] for row in errors if row["method"] == method.name] for method in METHODS}
     assert max(by_method["pmlem-osl"]) < 0.12
     assert max(by_method["pmlem"]) < 0.12
     assert min(by_method["pmlem-clipped"]) > 0.12
 
 
-def test_best_weights_are_given_to_denoisers_and_to_one_that_is_named_so(errors: list[dict[str, Any]]) -> None:
-    given = {row["method"] for row in errors if row["weight"] is not None}
-    assert given == {method.name for method in METHODS if method.weights}
-    assert {"tv", BEST} <= given
-    assert not {OURS, "pmlem-osl"} & given
-
-
-@pytest.mark.parametrize("number", [2, 3, 4])
-def test_the_table_holds_what_the_json_holds(number: int, made: Path) -> None:
+@pytest.mark.parametrize("number", [3, 4])
+def test_table_holds_what_json_holds(number: int, made: Path) -> None:
     content = json.loads((made / f"figure{number}.json").read_text())
     rows = content if number == 4 else content["planes"]
     with (made / f"figure{number}.csv").open() as file:
@@ -96,14 +85,6 @@ def test_the_table_holds_what_the_json_holds(number: int, made: Path) -> None:
     assert len(table) == len(rows)
     for row, cells in zip(rows, table, strict=True):
         assert {name: "" if value is None else str(value) for name, value in row.items()} == cells
-
-
-@pytest.mark.parametrize("number", [2, 3, 4])
-def test_each_figure_is_a_picture_fit_for_print(number: int, made: Path) -> None:
-    picture = cv2.imread(str(made / f"figure{number}.png"))
-    assert picture is not None
-    assert picture.shape[1] >= 2000
-    assert picture.std() > 10
 
 
 def test_each_back_projection_is_sharp_on_its_own_object(made: Path) -> None:
@@ -126,15 +107,13 @@ def test_figure_3_tells_how_dark_it_is(made: Path) -> None:
 
 
 def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: Command) -> None:
-    out = tmp_path / "out"
-    done("figures", out, "--only", 2, "--size-px", 64, 48)
-    assert sorted(path.name for path in out.glob("figure?.png")) == ["figure2.png"]
-    before = (out / "figure2.png").read_bytes()
-    said = json.loads(done("--json", "figures", out, "--only", 3, "--size-px", 64, 48).stdout)
-    assert list(said["figures"]) == ["figure3"]
-    assert (out / "figure2.png").read_bytes() == before
-    (out / "figure4.png").touch()  # of a figure that was cut short
-    done("figures", out, "--only", 3, "--size-px", 64, 48)
+    out = Path(shutil.copytree(made, tmp_path / "out"))
+    for path in {*out.glob("figure4*")} - {out / "figure4.png"}:
+        path.unlink()  # the picture is left, as of a figure that was cut short
+    before = (out / "figure3.png").read_bytes()
+    said = json.loads(done("--json", "figures", out, "--only", 2, "--size-px", 64, 48).stdout)
+    assert list(said["figures"]) == ["figure2"]
+    assert (out / "figure3.png").read_bytes() == before
     page = (out / "figures.html").read_text()
     assert 'id="figure2"' in page
     assert 'id="figure3"' in page
@@ -145,14 +124,7 @@ def test_figures_that_are_not_asked_for_stay(made: Path, tmp_path: Path, done: C
     assert "http" not in whole.split("</head>")[1]
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, faintfield: Command) -> None:
-    (tmp_path / "thesis.tex").touch()
-    ended = faintfield("figures", tmp_path)
-    assert ended.returncode == 1
-    assert "OutputExists" in ended.stderr
-
-
-def test_exposures_have_the_snr_they_are_named_by(star: StagedObject) -> None:
+def test_exposures_have_snr_they_are_named_by(star: StagedObject) -> None:
     view = star.experiment.reference_view
     signal = star.light[view][star.region]
     for snr, images, scale_e in star.exposures(seed=3):
@@ -163,7 +135,7 @@ def test_exposures_have_the_snr_they_are_named_by(star: StagedObject) -> None:
         assert images.electrons.sum(dtype=np.float64) == pytest.approx(expected, abs=4 * deviation)
 
 
-def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: StagedObject) -> None:
+def test_brighter_exposures_are_darker_ones_with_more_photons(star: StagedObject) -> None:
     frames = [images.electrons for _, images, _ in star.exposures(seed=3)]
     for darker, brighter in pairwise(frames):
         more = brighter - darker
@@ -173,20 +145,13 @@ def test_brighter_exposures_are_the_darker_ones_with_more_photons(star: StagedOb
     assert np.corrcoef(frames[0].ravel(), other.ravel())[0, 1] < 0.2
 
 
-def test_the_best_weight_is_the_best(star: StagedObject) -> None:
-    _, images, scale_e = next(star.exposures(seed=1))
-    tv = next(method for method in METHODS if method.name == "tv")
-    tried = [star.errors(tv.plane(star.operator, images, weight), scale_e)[0] for weight in tv.weights]
-    assert 0 < int(np.argmin(tried)) < len(tried) - 1
-
-
-def test_a_method_without_noise_has_no_error_but_that_of_sampling() -> None:
+def test_noise_free_plane_has_only_sampling_errors() -> None:
     ball = stage_object(shaded_ball(0.0, 0.0, 600.0).grey(), (120, 90))
     assert ball.errors(ball.bright * np.float32(2.0), 2.0)[0] == pytest.approx(0.0, abs=1e-12)
     assert ball.errors(ball.bright, 1.0)[1] < 2e-3
 
 
-def test_a_point_is_the_mean_of_its_draws_with_its_standard_error() -> None:
+def test_point_has_mean_and_standard_error_of_draws() -> None:
     draws = [ErrorPoint("star", 0.16, "tv", mse, seed, 2 * mse, None) for seed, mse in enumerate((0.01, 0.02, 0.06))]
     (point,) = mean_curves(draws)
     assert (point.mse, point.mse_texture) == pytest.approx((0.03, 0.06))
@@ -206,7 +171,7 @@ def test_monotone_means_that_every_step_is_down(errors: tuple[float, ...], falls
     assert is_monotone(points, "tv") == falls
 
 
-def test_a_plane_covers_its_object_with_a_margin(star: StagedObject) -> None:
+def test_plane_covers_its_object_with_margin(star: StagedObject) -> None:
     shown = np.zeros_like(star.region)
     shown[star.window] = True
     assert shown[star.region].all()
@@ -217,18 +182,7 @@ def test_a_plane_covers_its_object_with_a_margin(star: StagedObject) -> None:
     assert np.corrcoef(star.texture.ravel(), star.bright.ravel())[0, 1] > 0.95
 
 
-def test_slow_methods_have_fewer_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figure4, "SNRS", FEW_SNRS[:1])
-    quick = [
-        FigureMethod("once", "once", back_projection, draws=1),
-        FigureMethod("always", "always", back_projection),
-    ]
-    monkeypatch.setattr(figure4, "METHODS", quick)
-    points = mean_curves(figure4.measure_errors((40, 30), seeds=3))
-    assert {(point.method, point.draws) for point in points} == {("once", 1), ("always", 3)}
-
-
-def test_the_ratio_to_the_best_is_the_worst_along_a_curve() -> None:
+def test_ratio_to_best_is_worst_along_curve() -> None:
     points = [
         CurvePoint(name, method, snr, draws=1, mse=mse, standard_error=None, mse_texture=mse)
         for name, method, errors in (
@@ -240,9 +194,3 @@ def test_the_ratio_to_the_best_is_the_worst_along_a_curve() -> None:
         for snr, mse in zip((0.16, 0.17), errors, strict=True)
     ]
     assert over_best(points, "ours", "best") == pytest.approx({"star": 1.5, "ball": 1.0})
-
-
-def test_methods_have_names_of_their_own() -> None:
-    names = [method.name for method in METHODS]
-    assert len(set(names)) == len(names)
-    assert all(isinstance(method, FigureMethod) for method in METHODS)

@@ -8,6 +8,9 @@ import msgspec
 import pytest
 
 from faintfield.pipelines.cli import run
+from faintfield.pipelines.formats.files import write_json
+from faintfield.pipelines.formats.results.geometry import GeometryRecord
+from faintfield.pipelines.formats.results.noise import NoiseRecord
 from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.formats.results.records import (
     DepthMapFileRecord,
@@ -16,11 +19,10 @@ from faintfield.pipelines.formats.results.records import (
     ReconstructionRecord,
 )
 from faintfield.pipelines.formats.results.surface import SurfaceFileRecord
+from tests.pipelines.forms import GOLDEN as GOLDEN
 from tests.pipelines.forms import form_of_result
 
 type Command = Callable[..., CompletedProcess[str]]
-
-GOLDEN = Path(__file__).parent / "golden"
 
 # By the first word of the file's name.
 KINDS: dict[str, type[msgspec.Struct]] = {
@@ -35,18 +37,14 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 PAIR = ("--depth-mm", 500, "--depth-mm", 700)
 SWEEP = ("--sweep-mm", "400:800:9", "--method", "backprojection")
 
-# Options that make a result of the same kind from the small scene, and the name of its file.
-FRESH: dict[str, tuple[str, tuple[object, ...]]] = {
-    "reconstruction_pmlem": ("reconstruction.json", (*PAIR, "--prior", "tv")),
-    "reconstruction_prior": ("reconstruction.json", PAIR),
-    "reconstruction_pmlem-osl": ("reconstruction.json", ("--depth-mm", 500, "--method", "pmlem-osl")),
-    "reconstruction_sweep": ("reconstruction.json", SWEEP),
-    "reconstruction_auto": ("reconstruction.json", ("--depth-mm", "auto", "--prior", "tv")),
-    "depth_map_sweep": ("depth_map.json", (*SWEEP, "--depth-map")),
-    "plane_pmlem": ("plane_00500.0.json", (*PAIR, "--prior", "tv")),
-    "plane_prior": ("plane_00500.0.json", PAIR),
-    "metrics_set": ("metrics.json", PAIR),
-    "overview_set": ("overview.json", PAIR),
+# Options that make results from the small scene, and the golden files of the same form.
+FRESH: dict[str, tuple[tuple[object, ...], tuple[str, ...]]] = {
+    "PMLEM": ((*PAIR, "--prior", "tv"), ("reconstruction_pmlem", "plane_pmlem")),
+    "learned prior": (PAIR, ("reconstruction_prior", "plane_prior", "metrics_set", "overview_set")),
+    "one-step-late": (("--depth-mm", 500, "--method", "pmlem-osl"), ("reconstruction_pmlem-osl",)),
+    "sweep": (SWEEP, ("reconstruction_sweep",)),
+    "depth map": ((*SWEEP, "--depth-map"), ("depth_map_sweep",)),
+    "auto": (("--depth-mm", "auto", "--prior", "tv"), ("reconstruction_auto",)),
 }
 
 
@@ -76,10 +74,23 @@ def golden_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("name", FRESH)
-def test_a_fresh_result_has_the_form_of_its_golden_file(
-    name: str, golden_scene: Path, tmp_path: Path, done: Command
+@pytest.mark.parametrize("call", FRESH)
+def test_fresh_results_have_the_form_of_golden_ones(
+    call: str, golden_scene: Path, tmp_path: Path, done: Command
 ) -> None:
-    file, options = FRESH[name]
+    options, names = FRESH[call]
     done("reconstruct", golden_scene, "--out", tmp_path, *options)
-    assert form_of_result(tmp_path / file) == form_of_result(GOLDEN / f"{name}.json")
+    for name in names:
+        kind = name.rpartition("_")[0]
+        file = "plane_00500.0.json" if kind == "plane" else f"{kind}.json"
+        assert form_of_result(tmp_path / file) == form_of_result(GOLDEN / f"{name}.json"), name
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("noise.json", NoiseRecord), ("noise_of_a_mosaic.json", NoiseRecord), ("geometry.json", GeometryRecord)],
+)
+def test_a_golden_file_is_written_as_it_was_read(name: str, kind: type[msgspec.Struct], tmp_path: Path) -> None:
+    content = (GOLDEN / name).read_bytes()
+    write_json(tmp_path / name, msgspec.json.decode(content, type=kind))
+    assert (tmp_path / name).read_bytes() == content

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from faintfield.pipelines.commands.simulate import simulate
-from faintfield.pipelines.errors import BadValue
 from faintfield.pipelines.formats.files import sha256, write_json
 from faintfield.pipelines.formats.results.geometry import (
     CameraPoses,
@@ -76,12 +75,6 @@ def test_a_homing_of_unknown_shift_is_told(
     assert not capsys.readouterr().err, "one homing shifts all views alike"
 
 
-def test_an_impossible_shift_is_refused(scene: ElementalSet, tmp_path: Path) -> None:
-    write_json(tmp_path / "geometry.json", geometry([HomingRecord(0, 1, (1e30, 0.0, 0.0), SIGMA_MM)]))
-    with pytest.raises(BadValue, match="homing shift"):
-        with_measured_geometry(scene, tmp_path)
-
-
 class Taken(NamedTuple):
     intent: int
 
@@ -106,7 +99,7 @@ def test_the_homings_of_a_session_are_not_those_of_another(
 
 @pytest.mark.parametrize(
     ("spread_mm", "checks", "repeat"),
-    [((0.01, 0.01), 6, True), ((0.01, 0.01), 5, False), ((0.01, 0.03), 9, False), (None, 1, False)],
+    [((0.01, 0.01), 6, True), ((0.01, 0.01), 5, False), (None, 1, False)],
 )
 def test_few_checks_do_not_show_that_switches_repeat(
     spread_mm: tuple[float, ...] | None, checks: int, repeat: bool

@@ -43,10 +43,9 @@ def _grid_names(rows: Iterable[int], columns: Iterable[int], template: str = "vi
     [
         _grid_names(range(2), range(3)),
         _grid_names(range(4, 6), range(10, 13)),
-        _grid_names(range(2), range(3), "2024_{}-{}.png"),
         _grid_names((8, 9), (9, 10, 11), "img{}x{}.tiff"),
     ],
-    ids=["from zero", "from elsewhere", "with a date", "across ten"],
+    ids=["from zero", "from elsewhere", "across ten"],
 )
 def test_nodes_are_the_last_two_numbers_of_a_name_counted_from_the_first(
     names: list[str], tmp_path: Path, done: Command
@@ -64,20 +63,6 @@ def test_nodes_are_the_last_two_numbers_of_a_name_counted_from_the_first(
     np.testing.assert_array_equal(loaded.poses_rt_cam_ref[:, 3:5], expected)
 
 
-def test_names_without_numbers_are_taken_in_order_row_by_row(tmp_path: Path, done: Command) -> None:
-    src = _pictures(tmp_path / "src", [f"{letter}.tiff" for letter in "abcdef"])
-    done("import", "grid", src, tmp_path / "out", "--rows", 3, "--columns", 2)
-    views = load_set(tmp_path / "out").settings.view
-    assert [(view.image, view.node) for view in views] == [
-        (f"{letter}.tiff", (index // 2, index % 2)) for index, letter in enumerate("abcdef")
-    ]
-
-
-def test_one_picture_is_a_grid_of_one(tmp_path: Path, done: Command) -> None:
-    done("import", "grid", _pictures(tmp_path / "src", ["alone.tiff"]), tmp_path / "out")
-    assert load_set(tmp_path / "out").settings.view[0].node == (0, 0)
-
-
 @pytest.mark.parametrize(
     ("names", "options", "failure", "words"),
     [
@@ -88,23 +73,8 @@ def test_one_picture_is_a_grid_of_one(tmp_path: Path, done: Command) -> None:
             "MissingFile",
             "the view in row 0 and column 1, counted from 0, is missing, 2 of 4",
         ),
-        (
-            _grid_names((3, 4, 5), (7, 8, 9))[::2][:-1],
-            (),
-            "MissingFile",
-            "the view in row 0 and column 1, counted from 0, is missing, 5 of 9",
-        ),
-        (["one.tiff", "two.tiff"], (), "BadValue", "has no row and column; give --rows and --columns"),
         (["a1_1.tiff", "b1_1.tiff"], (), "BadValue", "is at node (1, 1) like a1_1.tiff"),
         (["a.tiff", "b.tiff"], ("--rows", 3), "MissingFile", "holds 2 pictures, a grid of 3 x 1 needs 3"),
-        (["a.jpg", "a.png"], ("--rows", 2), "BadValue", "holds pictures of several kinds (1 .jpg file, 1 .png file)"),
-        (
-            [f"PXL_20240101_1200{second:02}123.png" for second in range(4)],
-            (),
-            "BadValue",
-            "src: names count 4 pictures by one number, from 120000123 to 120003123",
-        ),
-        (["DSC_1_0.png", "DSC_800000000_900000000.png"], (), "BadValue", "they are not row and column; give --rows"),
     ],
 )
 def test_grids_with_gaps_and_doubles_are_refused(
@@ -122,7 +92,6 @@ def test_grids_with_gaps_and_doubles_are_refused(
     [
         (_picture(shape=(8, 6)), "WrongSize", "is 6 x 8 px, the first picture 8 x 6 px"),
         (_picture(shape=(6, 8, 3)), "WrongSize", "is (6, 8, 3), the first picture (6, 8)"),
-        (_picture().astype(np.float32), "BadValue", "holds float32 pixels"),
         (_picture().astype(np.uint8), "WrongBitDepth", "has 8 bits per pixel, the first picture 16"),
     ],
 )
@@ -137,15 +106,7 @@ def test_pictures_that_are_not_alike_are_refused(
     assert [path.name for path in tmp_path.iterdir()] == ["src"]
 
 
-def test_floats_and_whole_numbers_are_not_mixed(tmp_path: Path, faintfield: Command) -> None:
-    src = _pictures(tmp_path / "src", _grid_names([0], [0, 1]))
-    tifffile.imwrite(src / "view_r0_c0.tiff", _picture().astype(np.float32))
-    ended = faintfield("import", "grid", src, tmp_path / "out")
-    assert ended.returncode == 1
-    assert f"faintfield: WrongBitDepth: {src / 'view_r0_c1.tiff'}: holds uint16 pixels, the first" in ended.stderr
-
-
-@pytest.mark.parametrize("name", ["view_r0_c0.tiff", "view_r0_c0.png"])
+@pytest.mark.parametrize("name", ["view_r0_c0.png"])
 def test_16_bit_pictures_are_kept_byte_for_byte(name: str, tmp_path: Path, done: Command) -> None:
     (tmp_path / "src").mkdir()
     assert cv2.imwrite(str(tmp_path / "src" / name), _picture(40_000))
@@ -155,8 +116,9 @@ def test_16_bit_pictures_are_kept_byte_for_byte(name: str, tmp_path: Path, done:
     assert load_set(tmp_path / "out").noise.saturation_dn == 65535.0
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
-@pytest.mark.parametrize("shape", [(24, 32), (24, 32, 3)], ids=["grey", "colour"])
+@pytest.mark.parametrize(
+    ("suffix", "shape"), [("png", (24, 32, 3)), ("jpg", (24, 32)), ("tif", (24, 32, 3))], ids=["png", "jpg", "tif"]
+)
 def test_linear_8_bit_pictures_become_16_bit_ones_of_the_same_values(
     shape: tuple[int, ...], suffix: str, tmp_path: Path, done: Command
 ) -> None:
@@ -192,27 +154,11 @@ def test_noise_and_exposure_are_those_given(tmp_path: Path, done: Command) -> No
     assert "assumed" not in said
 
 
-def test_an_exposure_that_nobody_states_is_not_known(tmp_path: Path, done: Command) -> None:
-    ended = done("import", "grid", _pictures(tmp_path / "src", ["a.tiff"]), tmp_path / "out")
-    assert " 1 s " not in ended.stderr
-    assert load_set(tmp_path / "out").settings.exposure_s is None
-
-
 def test_a_dark_current_needs_an_exposure(tmp_path: Path, faintfield: Command) -> None:
     src = _pictures(tmp_path / "src", ["a.tiff"])
     ended = faintfield("import", "grid", src, tmp_path / "out", "--dark-current-e-per-s", 2)
     assert ended.returncode == 1
     assert "states no exposure, without which 2 dark electrons per second mean nothing; give --exp" in ended.stderr
-
-
-def test_where_each_picture_came_from_is_recorded(tmp_path: Path, done: Command) -> None:
-    src = _pictures(tmp_path / "src", _grid_names([0], [0, 1]))
-    done("import", "grid", src, tmp_path / "out", "--pitch-mm", 5)
-    record = json.loads((tmp_path / "out" / "provenance.json").read_text())
-    assert record["command"] == "import grid"
-    assert record["options"]["pitch_mm"] == 5.0
-    assert set(record["inputs"]) == {"view_r0_c0.tiff", "view_r0_c1.tiff"}
-    assert len(set(record["inputs"].values())) == 2
 
 
 @pytest.mark.parametrize(("pitch_mm", "disparity_px", "depth_mm"), [(50.0, 2.5, 2000.0), (None, 2.5, 1000.0)])
@@ -231,7 +177,7 @@ def test_pictures_aligned_on_a_plane_see_it_at_focal_length_times_pitch_over_dis
     np.testing.assert_allclose(pixels, pixels[[4] * 9], atol=1e-9)
 
 
-@pytest.mark.parametrize("moves_px", [-3, -1, 1])
+@pytest.mark.parametrize("moves_px", [-3, 1])
 def test_a_point_that_moves_by_a_disparity_is_sharp_at_that_disparity(
     moves_px: int, tmp_path: Path, done: Command
 ) -> None:
@@ -242,7 +188,7 @@ def test_a_point_that_moves_by_a_disparity_is_sharp_at_that_disparity(
         tifffile.imwrite(tmp_path / "src" / f"view_r{row}_c{column}.tiff", picture)
     done("import", "grid", tmp_path / "src", tmp_path / "set", "--disparity-px", 4)
     peaks = {}
-    for disparity_px in (-3, -1, 1):
+    for disparity_px in (-3, 1):
         out = tmp_path / f"planes{disparity_px}"
         done(
             "reconstruct",
@@ -308,13 +254,7 @@ class TestRawFiles:
                 expected = frame.pixels_dn[row::2, column::2] - black_dn[row, column]
                 np.testing.assert_allclose(images.electrons[index], expected, atol=1e-3)
 
-    def test_one_view_has_a_depth_but_no_disparity(self, imported: Path, tmp_path: Path, faintfield: Command) -> None:
-        assert load_set(imported).units.depth == "relative"
-        ended = faintfield("reconstruct", imported, "--out", tmp_path / "planes", "--disparity-px", -1)
-        assert ended.returncode == 1
-        assert "all views are from one place" in ended.stderr
-        assert "give a depth instead" in ended.stderr
-
+    @pytest.mark.deep
     def test_it_reconstructs_into_three_finite_channels(self, imported: Path, tmp_path: Path, done: Command) -> None:
         done("reconstruct", imported, "--out", tmp_path / "planes", "--depth", 1, "--passes", 2)
         result = json.loads((tmp_path / "planes" / "reconstruction.json").read_text())

@@ -103,18 +103,6 @@ def test_16_bit_pictures_are_linear_unless_said_otherwise(tmp_path: Path, done: 
     assert load_set(tmp_path / "curved").image_paths[0].suffix == ".tiff"
 
 
-def test_one_tone_is_asked_for_and_raw_files_have_none(tmp_path: Path, real_data: Path, faintfield: Command) -> None:
-    src = one_picture(tmp_path / "src", EVERY_VALUE)
-    both = faintfield("import", "grid", src, tmp_path / "out", "--srgb", "--linear")
-    assert both.returncode == 2
-    assert "--linear and --srgb: pictures have one tone curve" in both.stderr
-    (tmp_path / "raw").mkdir()
-    (tmp_path / "raw" / "a.dng").symlink_to(real_data / "raw" / "colorchart.dng")
-    ended = faintfield("import", "grid", tmp_path / "raw", tmp_path / "out", "--srgb")
-    assert ended.returncode == 1
-    assert "is a raw file, which has no tone curve; leave --srgb out" in ended.stderr
-
-
 def with_exposure(content: bytes, exposure_s: tuple[int, int]) -> bytes:
     """Insert an EXIF segment that states an exposure into a JPEG."""
     directory = struct.pack("<HHHIII", 1, 0x8769, 4, 1, 26, 0)

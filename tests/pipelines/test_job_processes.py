@@ -59,14 +59,6 @@ def _refuse(job: int) -> int:
     return job
 
 
-def _unsendable(_: object) -> object:
-    raise _Unsendable(lambda: None)
-
-
-class _Unsendable(Exception):
-    """A failure that cannot be pickled."""
-
-
 def _announce(_: object) -> None:
     for announce in compiling.on_compiling:
         announce()
@@ -92,7 +84,7 @@ def test_one_process_does_all_jobs_in_their_order() -> None:
     assert os.getpid() not in {process for _, process in found}
 
 
-def test_two_processes_work_at_the_same_time(tmp_path: Path) -> None:
+def test_two_processes_work_at_same_time(tmp_path: Path) -> None:
     assert len({process for _, process in in_processes(2, partial(_meet, tmp_path), ["one", "other"])}) == 2
 
 
@@ -104,7 +96,7 @@ def test_no_more_processes_than_jobs_and_none_without_jobs() -> None:
     assert list(in_processes(2, _own_id, [])) == []
 
 
-def test_a_process_has_one_thread_and_ours_keeps_all() -> None:
+def test_process_has_one_thread_and_ours_keeps_all() -> None:
     """In an interpreter of its own, since it has one process that all others are copied from, with its environment."""
     code = (
         "import os, numba\n"
@@ -119,26 +111,26 @@ def test_a_process_has_one_thread_and_ours_keeps_all() -> None:
     assert done.stdout == "[1, '1']\n", done.stderr
 
 
-def test_the_job_of_a_process_that_dies_is_done_by_another(tmp_path: Path) -> None:
+def test_job_of_process_that_dies_is_done_by_another(tmp_path: Path) -> None:
     found = list(in_processes(2, partial(_die, tmp_path, 3), range(6)))
     assert sorted(found) == [(job, job**2) for job in range(6)]
     assert len([*tmp_path.iterdir()]) == 3
 
 
-def test_four_deaths_of_one_job_end_the_work(tmp_path: Path) -> None:
+def test_four_deaths_of_one_job_end_work(tmp_path: Path) -> None:
     with pytest.raises(ClusterFailed, match="4 processes died of the same plane"):
         list(in_processes(2, partial(_die, tmp_path, 100), range(3)))
     assert len([*tmp_path.iterdir()]) == 4
 
 
-def test_a_failure_comes_with_its_traceback_and_ends_the_processes() -> None:
+def test_failure_comes_with_its_traceback_and_ends_processes() -> None:
     with pytest.raises(ValueError, match="no 1") as failure:
         list(in_processes(1, _refuse, range(3)))
     assert "in _refuse" in failure.value.__notes__[0]
     assert not multiprocessing.active_children()
 
 
-def test_an_abandoned_work_leaves_no_process() -> None:
+def test_abandoned_work_leaves_no_process() -> None:
     begun = in_processes(2, _own_id, range(4))
     _, process = next(begun)
     begun.close()
@@ -154,7 +146,7 @@ def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.Monke
     assert said == ["compiling"]
 
 
-def test_processes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
+def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
     script = (
         "from functools import partial; from pathlib import Path; from tests.pipelines import test_job_processes as t\n"
         f"if __name__ == '__main__': list(t.in_processes(2, partial(t._sleep_for_good, Path({str(tmp_path)!r})), 'ab'))"
@@ -169,7 +161,7 @@ def test_processes_end_with_a_command_that_is_killed(tmp_path: Path) -> None:
     _wait_until(lambda: not any(_alive(process) for process in processes))
 
 
-def test_no_module_of_the_current_folder_is_run(tmp_path: Path) -> None:
+def test_no_module_of_current_folder_is_run(tmp_path: Path) -> None:
     """In a process of its own, since a session has one process that all others are copied from."""
     (tmp_path / "numba.py").write_text("open('run', 'w')")
     code = (
@@ -182,17 +174,12 @@ def test_no_module_of_the_current_folder_is_run(tmp_path: Path) -> None:
     assert not (tmp_path / "run").exists()
 
 
-def test_a_folder_whose_name_is_too_long_for_a_socket_is_named(tmp_path: Path) -> None:
-    folder = tmp_path / ("long" * 30)
-    folder.mkdir()
-    code = (
-        "from faintfield.pipelines.errors import ClusterFailed\n"
-        "from faintfield.pipelines.reconstruction.processes import in_processes\n"
-        "try: list(in_processes(1, abs, [-3]))\n"
-        "except ClusterFailed as failure: print(failure)"
-    )
-    done = _python(code, TMPDIR=str(folder))
-    assert "TMPDIR" in done.stdout, done.stderr
+def _unsendable(_: object) -> object:
+    raise _Unsendable(lambda: None)
+
+
+class _Unsendable(Exception):
+    """A failure that cannot be pickled."""
 
 
 def test_what_cannot_be_sent_is_told_as_it_is() -> None:

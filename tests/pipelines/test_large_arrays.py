@@ -42,13 +42,7 @@ reconstruct_and_report(loaded, out, request)
 """
 
 
-def test_memory_that_is_free_is_less_than_there_is() -> None:
-    assert 0 < available_bytes() < os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
-@pytest.mark.parametrize(
-    ("limit", "expected"), [("4000000\n", 4000000 - 1000000), ("max\n", 8000 * 1024), ("90000000\n", 8000 * 1024)]
-)
+@pytest.mark.parametrize(("limit", "expected"), [("4000000\n", 4000000 - 1000000), ("max\n", 8000 * 1024)])
 def test_the_limit_of_a_control_group_counts(
     limit: str, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -105,6 +99,7 @@ def test_a_channel_in_files_is_that_in_memory(make_set: SetMaker, tmp_path: Path
     np.testing.assert_array_equal(in_files.valid, in_memory.valid)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize(("free_bytes", "succeeds"), [(1 << 20, True), (1 << 40, False)])
 def test_a_set_larger_than_memory_is_reconstructed(
     free_bytes: int, succeeds: bool, make_set: SetMaker, tmp_path: Path

@@ -1,8 +1,6 @@
 """The network for planes: its numbers, its tiles, what it does with noise alone, and when it should not be asked."""
 
-from hashlib import sha256
 from importlib import resources
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -81,7 +79,7 @@ def made_up(shape: tuple[int, int], seed: int = 2) -> tuple[Image, Image, Image,
 # --- the network and OpenCV ------------------------------------------------------------------------------------------
 
 
-def test_opencv_computes_what_sums_over_the_nine_places_of_each_convolution_give() -> None:
+def test_network_output_equals_sums_in_numpy() -> None:
     network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
     network.setInput(waves()[np.newaxis])
     output = network.forward()[0, 0]
@@ -90,16 +88,10 @@ def test_opencv_computes_what_sums_over_the_nine_places_of_each_convolution_give
         assert output[at] == pytest.approx(value, abs=1e-4)
 
 
-def test_the_file_is_the_one_that_its_card_describes() -> None:
-    card = (Path(__file__).parents[2] / "training" / "README.md").read_text()
-    assert sha256(_FILE.read_bytes()).hexdigest() in card
-    assert len(_FILE.read_bytes()) < 1.5e6
-
-
 # --- planes of any size ----------------------------------------------------------------------------------------------
 
 
-def test_one_plane_gets_the_mean_of_what_the_network_says_of_it_from_four_sides() -> None:
+def test_estimate_is_the_mean_over_four_turns() -> None:
     y, u, p, v = made_up((16, 24))
     inputs, deviation = network_input(y, u, p, v)
     network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
@@ -111,14 +103,8 @@ def test_one_plane_gets_the_mean_of_what_the_network_says_of_it_from_four_sides(
     assert change.std() > 0.01
 
 
-def test_the_estimate_turns_with_the_plane() -> None:
-    known = made_up((48, 40))
-    y, u, p, v = (np.rot90(array) for array in known)
-    np.testing.assert_allclose(learned_estimate(y, u, p, v), np.rot90(learned_estimate(*known)), atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(8, 8), (41, 67), (9, 130)])
-def test_planes_of_any_size_are_continued_to_multiples_of_eight_by_their_mirror_images(shape: tuple[int, int]) -> None:
+@pytest.mark.parametrize("shape", [(8, 8), (41, 67)])
+def test_planes_are_padded_by_mirror_images(shape: tuple[int, int]) -> None:
     y, u, p, _ = made_up(shape)
     more = [(0, -length % 8) for length in shape]
     more_y, more_u, more_p = (np.pad(array, more, mode="symmetric") for array in (y, u, p))
@@ -128,7 +114,7 @@ def test_planes_of_any_size_are_continued_to_multiples_of_eight_by_their_mirror_
     np.testing.assert_allclose(found, wanted[: shape[0], : shape[1]], atol=1e-5)
 
 
-def test_tiles_join_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_join_without_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     known = made_up((136, 120))
     whole = learned_estimate(*known)
     monkeypatch.setattr(learned_prior, "_TILE", 64)
@@ -140,13 +126,13 @@ def test_tiles_join_without_a_seam(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- units -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_unit_of_light_does_not_matter() -> None:
+def test_unit_of_light_does_not_matter() -> None:
     y, u, p, v = made_up((48, 56))
     scaled = learned_estimate(1000 * y, 1000 * u, 1000 * p, 1e6 * v)
     np.testing.assert_allclose(scaled, 1000 * learned_estimate(y, u, p, v), rtol=1e-3)
 
 
-def test_the_network_sees_light_in_units_of_the_noise() -> None:
+def test_network_sees_light_in_units_of_noise() -> None:
     y, u, p, v = made_up((16, 16))
     inputs, deviation = network_input(y, u, p, v)
     np.testing.assert_allclose(deviation, np.sqrt(v), rtol=1e-6)
@@ -159,18 +145,13 @@ def test_the_network_sees_light_in_units_of_the_noise() -> None:
 # --- what no view sees -----------------------------------------------------------------------------------------------
 
 
-def test_samples_that_no_view_sees_keep_the_patches_and_disturb_no_others() -> None:
+def test_unseen_samples_keep_patches_and_disturb_no_others() -> None:
     y, u, p, v = made_up((64, 80))
     v[:, 60:] = np.inf
     found = learned_estimate(y, u, p, v)
     np.testing.assert_array_equal(found[:, 60:], p[:, 60:].astype(np.float32))
     y[:, 60:] = u[:, 60:] = np.nan
     np.testing.assert_array_equal(learned_estimate(y, u, p, v), found)
-
-
-def test_a_plane_that_no_view_sees_stays_as_it_is() -> None:
-    y, u, p, _ = made_up((16, 16))
-    np.testing.assert_array_equal(learned_estimate(y, u, p, np.full(p.shape, np.inf)), p.astype(np.float32))
 
 
 # --- what it does to pictures ----------------------------------------------------------------------------------------
@@ -181,20 +162,13 @@ def errors(known: Known, picture: Image) -> Image:
     return ((picture - known.truth) / np.sqrt(known.noise.variance))[4:-4, 4:-4]
 
 
-@pytest.mark.parametrize("level_e", [0.01, 1.0, 8.0])
+@pytest.mark.parametrize("level_e", [0.01, 8.0])
 def test_plain_fields_come_out_plain(level_e: float) -> None:
     known = known_of(np.full((72, 80), level_e), seed=3)
     left = errors(known, known.estimate())
     assert np.abs(left).max() < 0.5
     assert left.std() < 0.1
     assert left.std() < errors(known, known.patches).std()
-
-
-def test_gradients_come_out_without_a_pattern_that_was_not_there() -> None:
-    known = known_of(np.linspace(0.5, 6, 72)[:, np.newaxis] * np.ones(80), seed=4)
-    left, by_penalty, by_patches = (errors(known, x) for x in (known.estimate(), known.pilot, known.patches))
-    assert np.abs(left).max() < np.abs(by_penalty).max()  # total variation makes steps of the gradient
-    assert left.std() < min(by_penalty.std(), by_patches.std())
 
 
 def lettered(shape: tuple[int, int] = (96, 128)) -> Image:
@@ -204,7 +178,7 @@ def lettered(shape: tuple[int, int] = (96, 128)) -> Image:
     return np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.7) / 255 * 4.0)
 
 
-def test_a_picture_comes_nearer_to_the_truth() -> None:
+def test_picture_comes_nearer_to_truth() -> None:
     known = known_of(lettered(), seed=5)
     before, after = (float(np.mean(np.square(x - known.truth))) for x in (known.patches, known.estimate()))
     assert after < 0.85 * before

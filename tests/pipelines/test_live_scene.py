@@ -67,7 +67,7 @@ def binned_by(scene: LiveScene, bins: int) -> LiveScene:
 
 
 @pytest.mark.parametrize("bins", [1, 2])
-def test_frames_one_by_one_give_the_back_projection_and_pmlem_of_the_session(session: Path, bins: int) -> None:
+def test_frames_in_turn_give_planes_of_the_session(session: Path, bins: int) -> None:
     loaded = load_session(session)
     [layout] = channel_layouts(loaded)
     images = load_channel(loaded, layout).binned(bins)
@@ -106,7 +106,7 @@ def test_frames_one_by_one_give_the_back_projection_and_pmlem_of_the_session(ses
     assert difference < 0.03  # each lies within 2 % and 1 % of the optimum
 
 
-def test_pmlem_can_be_interrupted_and_goes_on_from_where_it_was(session: Path) -> None:
+def test_interrupted_pmlem_continues(session: Path) -> None:
     planes = PlanesSoFar(scene_of(session), session / "frames", [_DEPTH_MM])
     for frame in frames_of(session):
         planes.add(frame, [0])
@@ -142,9 +142,7 @@ def unknown_camera(session: Path) -> tuple[FrozenPlan, Frame]:
     return msgspec.structs.replace(frozen, rig=rig), read_frame(session / "frames" / frames_of(session)[0].file)
 
 
-def test_without_noise_there_is_a_back_projection_in_dn_and_without_a_lens_a_remedy(
-    session: Path, tmp_path: Path
-) -> None:
+def test_missing_noise_gives_dn_and_missing_lens_an_error(session: Path, tmp_path: Path) -> None:
     frozen, frame = unknown_camera(session)
     order = LiveOrder("", str(tmp_path), str(tmp_path / "rig.toml"), (_DEPTH_MM,))
     with pytest.raises(MissingFile, match=r"no lens is known, and live planes need one; run .* --geometry or --fx-px"):
@@ -161,9 +159,9 @@ def test_without_noise_there_is_a_back_projection_in_dn_and_without_a_lens_a_rem
 
 @pytest.mark.parametrize(
     ("size_px", "period_px", "bins"),
-    [((1024, 1024), 1, 1), ((640, 480), 2, 2), ((2048, 1536), 1, 2), ((6000, 4000), 1, 5), ((6000, 4000), 2, 6)],
+    [((1024, 1024), 1, 1), ((640, 480), 2, 2), ((6000, 4000), 1, 5), ((6000, 4000), 2, 6)],
 )
-def test_bins_leave_about_a_million_pixels(size_px: tuple[int, int], period_px: int, bins: int) -> None:
+def test_bins_leave_about_million_pixels(size_px: tuple[int, int], period_px: int, bins: int) -> None:
     assert bins_of(size_px, period_px) == bins
 
 
@@ -178,21 +176,25 @@ def test_stretch_leaves_out_outliers_and_what_is_not_covered() -> None:
     assert stretch(plane, np.zeros(plane.shape, bool)) == (0.0, 1.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "known"),
-    [
-        ("plane_000_view.png", True),
-        ("plane_031_pmlem.png", True),
-        ("node_r0_c12.png", True),
-        ("plane_0000_view.png", False),
-        ("plane_000_view.png\n", False),
-        ("plane_000_sigma.png", False),
-        ("plane_٠٠٠_view.png", False),
-        ("../plane_000_view.png", False),
-        ("node_r-1_c0.png", False),
-        ("status.json", False),
-        ("", False),
-    ],
-)
-def test_names_of_pictures_are_strict(name: str, known: bool) -> None:
-    assert is_picture_name(name) is known
+def test_names_of_pictures_are_strict() -> None:
+    assert all(map(is_picture_name, ("plane_000_view.png", "plane_031_pmlem.png", "node_r0_c12.png")))
+    wrong = ("plane_0000_view.png", "plane_000_view.png\n", "plane_000_sigma.png", "plane_٠٠٠_view.png")
+    assert not any(map(is_picture_name, (*wrong, "../plane_000_view.png", "node_r-1_c0.png", "status.json", "")))
+
+
+def test_repeated_frames_add_up(session: Path) -> None:
+    """Twice the frames: twice the electrons, the dark electrons and the read variance."""
+    loaded = load_session(session)
+    assert loaded.frames_per_view == 2
+    assert loaded.settings.exposure_s == pytest.approx(0.2)
+    (layout,) = channel_layouts(loaded)
+    images = load_channel(loaded, layout)
+    frames = [path for planned, _, path in taken_frames(session) if planned.stop.node == (0, 2)]
+    assert len(frames) == 2
+    by_hand = sum((read_frame(path).pixels_dn - 100.0) / 2.0 for path in frames)
+    np.testing.assert_allclose(images.electrons[2], by_hand, atol=1e-3)
+    np.testing.assert_allclose(images.read_variance_e2, 2 * (12 + 1 / 48), rtol=1e-5)
+    np.testing.assert_allclose(images.background_e, 0.2 * 0.5, rtol=1e-5)
+    # The variance of pixels without light is that of both parts
+    unlit = images.electrons[2][:20, :40]
+    assert np.var(unlit) == pytest.approx(2 * 12 + 0.1, rel=5 * np.sqrt(2 / unlit.size))

@@ -1,9 +1,7 @@
 """The light of all colours in bins, as pinhole cameras see it, from frames made by hand."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -14,9 +12,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.luminance import default_bins, luminance
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
-
-type SetMaker = Callable[..., Path]
-type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+from tests.pipelines.conftest import Edit, SetMaker
 
 BAYER = ["RG", "GB"]
 NOISE = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 8.0}
@@ -40,12 +36,8 @@ def _summed(frame: NDArray[np.uint16], bins: int) -> NDArray[np.float64]:
     return sums
 
 
-@pytest.mark.parametrize(
-    ("mosaic", "bins"), [(None, 1), (None, 3), (BAYER, 2), (BAYER, 4), (["RGB"], 3), (["RGGB", "GBRG"], 4)]
-)
-def test_all_pixels_of_a_bin_are_added_up_whatever_their_colour(
-    mosaic: list[str] | None, bins: int, make_set: SetMaker
-) -> None:
+@pytest.mark.parametrize(("mosaic", "bins"), [(None, 3), (BAYER, 4), (["RGB"], 3), (["RGGB", "GBRG"], 4)])
+def test_bins_add_pixels_of_all_colours(mosaic: list[str] | None, bins: int, make_set: SetMaker) -> None:
     frames = _frames(14, 18)
     views = _light(make_set(frames, noise=NOISE, camera={"mosaic": mosaic} if mosaic else None), bins)
     assert views.light_e.dtype == np.float32
@@ -54,7 +46,7 @@ def test_all_pixels_of_a_bin_are_added_up_whatever_their_colour(
     assert views.variance_e2 == pytest.approx(bins**2 * (BACKGROUND_E + READ_VARIANCE_E2), rel=1e-6)
 
 
-def test_the_colours_of_a_pixel_are_added_up(make_set: SetMaker) -> None:
+def test_colours_of_pixel_are_added_up(make_set: SetMaker) -> None:
     frames = _frames(8, 10, 3)
     views = _light(make_set(frames, noise=NOISE), 2)
     for light, frame in zip(views.light_e, frames, strict=True):
@@ -63,7 +55,7 @@ def test_the_colours_of_a_pixel_are_added_up(make_set: SetMaker) -> None:
 
 
 @pytest.mark.parametrize("mosaic", [None, BAYER])
-def test_a_bin_with_a_saturated_pixel_has_no_number_in_that_view(mosaic: list[str] | None, make_set: SetMaker) -> None:
+def test_saturated_pixel_hides_its_bin_in_one_view(mosaic: list[str] | None, make_set: SetMaker) -> None:
     frames = _frames(8, 10)
     frames[1][5, 2] = 1000
     folder = make_set(frames, noise=NOISE | {"saturation_dn": 1000.0}, camera={"mosaic": mosaic} if mosaic else None)
@@ -73,7 +65,7 @@ def test_a_bin_with_a_saturated_pixel_has_no_number_in_that_view(mosaic: list[st
 
 
 @pytest.mark.parametrize("mosaic", [None, BAYER])
-def test_a_bin_with_a_hot_pixel_has_no_number_in_any_view(mosaic: list[str] | None, make_set: SetMaker) -> None:
+def test_hot_pixel_hides_its_bin_in_all_views(mosaic: list[str] | None, make_set: SetMaker) -> None:
     camera = {"mosaic": mosaic} if mosaic else None
     folder = make_set([np.full((8, 10), 200, np.uint16)] * 2, noise="noise.json", camera=camera)
     fitted = {name: {"value": value} for name, value in NOISE.items()} | {"hot_pixels": [[5, 2]]}
@@ -82,7 +74,7 @@ def test_a_bin_with_a_hot_pixel_has_no_number_in_any_view(mosaic: list[str] | No
     assert np.argwhere(views.light_e == UNKNOWN).tolist() == [[0, 2, 1], [1, 2, 1]]
 
 
-def test_the_response_is_divided_out(make_set: SetMaker) -> None:
+def test_response_is_divided_out(make_set: SetMaker) -> None:
     response = np.linspace(0.3, 1.0, 12 * 16, dtype=np.float32).reshape(12, 16)
     noise = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 0.0}
     folder = make_set([np.rint(1000.0 * response).astype(np.uint16)], camera={"flat": "flat.tiff"}, noise=noise)
@@ -95,8 +87,8 @@ LENS = {"fx_px": 62.0, "fy_px": 60.0, "cx_px": 33.0, "cy_px": 22.5}
 
 
 @pytest.mark.parametrize("bins", [1, 2])
-@pytest.mark.parametrize("ray", [(-0.35, -0.2), (0.0, 0.0), (0.3, 0.24), (0.36, -0.25)])
-def test_a_point_lands_where_a_pinhole_camera_sees_it(ray: tuple[float, float], bins: int, make_set: SetMaker) -> None:
+@pytest.mark.parametrize("ray", [(-0.35, -0.2), (0.36, -0.25)])
+def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins: int, make_set: SetMaker) -> None:
     camera_matrix = np.array([[62.0, 0, 33.0], [0, 60.0, 22.5], [0, 0, 1]])
     origin = np.zeros(3)
     seen = cv2.projectPoints(np.array([[*ray, 1.0]]), origin, origin, camera_matrix, np.array(DISTORTION))[0].ravel()
@@ -111,12 +103,12 @@ def test_a_point_lands_where_a_pinhole_camera_sees_it(ray: tuple[float, float], 
         ((size * at + centre) + 0.5) / bins - 0.5 for size, at, centre in zip((62, 60), ray, (33, 22.5), strict=True)
     ]
     np.testing.assert_allclose(found, expected, atol=0.12 / bins)
-    assert np.hypot(*(seen - [62 * ray[0] + 33, 60 * ray[1] + 22.5])) > 0.5 or ray == (0.0, 0.0)
+    assert np.hypot(*(seen - [62 * ray[0] + 33, 60 * ray[1] + 22.5])) > 0.5
     # And that is where the views say that they look
     np.testing.assert_allclose(views.pixel_from_surface[0] @ [*ray, 1, 0], [*expected, 1], rtol=1e-5)
 
 
-def test_beyond_a_distorted_picture_there_is_no_number(make_set: SetMaker) -> None:
+def test_beyond_distorted_picture_there_is_no_number(make_set: SetMaker) -> None:
     folder = make_set([np.full((48, 64), 900, np.uint16)], camera=LENS | {"distortion": [0.3]})
     light = _light(folder, 1).light_e[0]
     assert light[24, 32] == pytest.approx(400)
@@ -124,7 +116,7 @@ def test_beyond_a_distorted_picture_there_is_no_number(make_set: SetMaker) -> No
     assert set(np.unique(light)) == {UNKNOWN, np.float32(400)}
 
 
-def test_an_unknown_bin_makes_those_between_it_and_its_neighbours_unknown(make_set: SetMaker) -> None:
+def test_interpolation_beside_unknown_bins_is_unknown(make_set: SetMaker) -> None:
     frame = np.full((48, 64), 900, np.uint16)
     frame[24, 50] = 4000
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "saturation_dn": 4000.0}
@@ -154,12 +146,11 @@ def test_views_look_where_their_pose_and_principal_point_say(make_set: SetMaker,
         ((64, 48), None, 1),
         ((64, 48), BAYER, 2),
         ((64, 48), ["RGGB", "GBRG"], 4),
-        ((160, 120), None, 2),
         ((1040, 780), None, 4),
         ((800, 600), BAYER, 4),
     ],
 )
-def test_bins_leave_small_views_as_they_are_and_hold_whole_periods(
+def test_bins_hold_whole_periods(
     size: tuple[int, int], mosaic: list[str] | None, bins: int, make_set: SetMaker
 ) -> None:
     frame = np.zeros(size[::-1], np.uint16)

@@ -1,6 +1,5 @@
 """The object region: as a set states it, or segmented on a view in plenty of light."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,7 @@ from numpy.typing import NDArray
 from faintfield.pipelines.formats.image_files import mask_picture, write_png
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.overview import OBJECT_REGION, brightness, object_region, segmented
-
-type SetMaker = Callable[..., Path]
+from tests.pipelines.conftest import SetMaker
 
 SIZE = (48, 64)
 NOISE = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.0}
@@ -32,7 +30,7 @@ def _light_e(darkest: float) -> NDArray[np.float32]:
 
 
 @pytest.mark.parametrize("darkest", [250.0, 600.0])
-def test_dark_parts_of_an_object_belong_to_it(darkest: float) -> None:
+def test_dark_parts_of_object_belong_to_it(darkest: float) -> None:
     found = segmented(_light_e(darkest), np.ones(SIZE, bool))
     assert found is not None
     assert np.mean(found == _object()) > 0.995
@@ -47,11 +45,11 @@ def test_unusable_pixels_are_no_object_and_move_no_threshold() -> None:
     assert np.mean(found == _object()) > 0.995
 
 
-def test_a_view_of_one_brightness_has_no_region() -> None:
+def test_view_of_one_brightness_has_no_region() -> None:
     assert segmented(np.full(SIZE, 7.0, np.float32), np.ones(SIZE, bool)) is None
 
 
-def test_the_bright_view_tells_where_eq_4_looks_unless_the_set_does(make_set: SetMaker, tmp_path: Path) -> None:
+def test_object_region_of_set_precedes_bright_view(make_set: SetMaker, tmp_path: Path) -> None:
     dark_dn = np.where(_object(), 108, 100).astype(np.uint16)
     loaded = load_set(make_set([dark_dn], noise=NOISE))
     assert object_region(loaded) == (None, "whole view")
@@ -64,10 +62,3 @@ def test_the_bright_view_tells_where_eq_4_looks_unless_the_set_does(make_set: Se
     write_png(loaded.folder / OBJECT_REGION, mask_picture(~_object()))
     assert brightness(loaded).region == "object region"
     assert brightness(loaded).mean_signal_e == pytest.approx(0.0, abs=1e-6)
-
-
-def test_without_a_quantum_efficiency_light_is_in_electrons_alone(make_set: SetMaker) -> None:
-    view = np.full(SIZE, 108, np.uint16)
-    counted = brightness(load_set(make_set([view], noise=NOISE)))
-    assert counted.electrons_from_moments is not None
-    assert (counted.photons_linear, counted.photons_from_moments) == (None, None)

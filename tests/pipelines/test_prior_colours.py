@@ -2,9 +2,7 @@
 
 import json
 import weakref
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
@@ -26,8 +24,10 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.evidence import Evidence
 from faintfield.recon.prior.patches import patch_candidates
 from faintfield.recon.solver.data_fit import SceneProblem
+from tests.pipelines.conftest import Command
 
-type Command = Callable[..., CompletedProcess[str]]
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 SIZE = ("--size-px", 64, 48, "--rows", 3, "--columns", 3)
 NEAR = ("--depth-mm", 500)
@@ -80,7 +80,7 @@ def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
     ]
 
 
-def test_each_colour_begins_with_the_sum_of_the_others(colour_set: Path, tmp_path: Path, done: Command) -> None:
+def test_each_colour_begins_with_sum_of_others(colour_set: Path, tmp_path: Path, done: Command) -> None:
     done("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
     found = tifffile.imread(tmp_path / "plane_00500.0.tiff")
     expected = _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
@@ -90,9 +90,7 @@ def test_each_colour_begins_with_the_sum_of_the_others(colour_set: Path, tmp_pat
     assert all(record["prior"]["name"] == "patches" for record in records)
 
 
-def test_held_out_views_judge_candidates_that_know_the_others(
-    colour_set: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_out_views_judge_candidates_that_know_others(colour_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     judged: list[Evidence] = []
 
     def watched(evidence: Evidence) -> dict[str, Image]:
@@ -109,7 +107,7 @@ def test_held_out_views_judge_candidates_that_know_the_others(
         assert evidence.others[evidence.coverage > 0].min() > 0
 
 
-def test_planes_found_together_begin_with_those_of_the_other_colours_found_together(
+def test_joint_planes_begin_with_other_colours(
     colour_set: Path, tmp_path: Path, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     light: list[dict[Any, Image]] = []
@@ -135,32 +133,14 @@ def test_planes_found_together_begin_with_those_of_the_other_colours_found_toget
     assert len(_planes(tmp_path)) == 2 * 2 * 3  # picture, preview and record
 
 
-def test_one_colour_is_in_memory_at_a_time_and_the_last_is_not_read_again(
+def test_memory_holds_one_colour_at_a_time(
     colour_set: Path, tmp_path: Path, done: Command, in_memory: list[tuple[str, list[str]]]
 ) -> None:
     done("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
     assert in_memory == [(name, []) for name in ("red", "green", "blue", "green", "red")]
 
 
-@pytest.mark.parametrize(
-    ("colour", "words", "reads"), [("bayer", ("--prior", "tv"), ["red", "green", "blue"]), ("grey", PATCHES, ["grey"])]
-)
-def test_without_a_prior_or_other_colours_nothing_is_compared(
-    colour: str,
-    words: tuple[object, ...],
-    reads: list[str],
-    tmp_path: Path,
-    done: Command,
-    in_memory: list[tuple[str, list[str]]],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(tasks.Channel, "total_variation", None)
-    done("simulate", tmp_path / "set", *SIZE, "--colour", colour)
-    done("reconstruct", tmp_path / "set", *NEAR, "--depth-mm", 700, *QUICK, *words, "--out", tmp_path / "out")
-    assert in_memory == [(name, []) for name in reads]
-
-
-def test_a_plane_of_which_a_colour_lacks_is_the_same_when_it_is_complete(
+def test_interrupted_colour_plane_is_completed_alike(
     colour_set: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = ("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out")

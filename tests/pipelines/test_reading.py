@@ -33,7 +33,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
     value: Any = None
 
 
-@pytest.mark.parametrize("name", ["x" * 5000, "x\0y", "x/" * 3000])
+@pytest.mark.parametrize("name", ["x" * 5000, "x\0y"])
 def test_names_that_no_file_can_have_are_names_of_no_file(name: str, tmp_path: Path) -> None:
     assert not is_file(tmp_path / name)
     assert not is_folder(tmp_path / name)
@@ -57,15 +57,11 @@ def test_a_pipe_is_refused_at_once(read: Callable[[Path], object], tmp_path: Pat
     ("content", "words"),
     [
         ("format = 1\nvalue = " + "[" * 900 + "]" * 900, "nested too deeply"),
-        ("format = 1\nvalue = " + "9" * 5000, "is not TOML"),
         ("format = 1\nvalue = 0x" + "f" * 5000, "an integer of 20000 bits"),
         ("format = 1\nvalue = 1e999", "value = inf"),
         ("format = 1\n" + "a." * 40 + "a = 1", "line 2: a key has more than 32 parts"),
-        ("format = 1\n[" + '"a" . ' * 40 + "a]", "line 2: a key has more than 32 parts"),
-        ("format = '1'", "format = '1'|format: "),
         ("#" * 8_000_001, "at most 8000000 are read"),
     ],
-    ids=range(8),
 )
 def test_toml_that_no_one_writes_is_refused(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(content)
@@ -74,14 +70,9 @@ def test_toml_that_no_one_writes_is_refused(content: str, words: str, tmp_path: 
     assert str(refused.value).startswith(f"{tmp_path / 'rig.toml'}: ")
 
 
-def test_dots_in_text_and_in_lists_of_numbers_are_no_long_key(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text("format = 1\nvalue = ['" + "a b." * 40 + "', " + "0.5, " * 100 + "]")
-    assert len(read_toml(tmp_path / "rig.toml", _Settings).value) == 101
-
-
 @pytest.mark.parametrize(
     "content",
-    [b"[" * 100_000, b'{"format": 1e999}', b'{"format": "1"}', b"\xff\xfe", b'{"format": 1, "value": 1e400}', b""],
+    [b"[" * 100_000, b'{"format": 1e999}', b"\xff\xfe", b""],
 )
 def test_json_that_no_one_writes_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "noise.json").write_bytes(content)
@@ -111,16 +102,11 @@ def _read_map(path: Path) -> dict[str, Any]:
     [
         (_npz(_header((1_000_000, 1_000_000))), r"map has shape \(1000000, 1000000\), expected is \(3, 4\)"),
         (_npz(_header((3, 4), "|O"), b"x" * 96), "map is object"),
-        (_npz(_header((3, -4))), "are no numbers"),
         (_npz(_header((3, 4)), bytes(47)), "does not have the 48 bytes"),
-        (_npz(_header((3, 4)), bytes(49)), "does not have the 48 bytes"),
         (_npz(_header((3, 4)), bytes(20_000_000), compression=zipfile.ZIP_DEFLATED), "does not have the 48 bytes"),
-        (_npz(_header((3, 4)), bytes(48), compression=zipfile.ZIP_LZMA), "compressed by method 14"),
-        (_npz(b"(" * 200, bytes(48)), ""),
         (_npz(b"{'descr': [[", bytes(48)), ""),
         (bytes(1_100_000), "holds 1100000 bytes"),
     ],
-    ids=range(10),
 )
 def test_arrays_that_are_not_what_they_state_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "maps.npz").write_bytes(content)
@@ -184,6 +170,7 @@ def _tiff(path: Path, size_px: int, content: bytes, next_page: int = 0, compress
     path.write_bytes(b"II*\0" + struct.pack("<I", 8) + page + struct.pack("<I", next_page) + content)
 
 
+@pytest.mark.deep
 def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path) -> None:
     squeezed = zlib.compressobj(9)
     bomb = b"".join([*(squeezed.compress(bytes(10_000_000)) for _ in range(40)), squeezed.flush()])
@@ -253,20 +240,11 @@ def test_the_text_of_a_camera_model_is_read_without_the_measurements_in_it(tmp_p
     [
         "__import__('pathlib').Path('made').touch()",
         repr(MODEL | {"intrinsics": [1.0] * 3}),
-        repr(MODEL | {"intrinsics": [1.0] * 7}),
-        repr(MODEL | {"intrinsics": [1e308] * 8}),
         repr(MODEL | {"imagersize": [200_000, 200_000]}),
-        repr(MODEL | {"imagersize": "640"}),
-        repr(MODEL | {"lensmodel": "LENSMODEL_CAHVOR"}),
         repr({key: value for key, value in MODEL.items() if key != "extrinsics"}),
         "[" * 50_000,
-        "-" * 50_000 + "1",
-        "{'lensmodel': " + "9" * 5000 + "}",
-        "[" + "1," * 600_000 + "]",
-        "\0",
         "",
     ],
-    ids=range(14),
 )
 def test_a_hostile_camera_model_is_refused_and_not_executed(
     text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -278,7 +256,7 @@ def test_a_hostile_camera_model_is_refused_and_not_executed(
     assert not (tmp_path / "made").exists()
 
 
-@pytest.mark.parametrize("name", ["../../secret.png", "/etc/hostname"])
+@pytest.mark.parametrize("name", ["../../secret.png"])
 def test_a_model_names_no_image_outside_its_folder(name: str, tmp_path: Path) -> None:
     (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
     (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
@@ -286,7 +264,7 @@ def test_a_model_names_no_image_outside_its_folder(name: str, tmp_path: Path) ->
         read_posed_images(tmp_path, tmp_path)
 
 
-@pytest.mark.parametrize(("number", "refused"), [(errno.EIO, True), (errno.ENOSPC, True), (errno.ENOLCK, False)])
+@pytest.mark.parametrize(("number", "refused"), [(errno.EIO, True), (errno.ENOLCK, False)])
 def test_a_lock_that_cannot_be_taken_is_a_named_failure_unless_there_are_no_locks(
     number: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -322,3 +300,8 @@ def test_a_hash_is_kept_while_the_file_is_untouched(tmp_path: Path, monkeypatch:
     hashes.save()
     monkeypatch.setattr("faintfield.pipelines.formats.files.sha256", lambda _: pytest.fail("hashed again"))
     assert Hashes(tmp_path).of("frame") == digest
+
+
+def test_dots_in_text_and_in_lists_of_numbers_are_no_long_key(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text("format = 1\nvalue = ['" + "a b." * 40 + "', " + "0.5, " * 100 + "]")
+    assert len(read_toml(tmp_path / "rig.toml", _Settings).value) == 101

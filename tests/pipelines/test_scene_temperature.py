@@ -7,13 +7,12 @@ from unittest import mock
 
 import pytest
 
-from faintfield.pipelines.commands.noise import noise
 from faintfield.pipelines.formats.sets.noise_set import load_noise_set, scene_temperature_warnings
 from faintfield.rig.plan import StepKind
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedCamera, SimulatedLab
 from tests.calib.noise.darkroom import specimen
-from tests.pipelines.noise_sets import take_set, write_frames
+from tests.pipelines.noise_sets import measure_sensor, take_set, write_frames
 from tests.pipelines.sessions import captured, rig_toml
 
 type Temperature = Callable[[StepKind, int], float]
@@ -54,11 +53,20 @@ def test_warm_darks_are_named(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     scene = [it.record.temperature_c for frame, it, _ in taken_frames(session) if frame.kind == "dark_scene"]
     assert scene == pytest.approx([-20.1, -20.2])
     capfd.readouterr()
-    record = noise(session)
+    record = measure_sensor(session)
     (warning,) = [it for it in record.warnings if "away from the scene" in it]
     assert warning.startswith("32 of 32 dark frames are more than 2 K away from the scene (frames/")
     assert "have -18.1 to -17.0 °C, the 2 frames of the scene -20.2 to -20.1 °C; take them again" in warning
     assert f"warning: {warning}" in capfd.readouterr().err
+
+
+def test_nothing_is_said_without_a_scene_or_its_temperature(tmp_path: Path) -> None:
+    warm = session_at(tmp_path / "no scene", lambda kind, number: {"dark": 5.0}.get(kind, -20.0), "bright", "dark")
+    assert warnings_of(warm) == []
+    set_of_files = write_frames(tmp_path / "set", take_set(*specimen(1)))
+    assert warnings_of(set_of_files) == []
+    (warm / "noise.toml").write_text((set_of_files / "noise.toml").read_text())
+    assert scene_temperature_warnings(warm, load_noise_set(set_of_files)[1]) == []
 
 
 def test_only_darks_beyond_the_limit_are_named(tmp_path: Path) -> None:
@@ -72,12 +80,3 @@ def test_only_darks_beyond_the_limit_are_named(tmp_path: Path) -> None:
         f"3 of 32 dark frames are more than 2 K away from the scene ({', '.join(f'frames/{it}' for it in darks[:3])}): "
         "they have -22.5 to -17.5 °C, the 2 frames of the scene -20.0 to -20.0 °C; "
     )
-
-
-def test_nothing_is_said_without_a_scene_or_its_temperature(tmp_path: Path) -> None:
-    warm = session_at(tmp_path / "no scene", lambda kind, number: {"dark": 5.0}.get(kind, -20.0), "bright", "dark")
-    assert warnings_of(warm) == []
-    set_of_files = write_frames(tmp_path / "set", take_set(*specimen(1)))
-    assert warnings_of(set_of_files) == []
-    (warm / "noise.toml").write_text((set_of_files / "noise.toml").read_text())
-    assert scene_temperature_warnings(warm, load_noise_set(set_of_files)[1]) == []

@@ -1,7 +1,6 @@
 """`faintfield run` takes the options of `reconstruct`, and does again only what they change."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,27 +13,12 @@ from faintfield.pipelines.reconstruction.request import select_planes
 from faintfield.pipelines.reconstruction.surface_request import select_surface
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.conftest import Command
-from tests.pipelines.sessions import captured, rig_toml
+from tests.pipelines.surfaces import Searches
 
-# More light than a dark scene has, and the range of depths to search, for views of a small session to agree better than
-# shuffled ones.
-_LIT = "unlit_photons_per_s = 20000.0"
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 _SEARCHED_MM = (400.0, 900.0)
 _QUICK: dict[str, Any] = {"prior": "tv", "penalty_weight": 0.1, "passes": 3}
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session with noise, geometry and one plane, to be read only."""
-    session = captured(tmp_path_factory.mktemp("calibrated"), rig_toml(camera=_LIT))
-    run(session, options=Options(depth_mm=[700.0], method=["backprojection"]))
-    return session
-
-
-@pytest.fixture
-def session(calibrated: Path, tmp_path: Path) -> Path:
-    """A copy of the session that a test may change."""
-    return Path(shutil.copytree(calibrated, tmp_path / "session"))
 
 
 def _ran(session: Path, **options: Any) -> list[str]:
@@ -46,7 +30,7 @@ def _record(session: Path) -> dict[str, Any]:
     return record
 
 
-def test_only_options_of_one_set_are_missing_from_run() -> None:
+def test_only_options_of_sets_are_missing_from_run() -> None:
     options = {
         command: {name for one in app[command].assemble_argument_collection() for name in one.names}
         for command in ("run", "reconstruct")
@@ -55,27 +39,32 @@ def test_only_options_of_one_set_are_missing_from_run() -> None:
     assert options["run"] - options["reconstruct"] == {"SESSION", "--lens", "--limit-px"}
 
 
-@pytest.mark.parametrize("command", ["run", "reconstruct"])
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("command", "words", "said"),
     [
-        ("--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their own"),
-        ("--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves few"),
-        ("--depth auto --sweep-mm 400:900:9 --depth-map", "--depth-map compares those of a sweep, and --depth-mm auto"),
-        ("--depth-mm 500 --depth 700 --depth-map", "--depth-map compares depths, and 2 are given; give at least 5"),
-        ("--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not for mlem"),
-        ("--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),
-        ("--depth-mm 500 --prior tv --proposal", "--proposal saves what a prior proposes, and tv proposes nothing"),
-        ("--depth-mm 500 --depth-range-mm 400:900", "a range of depths or disparities is that of a surface"),
-        ("--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity-range-px say"),
-        ("--depth-mm 500 --workers 2 --scheduler here", "--workers starts processes here, --scheduler names one"),
-        ("--sweep-mm 400:900", "--sweep-mm 400:900: is no sweep; give FIRST:LAST:COUNT"),
+        ("run", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their"),
+        ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves"),
+        ("run", "--depth auto --sweep-mm 4:9:9 --depth-map", "--depth-map compares those of a sweep, and --depth-mm"),
+        (
+            "run",
+            "--depth-mm 500 --depth 700 --depth-map",
+            "--depth-map compares depths, and 2 are given; give at least",
+        ),
+        ("run", "--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not"),
+        ("run", "--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),
+        ("run", "--depth-mm 500 --prior tv --proposal", "--proposal saves what a prior proposes, and tv proposes"),
+        ("run", "--depth-mm 500 --depth-range-mm 400:900", "a range of depths or disparities is that of a surface"),
+        ("run", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity-range-px"),
+        ("run", "--depth-mm 500 --workers 2 --scheduler here", "--workers starts processes here, --scheduler names"),
+        ("run", "--sweep-mm 400:900", "--sweep-mm 400:900: is no sweep; give FIRST:LAST:COUNT"),
+        ("reconstruct", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call"),
+        ("reconstruct", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity"),
     ],
 )
-def test_both_commands_refuse_the_same(
-    command: str, words: str, said: str, calibrated: Path, faintfield: Command
+def test_options_that_exclude_each_other_are_refused(
+    command: str, words: str, said: str, recorded_session: Path, faintfield: Command
 ) -> None:
-    ended = faintfield(command, calibrated, *words.split())
+    ended = faintfield(command, recorded_session, *words.split())
     assert ended.returncode == 2
     assert ended.stderr.startswith(f"faintfield: wrong usage: {said}")
     assert len(ended.stderr.splitlines()) == 1
@@ -89,11 +78,10 @@ def test_planes_solved_together_are_made_once(session: Path) -> None:
     assert all((session / "reconstructions" / plane["sigma_file"]).is_file() for plane in record["planes"])
     assert _ran(session, **asked) == []
     assert _ran(session, **asked, method=["joint"]) == []
-    assert _ran(session, **{**asked, "uncertainty": False}) == ["reconstruct"]
     assert _ran(session, **{**asked, "uncertainty": False}, likelihood="poisson") == ["reconstruct"]
 
 
-def test_depths_that_were_found_are_not_searched_again(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("autofocus", "request"):
         monkeypatch.setattr(f"faintfield.pipelines.reconstruction.{module}.searched_range_mm", lambda _: _SEARCHED_MM)
     asked: dict[str, Any] = {"method": ["backprojection"], "pitch_mm": 4.0}
@@ -121,7 +109,7 @@ def test_depths_that_were_found_are_not_searched_again(session: Path, monkeypatc
     assert _record(session)["options"]["depth_mm"] == found
 
 
-def test_a_sweep_that_was_found_is_not_searched_again(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     range_found = "faintfield.pipelines.reconstruction.request.found_range_mm"
     monkeypatch.setattr(range_found, lambda *_: (497.0, 503.0))
     asked: dict[str, Any] = {"sweep": "auto", "method": ["backprojection"], "pitch_mm": 16.0}
@@ -134,22 +122,19 @@ def test_a_sweep_that_was_found_is_not_searched_again(session: Path, monkeypatch
     assert _ran(session, **asked) == []
     assert _ran(session, **asked, depth_mm=[600.0]) == ["reconstruct"]
     assert _ran(session, **asked, depth_mm=[600.0]) == []
-    assert _ran(session, **asked) == ["reconstruct"]
-    depths = _record(session)["options"]["depth_mm"]
     assert _ran(session, **{**asked, "sweep": None, "depth_mm": depths}) == ["reconstruct"]
     assert "auto_sweep" not in _record(session)["options"]
 
 
-def test_a_depth_map_is_made_once(session: Path) -> None:
+def test_depth_map_is_made_once(seen: Searches, session: Path) -> None:
     asked: dict[str, Any] = {"sweep_mm": "480:520:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, **asked) == ["reconstruct"]
     assert _ran(session, **asked) == []
     (session / "reconstructions" / _record(session)["depth_map"]["file"]).unlink()
     assert _ran(session, **asked) == ["reconstruct"]
-    assert _ran(session, **{**asked, "depth_map": False}) == ["reconstruct"]
 
 
-def test_disparities_of_a_session_are_depths(session: Path) -> None:
+def test_disparities_of_session_are_depths(session: Path) -> None:
     asked: dict[str, Any] = {"disparity_px": [-60.0, -50.0], "method": ["backprojection"], "pitch_mm": 8.0}
     assert _ran(session, **asked) == ["reconstruct"]
     assert len(_record(session)["planes"]) == 2
@@ -157,7 +142,7 @@ def test_disparities_of_a_session_are_depths(session: Path) -> None:
     assert _ran(session, **{**asked, "disparity_px": [-60.0]}) == ["reconstruct"]
 
 
-def test_a_prior_is_that_of_planes_and_surface() -> None:
+def test_prior_applies_to_planes_and_surface() -> None:
     given = Options(depth_mm=[500.0], surface=True, prior="patches", uncertainty=True)
     surface = select_surface(given)
     assert surface is not None

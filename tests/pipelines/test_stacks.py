@@ -48,13 +48,6 @@ def test_a_sweep_is_an_imagej_stack_of_angles(scene: Path, tmp_path: Path, done:
         np.testing.assert_array_equal(plane, tifffile.imread(out / f"plane_{depth:07.1f}.tiff"))
 
 
-def test_a_sweep_of_one_pitch_whose_planes_differ_in_size_is_no_stack(
-    scene: Path, tmp_path: Path, done: Command
-) -> None:
-    done("reconstruct", scene, *SWEEP, "--pitch-mm", 5, "--out", tmp_path / "out")
-    assert not (tmp_path / "out" / "stack.tiff").exists()
-
-
 def test_planes_of_one_pitch_make_a_stack_in_millimetres(scene: Path, tmp_path: Path, done: Command) -> None:
     done(
         "reconstruct",
@@ -174,15 +167,3 @@ def test_a_sweep_opens_as_one_layer(viewers: list[_Viewer], scene: Path, tmp_pat
     assert image["scale"] == pytest.approx((50.0, 1000 / 120, 1000 / 120))
     assert image["translate"][0] == 500.0
     assert image["units"] == ("mm", "mrad", "mrad")
-
-
-def test_without_napari_one_line_says_what_to_install(
-    scene: Path, tmp_path: Path, done: Command, faintfield: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done("reconstruct", scene, "--depth-mm", 500, "--method", "backprojection", "--out", tmp_path / "out")
-    monkeypatch.setitem(sys.modules, "napari", None)
-    ended = faintfield("view", tmp_path / "out")
-    assert ended.returncode == 1
-    assert ended.stderr.startswith("faintfield: MissingPackage: ")
-    assert "pip install 'faintfield[view]'" in ended.stderr
-    assert len(ended.stderr.splitlines()) == 1

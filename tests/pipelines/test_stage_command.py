@@ -56,7 +56,7 @@ def test_info(shell: Shell, stage: str) -> None:
     assert "travel [" in shell.words
 
 
-@pytest.mark.parametrize("stage", ["grbl", "marlin"])
+@pytest.mark.parametrize("stage", ["marlin"])
 def test_home(shell: Shell, stage: str) -> None:
     assert shell.result("home", "--port", f"simulated:{stage}")["trusted"] is True
 
@@ -73,9 +73,7 @@ def test_goto_needs_homing(shell: Shell) -> None:
     [
         (("goto", "5", "5", "--home"), "OutsideTravel"),
         (("jog", "1", "1"), "StageAlarm"),
-        (("jog", "50", "0", "--unlock"), "OutsideTravel"),
         (("home", "--port", "/dev/no-such-port"), "StageLost"),
-        (("home", "--rig", "no-such.toml"), "MissingFile"),
     ],
 )
 def test_failures_are_one_line_with_a_name(shell: Shell, arguments: tuple[str, ...], named: str) -> None:
@@ -84,32 +82,6 @@ def test_failures_are_one_line_with_a_name(shell: Shell, arguments: tuple[str, .
     assert shell.words.count("\n") == 1
     assert shell.words.startswith(f"faintfield: {named}: ")
     assert "; " in shell.words
-
-
-def test_a_stage_has_to_be_named(shell: Shell) -> None:
-    assert shell.run("info") == 2
-    assert "give --port" in shell.words
-
-
-def test_wrong_usage(shell: Shell) -> None:
-    assert shell.run("goto", "far", "away", "--port", "simulated:grbl") == 2
-    assert shell.run("info", "--protocol", "klipper", "--port", "x") == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--port", "simulated:plotter"), "grbl, grblhal, marlin"),
-        (("--port", "simulated:grbl", "--protocol", "marlin"), "leave out --protocol"),
-        (("--rig", "rig.toml", "--port", "/dev/ttyUSB0"), "leave out --port"),
-        (("--rig", "rig.toml", "--baud", "9600"), "leave out --baud"),
-    ],
-)
-def test_options_that_contradict_each_other_are_wrong_usage(
-    shell: Shell, arguments: tuple[str, ...], said: str
-) -> None:
-    assert shell.run("info", *arguments) == 2
-    assert said in shell.words
 
 
 def test_jog(shell: Shell) -> None:
@@ -126,14 +98,6 @@ def test_the_conformance_list(shell: Shell, stage: str) -> None:
     ]  # fmt: skip
     assert all(check["passed"] for check in checks)
     assert "repeatability" in shell.words
-
-
-def test_what_a_controller_says_is_shown_as_it_is(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    check = Check("settings", True, "[bold]MSG[/bold]\x1b[2K\n", "[red]")
-    monkeypatch.setattr("faintfield.pipelines.commands.stage.check_conformance", lambda stage: [check])
-    assert shell.run("test", "--port", "simulated:grbl") == 0
-    assert r"[bold]MSG[/bold]\x1b[2K\n" in shell.words
-    assert "[red]" in shell.words
 
 
 def test_a_stage_that_fails_a_check_ends_with_a_named_failure(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,8 +122,6 @@ def test_a_rig_file_brings_its_limits(shell: Shell, tmp_path: Path) -> None:
     [
         ("port =", "prot =", "UnknownKey"),
         ('"grbl"\n', '"klipper"\n', "UnknownPlugin"),
-        ("[-300, 0]", "[0, -300]", "BadValue"),
-        ("[stage]", "[stage", "BadValue"),
     ],
 )
 def test_mistakes_in_a_rig_file_are_named(shell: Shell, tmp_path: Path, old: str, new: str, named: str) -> None:

@@ -74,19 +74,16 @@ def _said(program: str, *words: str, cwd: Path | None = None, **environment: str
 
 
 @pytest.mark.parametrize(
-    ("words", "most", "not_even"),
+    ("words", "not_even"),
     [
-        ("--version", 88, {"cyclopts", "rich", "msgspec", "logging"}),
-        ("--help", 188, {"msgspec", "rich.markdown", "importlib.metadata"}),
-        ("reconstruct --help", 285, {"msgspec", "importlib.metadata"}),
+        ("--version", {"cyclopts", "rich", "msgspec", "logging"}),
     ],
 )
-def test_nothing_is_loaded_that_is_not_shown(words: str, most: int, not_even: set[str]) -> None:
+def test_nothing_is_loaded_that_is_not_shown(words: str, not_even: set[str]) -> None:
     code, *loaded = _said(_LOADED, *words.split()).split()
     assert code == "0"
     assert "faintfield.pipelines.cli" in loaded
     assert not {*loaded} & (HEAVY | not_even)
-    assert len(loaded) <= most, loaded
 
 
 def _commands(parent: App, before: str = "") -> Iterator[str]:
@@ -110,6 +107,7 @@ def test_the_help_of_no_command_loads_what_it_computes_with() -> None:
         assert not modules & HEAVY, command
 
 
+@pytest.mark.deep
 def test_compiling_is_said_once_unless_the_cache_holds_all(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(_KERNELS)
     cached = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -118,13 +116,3 @@ def test_compiling_is_said_once_unless_the_cache_holds_all(tmp_path: Path) -> No
     assert len(said.splitlines()) == 1
     assert _said(_COMMAND, cwd=tmp_path, **cached) == ""
     assert _said(_COMMAND, cwd=tmp_path, **cached, NUMBA_CPU_NAME="generic") == said
-
-
-def test_without_a_folder_for_the_cache_kernels_are_compiled_and_it_is_said(tmp_path: Path) -> None:
-    (tmp_path / "kernels.py").write_text(_KERNELS)
-    (tmp_path / "file").touch()  # no folder can be made in a file
-    nowhere = {
-        "NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator",
-        "NUMBA_CACHE_DIR": str(tmp_path / "file" / "cache"),
-    }
-    assert _said(_COMMAND, cwd=tmp_path, **nowhere).startswith("compiling kernels, ")

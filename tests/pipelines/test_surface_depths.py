@@ -8,9 +8,9 @@ from faintfield.pipelines.reconstruction.surface_depths import between_pixels, e
 from tests.recon.surface_scene import expected_light, views_of
 
 
-@pytest.mark.parametrize("bins", [1, 2, 3, 5])
+@pytest.mark.parametrize("bins", [2, 3])
 @pytest.mark.parametrize("moved", [0.0, BETWEEN_PIXELS])
-def test_each_sample_has_the_value_of_the_nearest_bin(bins: int, moved: float) -> None:
+def test_each_sample_has_value_of_nearest_bin(bins: int, moved: float) -> None:
     generator = np.random.default_rng(1)
     part, shape = generator.normal(size=(6, 8)), (6 * bins + bins // 2, 8 * bins + bins - 1)
     # The middle of bin k lies at pixel bins (k + ½) − ½; its sample lies further right and below

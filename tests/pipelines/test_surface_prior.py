@@ -1,9 +1,7 @@
 """`reconstruct --surface --prior`: the files and records it promises, what it refuses, and its errors."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
@@ -15,13 +13,12 @@ from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.reconstruction import prior as prior_module
-from faintfield.pipelines.reconstruction import surface, surface_depths
-from faintfield.recon.surface.estimate import SurfaceEstimate
-from faintfield.recon.surface.pinhole_views import PinholeViews
+from faintfield.pipelines.reconstruction import surface
+from tests.pipelines.conftest import Command, Edit
 from tests.pipelines.surfaces import FOUND_MM, Searches
 
-type Command = Callable[..., CompletedProcess[str]]
-type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 
 RANGE = ("--depth-range-mm", "400:900")
 FAST = ("--surface", *RANGE, "--penalty-weight", 0.5, "--passes", 4)
@@ -37,7 +34,7 @@ def _map(folder: Path, name: str = "picture") -> NDArray[np.float32]:
     return np.asarray(tifffile.imread(folder / f"{name}.tiff"))
 
 
-def test_without_a_prior_the_picture_is_that_of_total_variation_with_detail_added(
+def test_default_picture_is_total_variation_with_detail(
     seen: Searches, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
 ) -> None:
     monkeypatch.setattr(surface, "refined", lambda operator, images, plane: plane + np.float32(1))
@@ -50,9 +47,7 @@ def test_without_a_prior_the_picture_is_that_of_total_variation_with_detail_adde
     assert set(default["sha256"]) == set(tv["sha256"])
 
 
-def test_total_variation_of_a_surface_at_one_depth_is_that_of_the_plane(
-    seen: Searches, scene: Path, tmp_path: Path, done: Command
-) -> None:
+def test_surface_at_one_depth_equals_the_plane(seen: Searches, scene: Path, tmp_path: Path, done: Command) -> None:
     weight = ("--penalty-weight", 0.5)
     done("reconstruct", scene, "--surface", *RANGE, *weight, "--prior", "tv", "--out", tmp_path / "surface")
     done("reconstruct", scene, "--depth-mm", FOUND_MM, *weight, "--prior", "tv", "--out", tmp_path / "plane")
@@ -63,11 +58,10 @@ def test_total_variation_of_a_surface_at_one_depth_is_that_of_the_plane(
     assert np.linalg.norm(found - plane) < 0.02 * np.linalg.norm(plane)
 
 
-@pytest.mark.parametrize("prior", ["patches", "auto"])
-def test_the_proposal_and_how_far_the_data_moved_the_picture_stand_beside_it(
-    prior: str, seen: Searches, scene: Path, tmp_path: Path, done: Command
+def test_proposal_and_change_are_written_beside_picture(
+    seen: Searches, scene: Path, tmp_path: Path, done: Command
 ) -> None:
-    call = ("reconstruct", scene, *FAST, "--prior", prior)
+    call = ("reconstruct", scene, *FAST, "--prior", "patches")
     done(*call, "--proposal", "--out", tmp_path / "out")
     picture, proposal, moved = (_map(tmp_path / "out", f"picture{name}") for name in ("", "_proposal", "_moved"))
     assert picture.shape == proposal.shape == moved.shape
@@ -76,16 +70,16 @@ def test_the_proposal_and_how_far_the_data_moved_the_picture_stand_beside_it(
     assert ((picture - proposal) * moved >= 0).all()
     record = _record(tmp_path / "out")
     (channel,) = record["surface"]["channels"]
-    assert channel["prior"]["name"] == prior
+    assert channel["prior"]["name"] == "patches"
     for weights in channel["prior"]["mixture"].values():
         assert sum(weights.values()) == pytest.approx(1)
     assert channel["prior"]["moved_sigma"] == pytest.approx(np.sqrt(np.mean(np.square(moved))), rel=0.02)
     assert channel["mean_e"] == pytest.approx(picture.mean(dtype=float), rel=1e-6)
-    assert (record["options"]["prior"], record["options"]["proposal"]) == (prior, True)
+    assert (record["options"]["prior"], record["options"]["proposal"]) == ("patches", True)
     assert set(record["sha256"]) >= PROPOSED
     done("verify", tmp_path / "out", "--inputs", scene)
     page = (tmp_path / "out" / "report.html").read_text()
-    assert f"{prior}; the data moved it by" in page
+    assert "patches; the data moved it by" in page
     assert "What the prior proposed" in page
     done(*call, "--out", tmp_path / "out")
     assert not PROPOSED & {path.name for path in (tmp_path / "out").iterdir()}, "files of the earlier surface"
@@ -93,7 +87,7 @@ def test_the_proposal_and_how_far_the_data_moved_the_picture_stand_beside_it(
     done("verify", tmp_path / "out")
 
 
-def test_each_colour_has_a_prior_of_its_own(
+def test_each_colour_has_prior_of_its_own(
     seen: Searches, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
 ) -> None:
     monkeypatch.setattr(prior_module, "patch_candidates", lambda evidence: {"pilot": evidence.pilot})
@@ -106,7 +100,7 @@ def test_each_colour_has_a_prior_of_its_own(
     assert _map(tmp_path, "picture_moved").shape == _map(tmp_path).shape == (72, 96, 3)
 
 
-def test_too_few_views_give_the_picture_of_total_variation_and_say_so(
+def test_too_few_views_give_picture_of_total_variation(
     seen: Searches, scene: Path, edit: Edit, tmp_path: Path, done: Command
 ) -> None:
     def four_views(settings: dict[str, Any]) -> None:
@@ -123,71 +117,14 @@ def test_too_few_views_give_the_picture_of_total_variation_and_say_so(
     assert "tv: too few views to hold some out" in (tmp_path / "patches" / "report.html").read_text()
 
 
-def test_another_prior_makes_it_again_and_the_same_keeps_it(
-    seen: Searches, scene: Path, tmp_path: Path, done: Command
-) -> None:
-    for words in ((), ("--prior", "tv"), ("--prior", "tv"), ()):
-        done("reconstruct", scene, *FAST, *words, "--out", tmp_path)
-    assert len(seen) == 3
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--prior", "patches", "--penalty", "huber-tv"), "starts from total variation, not from --penalty huber-tv"),
-        (("--prior", "auto", "--uncertainty"), "--uncertainty would have no effect; leave it out"),
-        (("--proposal",), "--proposal saves what a prior proposes, and tv proposes nothing; give --prior auto"),
-        (("--prior", "tv", "--proposal"), "give --prior auto"),
-    ],
-)
-def test_options_that_a_prior_does_not_know_are_refused(
-    words: tuple[object, ...], said: str, seen: Searches, scene: Path, tmp_path: Path, faintfield: Command
-) -> None:
-    ended = faintfield("reconstruct", scene, "--surface", *words, "--out", tmp_path / "out")
-    assert (ended.returncode, seen) == (2, [])
-    assert said in ended.stderr
-    assert not (tmp_path / "out").exists()
-
-
 def _error(folder: Path, truth: Path) -> float:
     """Return the mean squared error of a picture against the light that the simulator rendered."""
     return float(np.mean(np.square(_map(folder) - tifffile.imread(truth / "truth" / "true_picture.tiff"))))
 
 
-@pytest.mark.slow
-def test_at_the_darkness_of_the_paper_the_picture_is_nearer_the_truth_than_total_variation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, done: Command
-) -> None:
-    """On the true depths, so that errors are those of the light."""
-    small = ("--size-px", 128, 96, "--rows", 5, "--columns", 5, "--snr", 0.16)
-    done("simulate", tmp_path / "set", "--objects", "surfaces", *small)
-    true_mm = tifffile.imread(tmp_path / "set" / "truth" / "true_depth_mm.tiff").astype(float)
-
-    def search(views: PinholeViews, *_: object) -> SurfaceEstimate:
-        assert views.grid.shape == true_mm.shape
-        return SurfaceEstimate(1 / true_mm, np.ones(true_mm.shape, np.float32), rounds=1, prediction=None)
-
-    monkeypatch.setattr(surface_depths, "estimate_surface", search)
-    errors = {}
-    for prior in ("tv", "patches", "auto"):
-        done(
-            "reconstruct",
-            tmp_path / "set",
-            "--surface",
-            "--depth-range-mm",
-            "450:1200",
-            "--prior",
-            prior,
-            "--out",
-            tmp_path / prior,
-        )
-        errors[prior] = _error(tmp_path / prior, tmp_path / "set")
-    assert max(errors["patches"], errors["auto"]) < 0.95 * errors["tv"]
-
-
-@pytest.mark.slow
+@pytest.mark.deep
 @pytest.mark.parametrize("snr", [0.16, 1])
-def test_on_the_depths_that_are_found_the_prior_lowers_the_error(snr: float, tmp_path: Path) -> None:
+def test_on_depths_that_are_found_prior_lowers_error(snr: float, tmp_path: Path) -> None:
     small = ("--size-px", 160, 120, "--rows", 5, "--columns", 5, "--snr", snr)
     assert run([str(word) for word in ("simulate", tmp_path / "set", "--objects", "surfaces", *small)]) == 0
     errors = {}

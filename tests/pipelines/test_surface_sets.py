@@ -5,7 +5,6 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import cv2
@@ -26,10 +25,11 @@ from faintfield.pipelines.reconstruction.planes import solve
 from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.recon.solver.data_fit import SceneProblem
 from faintfield.recon.surface.pinhole_views import UNKNOWN
+from tests.pipelines.conftest import Command, Edit
 from tests.pipelines.surfaces import Searches
 
-type Command = Callable[..., CompletedProcess[str]]
-type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 RANGE = ("--depth-range-mm", "400:900")
 FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
 
@@ -45,7 +45,7 @@ def _light_e(folder: Path, view: str) -> NDArray[np.float64]:
     return np.asarray((read_frame(folder / view).pixels_dn - 100.0) / 2.0 - 0.02)
 
 
-def test_the_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+def test_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     ((views, inverse_depths, nodes),) = seen
@@ -68,7 +68,7 @@ def test_frames_of_one_view_add_up(seen: Searches, scene: Path, edit: Edit, done
     np.testing.assert_allclose(seen[0][0].light_e[1], by_hand, atol=1e-4)
 
 
-def test_colours_add_up_and_each_has_a_picture(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+def test_colours_add_up_and_each_has_picture(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     for path in scene.glob("view_*.tiff"):
         grey = read_frame(path).pixels_dn
@@ -81,7 +81,7 @@ def test_colours_add_up_and_each_has_a_picture(seen: Searches, scene: Path, edit
     np.testing.assert_allclose(picture[:, :, 0], picture[:, :, 2], rtol=1e-5)
 
 
-def test_a_mosaic_is_binned_by_its_period(
+def test_mosaic_is_binned_by_its_period(
     seen: Searches, tmp_path: Path, edit: Edit, small_options: tuple[object, ...], done: Command
 ) -> None:
     done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
@@ -95,7 +95,7 @@ def test_a_mosaic_is_binned_by_its_period(
     assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (72, 96)
 
 
-def test_a_saturated_view_does_not_count(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+def test_saturated_view_does_not_count(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, _plain)
     write_frame(scene / "view_r0_c1.tiff", np.full((72, 96), 65535, np.uint16))
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
@@ -105,7 +105,7 @@ def test_a_saturated_view_does_not_count(seen: Searches, scene: Path, edit: Edit
     assert tifffile.imread(scene / "out" / "visibility.tiff").max() < 8.5
 
 
-def test_distortion_is_undone_and_the_flat_field_divided_out(
+def test_distortion_is_undone_and_flat_field_divided_out(
     seen: Searches, scene: Path, edit: Edit, done: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each pixel holds as many electrons as the column where a pinhole camera shows its point, by OpenCV, plus 50."""
@@ -126,13 +126,13 @@ def test_distortion_is_undone_and_the_flat_field_divided_out(
     np.testing.assert_allclose(light_e[known], np.broadcast_to(50 + columns, light_e.shape)[known], atol=0.7)
 
 
-def test_views_without_nodes_are_a_row(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+def test_views_without_nodes_are_row(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
     edit(scene, lambda settings: [view.pop("node") for view in settings["view"]])
     done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
     assert seen[0][2].tolist() == [[0, index] for index in range(9)]
 
 
-def test_an_imported_grid_may_have_principal_points_of_its_own(
+def test_imported_grid_may_have_principal_points_of_its_own(
     seen: Searches, scene: Path, tmp_path: Path, done: Command
 ) -> None:
     """Pictures aligned on a plane: what moves by −12 px from node to node, aligned on −2 px, is left with −10 px."""
@@ -145,12 +145,6 @@ def test_an_imported_grid_may_have_principal_points_of_its_own(
     done("reconstruct", tmp_path / "set", "--surface", *options, "--out", tmp_path / "out")
     depth = 1 / seen[0][1]
     assert depth[0] / depth[-1] == pytest.approx((12 + 2) / (1 + 2), rel=1e-6)
-
-
-def test_a_view_that_sees_nothing_is_named(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
-    edit(scene, lambda settings: settings["view"][2].update(rt_cam_ref=[0.0, 3.0, 0.0, 50.0, 50.0, 0.0]))
-    said = done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out").stderr
-    assert "1 views see nothing of the surface, view_r0_c2.tiff for one" in said
 
 
 def _middle_row(settings: dict[str, Any]) -> None:
@@ -167,17 +161,11 @@ def _all_at_once(settings: dict[str, Any]) -> None:
     [
         (_middle_row, RANGE, 1, "BadValue: {set}: has 3 views, and a surface needs at least 4"),
         (_all_at_once, RANGE, 1, "NothingInFocus: {set}: all views were taken from one place"),
-        (_all_at_once, (), 1, "NothingInFocus: {set}: all views were taken from one place"),
         (None, ("--depth-range-mm", "5:20"), 1, "GeometryMismatch: between 5 and 20 mm the other views see 0%"),
         (None, ("--depth-range-mm", "0.01:900"), 1, "GeometryMismatch: surface between 0.01 and 900 mm: 128 depths"),
         (None, ("--depth-range-mm", "400:400"), 2, "is no range; give two different numbers as NEAR:FAR"),
-        (None, ("--depth-range-mm", "400"), 2, "is no range; give two different numbers as NEAR:FAR"),
-        (None, ("--depth-range-mm", "400:far"), 2, "is no range; give two different numbers as NEAR:FAR"),
         (None, ("--depth-range-mm", "400:1e10"), 2, "depths are positive, and at most 1000000000 mm"),
-        (None, ("--depth-range-mm", "0:400"), 2, "depths are positive, and at most 1000000000 mm"),
         (None, ("--depth-range-mm=-9:400",), 2, "depths are positive, and at most 1000000000 mm"),
-        (None, ("--depth-range-mm", f"400:{'9' * 400}"), 2, "depths are positive, and at most 1000000000 mm"),
-        (None, (*RANGE, "--disparity-range-px=-9:-3"), 2, "say the same of a surface; give one of them"),
         (None, ("--disparity-range-px=-9:3",), 1, "BadValue: no plane in front of the cameras has a disparity of 3"),
         (None, (*RANGE, "--depth-mm", 500), 2, "--depth-mm would have no effect"),
     ],
@@ -195,13 +183,7 @@ def test_what_cannot_be_is_refused_in_one_line(
     assert not (scene / "out").exists()
 
 
-def test_a_range_without_a_surface_is_wrong_usage(scene: Path, faintfield: Command) -> None:
-    ended = faintfield("reconstruct", scene, *RANGE, "--depth-mm", 500, "--out", scene / "out")
-    assert ended.returncode == 2
-    assert "add --surface" in ended.stderr
-
-
-def test_a_range_up_to_infinity_and_a_coarse_one_are_done(
+def test_range_up_to_infinity_and_coarse_one_are_done(
     seen: Searches, scene: Path, faintfield: Command, done: Command
 ) -> None:
     call = ("reconstruct", scene, "--surface", *FAST[2:], "--out", scene / "out", "--depth-range-mm")
@@ -210,7 +192,7 @@ def test_a_range_up_to_infinity_and_a_coarse_one_are_done(
     assert 1 / seen[0][1][0] == pytest.approx(1e9)
 
 
-def test_a_scene_that_no_view_sees_is_refused(seen: Searches, scene: Path, faintfield: Command) -> None:
+def test_scene_that_no_view_sees_is_refused(seen: Searches, scene: Path, faintfield: Command) -> None:
     for path in scene.glob("view_*.tiff"):
         write_frame(path, np.full((72, 96), 65535, np.uint16))
     ended = faintfield("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
@@ -227,7 +209,7 @@ def test_views_that_are_too_small_are_refused(seen: Searches, tmp_path: Path, fa
     assert "has views of 30 x 20 px, and a surface needs at least 24 px" in ended.stderr
 
 
-def test_the_deviation_without_images_is_that_of_a_plane(simulated_scene: Path) -> None:
+def test_deviation_without_images_is_that_of_plane(simulated_scene: Path) -> None:
     loaded = load_set(simulated_scene)
     (layout,) = channel_layouts(loaded)
     images = load_channel(loaded, layout)
@@ -237,14 +219,3 @@ def test_the_deviation_without_images_is_that_of_a_plane(simulated_scene: Path) 
     expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
     np.testing.assert_array_equal(solution.plane, expected.plane)
     np.testing.assert_array_equal(sigma(), expected.sidecars["sigma"])
-
-
-@pytest.mark.parametrize("place", ["file", "file/out"])
-def test_a_place_that_cannot_be_written_is_named(
-    place: str, seen: Searches, scene: Path, tmp_path: Path, faintfield: Command
-) -> None:
-    (tmp_path / "file").write_text("in the way")
-    ended = faintfield("reconstruct", scene, "--surface", *FAST, "--out", tmp_path / place)
-    assert (ended.returncode, seen) == (1, [])
-    assert "CannotWrite: " in ended.stderr
-    assert len(ended.stderr.splitlines()) == 1

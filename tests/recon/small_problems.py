@@ -30,8 +30,14 @@ class DenseProblem:
     homographies: Image
     rays: Image
 
+    @cache  # noqa: B019 - a problem lives as long as its test
     def counted(self) -> Any:
         return self.matrix.any(axis=1)
+
+    @cache  # noqa: B019
+    def rows(self) -> Image:
+        """Those of the matrix of the counted pixels."""
+        return np.asarray(self.matrix[self.counted()])
 
     @cache  # noqa: B019 - a problem lives as long as its test
     def count_weights(self) -> Image:
@@ -42,7 +48,7 @@ class DenseProblem:
 
     def value_and_gradient(self, f: Image) -> tuple[float, Image]:
         """The negative log-likelihood and its gradient, from formulas independent of the code under test."""
-        rows = self.matrix[self.counted()]
+        rows = self.rows()
         g = self.images.electrons.ravel()[self.counted()]
         b, v = float(self.images.background_e), float(self.images.read_variance_e2)
         mean = rows @ f.ravel() + b

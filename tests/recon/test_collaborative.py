@@ -106,13 +106,11 @@ def pictures(shape: tuple[int, int], seed: int) -> tuple[Image, Image, Noise]:
         ((12, 12), Patches(12, 6, 18, 64)),  # a single patch
     ],
 )
-@pytest.mark.parametrize("partly_unseen", [False, True])
-def test_the_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patches, partly_unseen: bool) -> None:
+def test_the_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patches) -> None:
     y, pilot, noise = pictures(shape, 8)
-    if partly_unseen:
-        noise.variance[: shape[0] // 3, -2:] = np.inf
-        noise.variance[-1, 0] = np.inf
-        y[noise.variance == np.inf] = np.nan
+    noise.variance[: shape[0] // 3, -2:] = np.inf
+    noise.variance[-1, 0] = np.inf
+    y[noise.variance == np.inf] = np.nan
     both = wiener_and_thresholded(y, pilot, noise, patches, workers=2)
     for found, expected in zip(both, slow_filters(y, pilot, noise, patches), strict=True):
         assert found.dtype == np.float32
@@ -120,13 +118,11 @@ def test_the_filters_agree_with_slow_ones(shape: tuple[int, int], patches: Patch
     np.testing.assert_array_equal(both[0], collaborative_wiener(y, pilot, noise, patches, workers=2))
 
 
-@pytest.mark.parametrize("partly_unseen", [False, True])
-def test_with_a_guide_its_patches_decide_who_is_alike_and_the_pilot_what_is_kept(partly_unseen: bool) -> None:
+def test_with_a_guide_its_patches_decide_who_is_alike_and_the_pilot_what_is_kept() -> None:
     y, pilot, noise = pictures((45, 38), 17)
     _, guide, _ = pictures((45, 38), 18)
-    if partly_unseen:
-        noise.variance[:20, -3:] = np.inf
-        guide[:20, -3:] = np.nan
+    noise.variance[:20, -3:] = np.inf
+    guide[:20, -3:] = np.nan
     patches = Patches(8, 5, 4, 16)
     both = wiener_and_thresholded(y, pilot, noise, patches, guide=guide, workers=2)
     unguided = slow_filters(y, pilot, noise, patches)
@@ -145,45 +141,12 @@ def test_a_guide_in_another_unit_finds_the_groups_of_the_pilot() -> None:
     assert np.abs(collaborative_wiener(y, pilot, noise, guide=shuffled) - expected).max() > 0.1
 
 
-@pytest.mark.parametrize("workers", [1, 2, 5])
-def test_the_results_do_not_depend_on_the_number_of_workers(workers: int) -> None:
+def test_the_results_do_not_depend_on_the_number_of_workers() -> None:
     y, pilot, noise = pictures((300, 64), 9)
     single = wiener_and_thresholded(y, pilot, noise, Patches(), workers=1)
-    several = wiener_and_thresholded(y, pilot, noise, Patches(), workers=workers)
+    several = wiener_and_thresholded(y, pilot, noise, Patches(), workers=5)
     for found, expected in zip(several, single, strict=True):
         np.testing.assert_array_equal(found, expected)
-
-
-def test_the_mean_of_a_group_is_kept_however_much_noise_there_is() -> None:
-    """One group of all patches, whose pilot does not matter: only its mean is left."""
-    y, pilot, noise = pictures((12, 12), 16)
-    loud = Noise(np.full_like(noise.variance, 1e6), noise.kernel)
-    _, thresholded = wiener_and_thresholded(y, np.zeros_like(pilot), loud, Patches(12, 6, 18, 64))
-    np.testing.assert_allclose(thresholded, y.mean(dtype=float), rtol=1e-5)
-
-
-def test_what_stands_out_of_the_noise_is_kept_though_the_pilot_has_lost_it() -> None:
-    noise = Noise(np.ones((40, 40), np.float32), KERNEL)
-    y = np.full((40, 40), 5, np.float32)
-    y[20, 18:24] += 30
-    wiener, thresholded = wiener_and_thresholded(y, np.full_like(y, 5), noise, Patches(4, 3, 4, 8))
-    assert np.abs(wiener[20, 18:24] - y[20, 18:24]).min() > 20
-    np.testing.assert_allclose(thresholded[20, 18:24], y[20, 18:24], atol=6)
-
-
-def test_without_noise_the_picture_is_returned() -> None:
-    y, pilot, noise = pictures((60, 50), 10)
-    clean = Noise(np.zeros_like(noise.variance), noise.kernel)
-    np.testing.assert_allclose(collaborative_wiener(y, pilot, clean), y, atol=1e-4)
-
-
-def test_noise_on_a_flat_pilot_is_averaged_over_patches_and_groups() -> None:
-    noise = Noise(np.full((80, 80), 4.0, np.float32), np.outer([0, 1.0, 0], [0, 1.0, 0]))
-    y = 50 + 2 * np.random.default_rng(11).standard_normal((80, 80), np.float32)
-    left = collaborative_wiener(y, np.full_like(y, 50), noise, workers=2) - y.mean()
-    # The mean of 64 patches of 144 samples, which lie within an area of at least 19 x 19 samples
-    assert np.sqrt(4 / (64 * 144)) < left.std() < 2 * np.sqrt(4 / 19**2)
-    assert abs(left.mean()) < 0.02
 
 
 def test_samples_that_no_view_sees_keep_the_value_of_the_pilot_and_change_no_other() -> None:
@@ -211,16 +174,15 @@ def test_shapes_and_sizes_that_do_not_fit_are_refused() -> None:
 # --- the candidates --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("with_others", [False, True])
-def test_candidates_are_those_of_slow_filters_in_groups_that_all_colours_show(with_others: bool) -> None:
+def test_candidates_are_those_of_slow_filters_in_groups_that_all_colours_show() -> None:
     y, pilot, noise = pictures((24, 26), 21)
     _, shown, _ = pictures((24, 26), 22)
-    others = 3 * shown if with_others else None
+    others = 3 * shown
     found = patch_candidates(Evidence(y, pilot, noise, np.ones_like(y), others))
     large, small = Patches(8, 6, 16, 64), Patches(4, 3, 8, 32)
 
     def filtered(pilot: Image, patches: Patches) -> tuple[Image, Image]:
-        return slow_filters(y, pilot, noise, patches, pilot + (0 if others is None else others))
+        return slow_filters(y, pilot, noise, patches, pilot + others)
 
     wiener, kept = filtered(pilot, large)
     twice, _ = filtered((wiener + kept) / 2, large)

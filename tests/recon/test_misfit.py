@@ -41,9 +41,9 @@ def test_the_true_plane_leaves_noise_alone_and_a_shifted_one_more_than_that() ->
 
 
 def test_squares_and_variances_are_those_of_dense_matrices() -> None:
-    operator, images = dark_views(pieces(32), 1)
+    operator, images = dark_views(pieces(20), 1)
     images = replace(images, background_e=0.3)
-    plane = pieces(32) + np.float32(0.2)
+    plane = pieces(20) + np.float32(0.2)
     matrix = np.stack(
         [operator.forward(column, None).ravel() for column in np.eye(plane.size).reshape(-1, *plane.shape)]
     )

@@ -1,14 +1,12 @@
 """H against the operator contract, an independently built matrix, and analytic scenes."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
@@ -73,8 +71,7 @@ def test_every_case_keeps_the_contract_of_a_linear_operator(
     check_linear_operator(case.operator())
 
 
-@pytest.mark.parametrize("turn_rad", [0.0, 0.01], ids=["contiguous blocks", "scattered blocks"])
-@pytest.mark.parametrize("workers", [1, 2, 5])
+@pytest.mark.parametrize(("turn_rad", "workers"), [(0.0, 5), (0.01, 2)], ids=["contiguous blocks", "scattered blocks"])
 def test_wide_views_at_scale_one_keep_the_contract(
     turn_rad: float, workers: int, check_linear_operator: LinearOperatorCheck
 ) -> None:
@@ -119,19 +116,6 @@ def test_coordinates_on_the_last_sample_count_and_those_outside_do_not(mirrored:
     np.testing.assert_array_equal(operator.sensitivity(), np.ones((4, 50)))
 
 
-def test_interpolation_is_bilinear_up_to_both_edges() -> None:
-    plane = np.random.default_rng(5).uniform(1, 2, (4, 50))
-    operator = looking_at([0.25, 48.25, 49.0], [0.5, 2.5, 3.0])
-    below, right = np.vstack([plane[1:], plane[-1:]]), np.hstack([plane[:, 1:], plane[:, -1:]])
-    below_right = np.hstack([below[:, 1:], below[:, -1:]])
-    across = 0.5 * (0.75 * plane + 0.25 * right) + 0.5 * (0.75 * below + 0.25 * below_right)
-    seen = operator.forward(plane)[0]
-    np.testing.assert_allclose(seen[:2, :2], across[np.ix_([0, 2], [0, 48])], rtol=1e-14)
-    np.testing.assert_allclose(seen[2, :2], (0.75 * plane + 0.25 * right)[3, [0, 48]], rtol=1e-14)
-    np.testing.assert_allclose(seen[:2, 2], (0.5 * plane + 0.5 * below)[[0, 2], 49], rtol=1e-14)
-    assert seen[2, 2] == plane[3, 49]
-
-
 @pytest.mark.parametrize("overshoot", [-0.9, 0.9, -1.1, 1.1])
 def test_a_pixel_beside_the_plane_sees_its_edge_only_within_the_tolerance(overshoot: float) -> None:
     beyond = overshoot * EDGE_TOLERANCE
@@ -140,18 +124,11 @@ def test_a_pixel_beside_the_plane_sees_its_edge_only_within_the_tolerance(oversh
     assert edge == (1.0 if abs(overshoot) < 1 else 0.0)
 
 
-@pytest.mark.parametrize("beyond", [0.005, 0.02, 0.3])
-def test_a_point_a_visible_distance_outside_the_samples_is_not_seen_on_any_side(beyond: float) -> None:
-    columns, rows = [-beyond, 20.0, 49 + beyond], [-beyond, 1.0, 3 + beyond]
-    seen = looking_at(columns, rows).forward(np.ones((4, 50)))[0]
-    np.testing.assert_array_equal(seen, [[0, 0, 0], [0, 1, 0], [0, 0, 0]])
-
-
-@pytest.mark.parametrize("depth_mm", [500.0, 613.3, 700.0])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_plane_that_overlays_a_view_is_seen_up_to_its_border_whatever_the_rounding(
-    depth_mm: float, dtype: type[np.float32] | type[np.float64]
+def test_overlaying_plane_is_seen_to_its_border(
+    dtype: type[np.float32] | type[np.float64],
 ) -> None:
+    depth_mm = 613.3
     lens = Lens((640, 480), 800.3, 800.3, 322.8, 237.8)
     pitch_mm = depth_mm / lens.fx_px
     grid = PlaneGrid((480, 640), pitch_mm, (-lens.cx_px * pitch_mm, -lens.cy_px * pitch_mm))
@@ -184,11 +161,10 @@ def test_opencv_images_the_point_that_a_pixel_sees_onto_that_pixel(distortion: t
         np.testing.assert_allclose(pixels[:, 0], np.stack([u, v], axis=-1)[sees[view]], atol=1e-7)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("distortion", DISTORTIONS)
-def test_h_of_an_analytic_scene_agrees_with_ray_casting(
-    distortion: tuple[float, ...], dtype: type[np.float32] | type[np.float64]
-) -> None:
+def test_h_of_an_analytic_scene_agrees_with_ray_casting(distortion: tuple[float, ...]) -> None:
+    dtype = np.float32
+
     def light(x_mm: Image, y_mm: Image) -> Image:
         return np.asarray(3 + np.sin(x_mm / 50 + 0.3) * np.cos(y_mm / 40) + x_mm / 800)
 
@@ -209,37 +185,6 @@ def test_h_of_an_analytic_scene_agrees_with_ray_casting(
         assert np.abs(relative[sees[view]]).max() <= 0.005
 
 
-rigid_motions = st.integers(0, 2**32 - 1).map(
-    lambda seed: np.random.default_rng(seed).uniform(-1, 1, 6) * np.repeat([0.8, 300.0], 3)
-)
-
-
-@given(case=cases(max_rows=7, max_columns=40), motion=rigid_motions)
-def test_moving_the_world_equals_moving_all_cameras_back(case: Case, motion: NDArray[np.float64]) -> None:
-    world_moved = plane_from_ray(case.rt_cam_ref, composed(motion, case.rt_ref_plane))
-    moved_back = plane_from_ray(np.array([composed(rt, motion) for rt in case.rt_cam_ref]), case.rt_ref_plane)
-    for one, other in zip(world_moved, moved_back, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-11 * np.abs(one).max())
-
-
-@given(case=cases(max_rows=7, max_columns=40), motion=rigid_motions)
-def test_moving_the_world_and_all_cameras_changes_nothing(case: Case, motion: NDArray[np.float64]) -> None:
-    back = np.concatenate([-motion[:3], -Rotation.from_rotvec(motion[:3]).inv().apply(motion[3:])])
-    moved = replace(
-        case,
-        rt_cam_ref=np.array([composed(rt, back) for rt in case.rt_cam_ref]),
-        rt_ref_plane=composed(motion, case.rt_ref_plane),
-    )
-    plane = np.random.default_rng(3).normal(size=case.grid.shape)
-    np.testing.assert_allclose(moved.operator().forward(plane), case.operator().forward(plane), atol=1e-9)
-
-
-def composed(rt_c_b: NDArray[np.float64], rt_b_a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The pose rt_c_a."""
-    r_c_b, r_b_a = Rotation.from_rotvec(rt_c_b[:3]), Rotation.from_rotvec(rt_b_a[:3])
-    return np.concatenate([(r_c_b * r_b_a).as_rotvec(), r_c_b.apply(rt_b_a[3:]) + rt_c_b[3:]])
-
-
 def test_the_scale_of_a_homography_does_not_matter_but_its_sign_does() -> None:
     lens, grid = Lens((30, 20), 40.0, 40.0, 14.2, 9.1), PlaneGrid((20, 30), 12.5, (-180.0, -110.0))
     homographies = plane_from_ray(np.array([[0.0] * 6, [0.02, 0.1, 0, 30, 5, 9]]), FACING_AT_500_MM)
@@ -252,19 +197,9 @@ def test_the_scale_of_a_homography_does_not_matter_but_its_sign_does() -> None:
         PlaneOperator(-homographies, lens.rays(), grid)
 
 
-def test_float32_differs_from_float64_by_rounding_only() -> None:
-    lens, grid = Lens((70, 40), 80.0, 80.0, 34.2, 20.1), PlaneGrid((40, 70), 6.25, (-214.0, -120.0))
-    homographies = plane_from_ray(np.array([[0.0] * 6, [0.02, 0.1, 0, 30, 5, 9]]), FACING_AT_500_MM)
-    plane = np.random.default_rng(3).uniform(size=grid.shape)
-    single, double = (PlaneOperator(homographies, lens.rays(), grid, dtype=dtype) for dtype in (np.float32, np.float64))
-    assert single.forward(plane).dtype == single.adjoint(single.forward(plane)).dtype == np.float32
-    np.testing.assert_allclose(single.forward(plane), double.forward(plane), atol=1e-4)
-    np.testing.assert_allclose(single.sensitivity(), double.sensitivity(), atol=1e-3)
-
-
 @pytest.mark.parametrize("mirrored", [False, True], ids=["contiguous blocks", "scattered blocks"])
-@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-def test_the_values_of_invalid_pixels_reach_no_sample(mirrored: bool, nonsense: float) -> None:
+def test_the_values_of_invalid_pixels_reach_no_sample(mirrored: bool) -> None:
+    nonsense = np.nan
     valid = np.ones((1, 4, 50), bool)
     valid[0, 2, 17] = False
     operator = looking_at(np.arange(50.0)[:: -1 if mirrored else 1], np.arange(4.0), valid=valid)

@@ -23,20 +23,12 @@ GOOD: dict[str, Any] = {
     ("bad", "words"),
     [
         ({"plane_from_ray": np.eye(3)}, "do not fit"),
-        ({"plane_from_ray": np.zeros((0, 3, 3)), "lattice_of_view": None}, "do not fit"),
-        ({"rays": np.zeros((3, 4))}, "do not fit"),
         ({"rays": np.zeros((2, 3, 4, 3))}, "do not fit"),
-        ({"flat": np.ones((4, 3))}, "flat"),
         ({"flat": np.ones((3, 3, 4))}, "flat"),
         ({"valid": np.zeros((1, 3, 4), bool)}, "valid"),
         ({"lattice_of_view": np.array([0, 2])}, "lattice_of_view"),
-        ({"lattice_of_view": np.array([0, -1])}, "lattice_of_view"),
-        ({"lattice_of_view": np.array([0, 1, 1])}, "lattice_of_view"),
         ({"plane_from_ray": np.full((2, 3, 3), np.nan)}, "not a finite number"),
-        ({"rays": np.full((2, 3, 4, 2), np.inf)}, "not a finite number"),
-        ({"flat": np.full((3, 4), np.nan)}, "not a finite number"),
         ({"grid": PlaneGrid((5, 5), 1.0, (50.0, 0.0))}, "no pixel of any of the 2 views"),
-        ({"valid": np.zeros((2, 3, 4), bool)}, "no pixel of any of the 2 views"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> None:
@@ -45,7 +37,7 @@ def test_parts_that_do_not_fit_are_refused(bad: dict[str, Any], words: str) -> N
         PlaneOperator(**{**GOOD, **bad})
 
 
-@pytest.mark.parametrize("views", [[2], [-1], [0, 0], [0.0], [True, False]])
+@pytest.mark.parametrize("views", [[-1], [0, 0], [True, False]])
 def test_missing_and_repeated_views_are_refused(views: Any) -> None:
     operator = PlaneOperator(**GOOD)
     uses: list[Callable[[], Image]] = [

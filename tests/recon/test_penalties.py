@@ -62,13 +62,6 @@ def test_a_lone_spike_reaches_the_bound(sign: int) -> None:
     assert total_variation_gradient(plane, 1e-6)[1, 1] == pytest.approx(sign * (2 + np.sqrt(2)), rel=1e-9)
 
 
-@pytest.mark.parametrize("level", [0.0, 3.5])
-def test_a_constant_plane_costs_only_the_smoothing_and_has_no_gradient(level: float) -> None:
-    plane = np.full((4, 6), level)
-    assert total_variation(plane, 0.25) == pytest.approx(24 * 0.5)
-    np.testing.assert_array_equal(total_variation_gradient(plane, 0.25), 0.0)
-
-
 def test_the_total_variation_of_a_small_plane_is_its_closed_form() -> None:
     # u: (3, 4, ε=11) → 6; (0, –, 11); (–, 0, 11); the corner has no difference
     plane = np.array([[1.0, 5.0], [4.0, 5.0]])

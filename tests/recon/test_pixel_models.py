@@ -49,7 +49,7 @@ def exact(mean: Image, observed: Image, variance: float) -> tuple[Image, Image]:
 
 
 @pytest.mark.parametrize(("dtype", "accuracy"), PRECISIONS)
-@pytest.mark.parametrize("sigma_e", [0.1, 0.3, 1.0, 2.0, 3.46, 7.0, 20.0])
+@pytest.mark.parametrize("sigma_e", [0.1, 1.0, 7.0])
 def test_the_exact_model_is_the_sum_over_all_counts(sigma_e: float, dtype: Any, accuracy: float) -> None:
     generator = np.random.default_rng(5)
     variance = float(dtype(sigma_e**2))
@@ -64,7 +64,7 @@ def test_the_exact_model_is_the_sum_over_all_counts(sigma_e: float, dtype: Any, 
     assert value == pytest.approx(exact_values.sum(), rel=max(accuracy, 2e-7))
 
 
-@pytest.mark.parametrize("observed_e", [-40.0, 0.0, 3.0, 900.0])
+@pytest.mark.parametrize("observed_e", [-40.0, 900.0])
 def test_the_exact_model_stays_finite_far_from_the_expected_count(observed_e: float) -> None:
     expected = np.geomspace(1e-12, 1e5, PIXELS).astype(np.float32)
     for sigma_e in (0.0, 0.05, 1.0, 3.0):
@@ -75,8 +75,8 @@ def test_the_exact_model_stays_finite_far_from_the_expected_count(observed_e: fl
 
 
 @pytest.mark.parametrize("model", [SHIFTED_POISSON, POISSON_GAUSSIAN, LEAST_SQUARES])
-@pytest.mark.parametrize("variance", [0.5, 4.0])
-def test_one_minus_the_ratio_is_the_derivative_of_the_value(model: int, variance: float) -> None:
+def test_one_minus_the_ratio_is_the_derivative_of_the_value(model: int) -> None:
+    variance = 0.5
     generator = np.random.default_rng(6)
     for observed in generator.normal(2, 3, (20, 1)):
         expected = generator.uniform(0.5, 5, 1)
@@ -107,7 +107,7 @@ def test_counts_are_impossible_where_none_are_expected() -> None:
     assert judged(SHIFTED_POISSON, zero, zero, 0.0, background=0.0)[1] == 0.0
 
 
-@pytest.mark.parametrize("sigma_e", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("sigma_e", [0.3, 2.0])
 def test_the_exact_model_has_no_bias_where_the_shifted_one_has(sigma_e: float) -> None:
     """The mean of the score at the true mean, integrated over g: zero for the truth."""
     mean_e, counts = 0.97, np.arange(40)

@@ -35,13 +35,13 @@ def summed_information(mean_e: float, read_noise_e: float) -> float:
     return float(np.trapezoid(score2, values))
 
 
-@pytest.mark.parametrize("read_noise_e", [0.1, 0.3, 0.7, 1.0, 2.0, 2.9])
-@pytest.mark.parametrize("mean_e", [0.01, 0.3, 2.0, 30.0])
+@pytest.mark.parametrize("read_noise_e", [0.1, 0.7, 2.9])
+@pytest.mark.parametrize("mean_e", [0.01, 2.0])
 def test_the_information_of_a_pixel_is_that_of_its_density(mean_e: float, read_noise_e: float) -> None:
     assert pixel_information(mean_e, read_noise_e) == pytest.approx(summed_information(mean_e, read_noise_e), rel=2e-3)
 
 
-@pytest.mark.parametrize(("mean_e", "read_noise_e"), [(0.01, 3.1), (1.0, 3.5), (200.0, 1.0), (150.0, 8.0)])
+@pytest.mark.parametrize(("mean_e", "read_noise_e"), [(0.01, 3.1), (200.0, 1.0)])
 def test_with_much_read_noise_or_light_it_is_that_of_the_likelihood_in_use(mean_e: float, read_noise_e: float) -> None:
     information = pixel_information(mean_e, read_noise_e)
     assert information == pytest.approx(1 / (mean_e + read_noise_e**2), rel=1e-12)
@@ -125,7 +125,7 @@ def bar_in_pixels(side_px: float, at_px: float, blur_px: float) -> NDArray[np.fl
     return np.diff(lit_up_to(edges - at_px + side_px / 2) - lit_up_to(edges - at_px - side_px / 2))
 
 
-@pytest.mark.parametrize(("side_px", "blur_px"), [(0.5, 0.0), (1.0, 0.0), (7.0, 0.0), (1.0, 0.8), (7.0, 1.5)])
+@pytest.mark.parametrize(("side_px", "blur_px"), [(0.5, 0.0), (7.0, 0.0), (1.0, 0.8)])
 def test_the_area_that_counts_is_the_mean_over_all_places_of_a_square(side_px: float, blur_px: float) -> None:
     energies = [np.square(bar_in_pixels(side_px, 30 + at, blur_px)).sum() for at in np.linspace(0, 1, 50, False)]
     assert feature_area_px2(side_px, blur_px) == pytest.approx(np.mean(energies) ** 2, rel=5e-3)
@@ -149,7 +149,7 @@ def test_the_square_at_the_smallest_contrast_is_five_deviations_of_its_best_esti
     assert math.sqrt(evidence) == pytest.approx(5.0, rel=0.01)
 
 
-@pytest.mark.parametrize(("side_px", "blur_px"), [(1.0, 0.0), (8.0, 0.0), (5.0, 1.0)])
+@pytest.mark.parametrize(("side_px", "blur_px"), [(8.0, 0.0), (5.0, 1.0)])
 def test_the_depth_bound_is_that_of_squares_that_move_between_views(side_px: float, blur_px: float) -> None:
     depth_mm, f_px, difference_e, information = 500.0, 800.0, 0.7, 0.3
     nodes = [(x, y) for x in (-50.0, 0.0, 50.0) for y in (-50.0, 0.0, 50.0)]

@@ -1,14 +1,11 @@
-"""Several planes in one sweep against operators of one plane each; blocks against scipy; data that stay on disk."""
+"""Several planes in one sweep against operators of one plane each; data that stay on disk."""
 
 import tracemalloc
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from faintfield.calib.homography import fronto_parallel_rt_ref_plane, plane_from_ray
 from faintfield.calib.lens import Lens
@@ -86,16 +83,7 @@ def test_a_scene_is_the_sum_of_its_planes(occluded: bool, generator: np.random.G
         np.testing.assert_allclose(back, one.adjoint(t * images), atol=1e-12)
 
 
-def test_a_scene_and_its_adjoint_are_adjoint(generator: np.random.Generator) -> None:
-    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **known(generator), occluders=occluders(generator))
-    samples, images = scene.samples_of(planes_of(generator)), generator.normal(size=IMAGES_SHAPE)
-    seen = scene.forward(samples)
-    back = float(np.vdot(samples, scene.adjoint(images)))
-    assert abs(float(np.vdot(seen, images)) - back) <= 1e-12 * np.linalg.norm(seen) * np.linalg.norm(images)
-
-
-@pytest.mark.parametrize("occluded", [False, True])
-@pytest.mark.parametrize("likelihood", ["shifted-poisson", "least-squares"])
+@pytest.mark.parametrize(("likelihood", "occluded"), [("shifted-poisson", True), ("least-squares", False)])
 def test_sums_without_images_are_those_of_forward_and_adjoint(
     likelihood: LikelihoodName, occluded: bool, generator: np.random.Generator
 ) -> None:
@@ -122,49 +110,12 @@ def test_sums_without_images_are_those_of_forward_and_adjoint(
         np.testing.assert_allclose(own, expected, atol=1e-12)
 
 
-def test_the_ratio_of_a_scene_uses_the_light_of_all_planes(generator: np.random.Generator) -> None:
-    options = known(generator)
-    scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS, **options)
-    samples = scene.samples_of([generator.uniform(0.5, 2.0, grid.shape) for grid in GRIDS])
-    electrons = generator.normal(1.0, 3.0, IMAGES_SHAPE)
-    images = ElementalImages(electrons, 0.25, 2.0, options["valid"])
-    value, ratios = scene.value_and_ratio(samples, images)
-    mean, shifted = scene.forward(samples) + 2.25, np.maximum(electrons + 2.0, 0)
-    for ratio, one in zip(scene.planes_of(ratios), singles(options), strict=True):
-        np.testing.assert_allclose(ratio, one.adjoint(shifted / mean), atol=1e-12)
-    met = scene.forward(np.ones(scene.samples_shape)) > 0
-    terms = mean - shifted + shifted * np.log(np.where(shifted > 0, shifted, 1.0) / mean)
-    assert value == pytest.approx(terms[met].sum(), rel=1e-12)
-    assert scene.negative_log_likelihood(samples, images) == pytest.approx(value, rel=1e-12)
-
-
-@pytest.mark.parametrize("plane", range(len(GRIDS)))
-def test_blocks_in_step_and_scattered_interpolate_as_scipy_does(plane: int, generator: np.random.Generator) -> None:
-    grid, samples = GRIDS[plane], generator.normal(size=GRIDS[plane].shape)
-    seen = PlaneOperator(HOMOGRAPHIES[plane], LENS.rays(), grid, dtype=np.float64).forward(samples)
-    at = index_of_pixels(HOMOGRAPHIES[plane], grid)
-    rows, columns = grid.shape
-    inside = (at[0] >= 0) & (at[0] <= rows - 1) & (at[1] >= 0) & (at[1] <= columns - 1)
-    assert all(inside[view].sum() > 200 for view in range(3))
-    expected = np.where(inside, map_coordinates(samples, at, order=1, mode="nearest"), 0)
-    np.testing.assert_allclose(seen, expected, atol=1e-10)
-
-
-def index_of_pixels(homographies: NDArray[Any], grid: PlaneGrid) -> NDArray[np.float64]:
-    """Row and column (2, view, row, column) on a plane's grid that each pixel looks at."""
-    rays = np.concatenate([LENS.rays(), np.ones((*IMAGES_SHAPE[1:], 1))], axis=-1)
-    x, y, scale = np.einsum("vij,rcj->ivrc", homographies, rays)
-    return np.stack([(y / scale - grid.origin_mm[1]), (x / scale - grid.origin_mm[0])]) / grid.pitch_mm
-
-
 @pytest.mark.parametrize(
     ("bad", "words"),
     [
         ({"occluders": Occluders([np.ones((2, 2))] * 3, DEPTHS_MM)}, "opacities of shapes"),
         ({"occluders": Occluders([np.ones(grid.shape) for grid in GRIDS], DEPTHS_MM[:2])}, "and 2 depths do not fit"),
         ({"occluders": Occluders([np.full(grid.shape, -0.1) for grid in GRIDS], DEPTHS_MM)}, "an opacity is negative"),
-        ({"occluders": Occluders([np.full(grid.shape, np.nan) for grid in GRIDS], DEPTHS_MM)}, "not a finite number"),
-        ({"grids": GRIDS[:2]}, "do not fit"),
         ({"grids": (*GRIDS[:2], PlaneGrid((5, 5), 1.0, (9e5, 0.0)))}, "no pixel of any of the 4 views"),
     ],
 )
@@ -173,8 +124,8 @@ def test_parts_of_a_scene_that_do_not_fit_are_refused(bad: dict[str, Any], words
         SceneOperator(HOMOGRAPHIES, LENS.rays(), **{"grids": GRIDS, **bad})
 
 
-@pytest.mark.parametrize("shapes", [(GRIDS[0].shape,), (GRIDS[1].shape, GRIDS[0].shape, GRIDS[2].shape)])
-def test_planes_of_other_shapes_than_the_scenes_are_refused(shapes: Sequence[tuple[int, int]]) -> None:
+def test_planes_of_other_shapes_than_the_scenes_are_refused() -> None:
+    shapes = (GRIDS[1].shape, GRIDS[0].shape, GRIDS[2].shape)
     scene = SceneOperator(HOMOGRAPHIES, LENS.rays(), GRIDS)
     with pytest.raises(GeometryMismatch, match="shapes"):
         scene.samples_of([np.ones(shape) for shape in shapes])

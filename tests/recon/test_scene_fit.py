@@ -1,7 +1,6 @@
 """Several planes solved together, against a primal-dual method on dense matrices and the solver of one plane."""
 
 import tracemalloc
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,10 +10,8 @@ from faintfield.recon.operator.grid import PlaneGrid
 from faintfield.recon.operator.occlusion import Occluders
 from faintfield.recon.operator.scene_operator import SceneOperator
 from faintfield.recon.prior.evidence import evidence_of_planes
-from faintfield.recon.solver.cross_validation import cross_validated_weight
 from faintfield.recon.solver.data_fit import SceneProblem
-from faintfield.recon.solver.initialization import mean_light_e, universal_penalty_weight
-from faintfield.recon.solver.penalties import Penalty
+from faintfield.recon.solver.initialization import mean_light_e
 from faintfield.recon.solver.pmlem import PmlemIterate, pmlem
 from faintfield.recon.solver.uncertainty import local_fits
 from tests.recon.small_problems import problem
@@ -71,10 +68,9 @@ def differences() -> Image:
     return matrix.reshape(-1, index.size)
 
 
-def objective_and_gradient(posed: SceneProblem, matrix: Image, f: Image) -> tuple[float, Image]:
+def objective_and_gradient(posed: SceneProblem, counted: tuple[Image, Image], f: Image) -> tuple[float, Image]:
     """The negative log-likelihood of all planes and its gradient, by formulas of their own."""
-    rows = matrix[matrix.any(axis=1)]
-    g = posed.images.electrons.ravel()[matrix.any(axis=1)]
+    rows, g = counted
     mean = rows @ f + 0.3
     if posed.images.likelihood.name == "least-squares":
         variance = 2.0 + 0.3 + 1.0
@@ -86,12 +82,13 @@ def objective_and_gradient(posed: SceneProblem, matrix: Image, f: Image) -> tupl
 def primal_dual(posed: SceneProblem, weight: float, passes: int) -> Image:
     """The optimum by Condat and Vũ's iteration with fixed steps."""
     matrix, gradient_of = dense(posed.operator), differences()
-    samples = matrix.shape[1]
+    samples, counted = matrix.shape[1], matrix.any(axis=1)
+    seen = matrix[counted], posed.images.electrons.ravel()[counted]
     curvature = np.linalg.norm(matrix, 2) ** 2 * 4
     step, dual_step = 1 / curvature, curvature / (16 * weight**2)
     f, p = np.ones(samples), np.zeros(2 * samples)
     for _ in range(passes):
-        slope = objective_and_gradient(posed, matrix, f)[1]
+        slope = objective_and_gradient(posed, seen, f)[1]
         ahead = np.maximum(f - step * (slope + weight * (gradient_of.T @ p)), 0)
         p = p + dual_step * weight * (gradient_of @ (2 * ahead - f))
         p = (p.reshape(2, samples) / np.maximum(np.hypot(*p.reshape(2, samples)), 1)).ravel()
@@ -99,9 +96,7 @@ def primal_dual(posed: SceneProblem, weight: float, passes: int) -> Image:
     return f
 
 
-@pytest.mark.parametrize(
-    ("likelihood", "occluded"), [("shifted-poisson", False), ("shifted-poisson", True), ("least-squares", False)]
-)
+@pytest.mark.parametrize(("likelihood", "occluded"), [("shifted-poisson", True), ("least-squares", False)])
 def test_planes_solved_together_agree_with_a_primal_dual_method(likelihood: LikelihoodName, occluded: bool) -> None:
     posed = scene(likelihood, occluded=occluded)
     best = primal_dual(posed, WEIGHT, 5000)
@@ -111,19 +106,9 @@ def test_planes_solved_together_agree_with_a_primal_dual_method(likelihood: Like
     assert min(alone) > 0.2 * max(alone)
 
 
-def test_the_objective_never_rises() -> None:
-    posed = scene()
-    start = posed.start()
-    iterates = pmlem(posed.fit(mean_light_e(posed.operator, start)), start, penalty_weight=WEIGHT, dual=posed.dual())
-    objectives = [next(iterates).objective for _ in range(30)]
-    assert all(after <= before * (1 + 1e-7) for before, after in pairwise(objectives))
-    assert objectives[-1] < objectives[0] - 10
-
-
-@pytest.mark.parametrize("occluded", [False, True])
-def test_no_array_is_as_large_as_the_images(occluded: bool) -> None:
-    _solve(_wide_scene(3, occluded))  # compiles and imports
-    posed = _wide_scene(60, occluded)
+def test_no_array_is_as_large_as_the_images() -> None:
+    _solve(_wide_scene(3))  # compiles and imports
+    posed = _wide_scene(60)
     tracemalloc.start()
     _solve(posed)
     peak = tracemalloc.get_traced_memory()[1]
@@ -131,14 +116,14 @@ def test_no_array_is_as_large_as_the_images(occluded: bool) -> None:
     assert peak < posed.images.electrons.nbytes / 4
 
 
-def _wide_scene(views: int, occluded: bool) -> SceneProblem:
-    """Two planes of few samples in views of many pixels."""
+def _wide_scene(views: int) -> SceneProblem:
+    """Two planes of few samples, which hide each other, in views of many pixels."""
     generator = np.random.default_rng(5)
     homographies = np.stack([np.eye(3)] * 2 * views).reshape(2, views, 3, 3)
     homographies[0, :, :2, 2] = generator.uniform(-9, 9, (views, 2))
     rays = np.stack(np.meshgrid(np.arange(128.0), np.arange(128.0)), axis=-1)
     grids = [PlaneGrid((32, 32), 4.0, (0.0, 0.0))] * 2
-    hiding = Occluders([np.full((32, 32), 0.5)] * 2, [500.0, 700.0]) if occluded else None
+    hiding = Occluders([np.full((32, 32), 0.5)] * 2, [500.0, 700.0])
     electrons = generator.normal(1, 3, (views, 128, 128)).astype(np.float32)
     operator = SceneOperator(homographies, rays, grids, occluders=hiding, workers=2)
     return SceneProblem(operator, ElementalImages(electrons, 0.1, 9.0))
@@ -197,14 +182,3 @@ def test_views_that_are_left_out_do_not_count() -> None:
     np.testing.assert_allclose(second.value_and_gradient(posed.start())[1], gradient, rtol=1e-12)
     np.testing.assert_allclose(second.metric(posed.start()), first.metric(posed.start()), rtol=1e-12)
     assert not np.allclose(posed.fit(1.0).metric(posed.start()), first.metric(posed.start()))
-
-
-def test_validation_views_choose_one_weight_for_all_planes() -> None:
-    posed = scene()
-    chosen = cross_validated_weight(
-        posed, universal_penalty_weight(posed.operator, posed.images, posed.start()), Penalty()
-    )
-    weights = list(chosen.candidates)
-    assert min(weights) <= chosen.weight <= max(weights)
-    assert chosen.solution is not None
-    assert chosen.solution.plane.shape == (10 * 9 + 7 * 8,)

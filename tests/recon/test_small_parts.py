@@ -42,9 +42,7 @@ def test_a_blur_is_scipys_convolution_with_repeated_edges(seed: int, spacings: l
     np.testing.assert_allclose(blurred(image, spacings), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("share", "expected"), [(0.1, 0.0), (0.15, 0.0), (0.2, 0.25), (0.25, 0.5), (0.35, 1.0), (0.5, 1.0)]
-)
+@pytest.mark.parametrize(("share", "expected"), [(0.15, 0.0), (0.2, 0.25), (0.35, 1.0)])
 def test_opacity_rises_from_fifteen_to_thirty_five_hundredths_of_the_typical_light(
     share: float, expected: float
 ) -> None:
@@ -63,8 +61,8 @@ def test_a_black_plane_is_transparent() -> None:
     assert opacity(np.zeros((8, 8), np.float32)).dtype == np.float32
 
 
-@pytest.mark.parametrize("vertex", [-0.4, 0.0, 0.3])
-def test_the_lowest_point_of_a_parabola(vertex: float) -> None:
+def test_the_lowest_point_of_a_parabola() -> None:
+    vertex = -0.4
     assert _lowest_offset([7 + 2 * (n - vertex) ** 2 for n in (-1, 0, 1)]) == pytest.approx(vertex)
 
 
@@ -111,21 +109,16 @@ def test_noisier_pixels_bound_the_curvature_of_the_samples_that_they_see_by_the_
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
-@pytest.mark.parametrize("mean_e", [0.05, 1.0, 20.0])
-@pytest.mark.parametrize("read_noise_e", [0.2, 0.6, 1.5])
+@pytest.mark.parametrize(("mean_e", "read_noise_e"), [(0.05, 0.6), (1.0, 0.2), (20.0, 1.5)])
 def test_the_share_of_read_noise_is_that_of_fishers_information(mean_e: float, read_noise_e: float) -> None:
     counts = np.arange(int(mean_e + 12 * np.sqrt(mean_e)) + 20)
 
-    def density(mean: float, at: float) -> float:
-        return float(stats.poisson.pmf(counts, mean) @ stats.norm.pdf(at, counts, read_noise_e))
-
-    def integrand(at: float) -> float:
-        here = density(mean_e, at)
-        slope = (density(mean_e * 1.0001, at) - density(mean_e * 0.9999, at)) / (2e-4 * mean_e)
-        return slope**2 / here if here > 1e-250 else 0.0
-
     places = np.linspace(-7 * read_noise_e, counts[-1], 4000)
-    information = np.trapezoid([integrand(at) for at in places], places)
+    readings = stats.norm.pdf(places[:, np.newaxis], counts, read_noise_e)
+    below, here, above = (readings @ stats.poisson.pmf(counts, mean_e * factor) for factor in (0.9999, 1, 1.0001))
+    slope = (above - below) / (2e-4 * mean_e)
+    integrand = np.divide(slope**2, here, out=np.zeros_like(here), where=here > 1e-250)
+    information = np.trapezoid(integrand, places)
     expected = np.clip((1 / information - mean_e) / read_noise_e**2, 0, 1)
     assert read_noise_share(mean_e, read_noise_e) == pytest.approx(expected, abs=2e-3)
 
@@ -144,8 +137,3 @@ def test_the_chosen_likelihood_counts_the_share_of_the_typical_pixel() -> None:
     assert found.name == "poisson-gaussian"
     assert found.read_noise_share == read_noise_share(2.0, 0.6)
     assert select_likelihood(images, "least-squares", 0.0).level_e > 0
-
-
-def test_images_binned_by_one_are_the_images() -> None:
-    images = ElementalImages(np.ones((2, 4, 4)))
-    assert images.binned(1) is images

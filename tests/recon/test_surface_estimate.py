@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from faintfield.recon.errors import NothingInFocus
 from faintfield.recon.surface import estimate
 from faintfield.recon.surface.confidence import RIGHT_WITHIN
-from faintfield.recon.surface.estimate import _OUTLIERS, SurfaceEstimate, _votes, estimate_surface, halves, next_depths
+from faintfield.recon.surface.estimate import _OUTLIERS, SurfaceEstimate, _votes, estimate_surface, halves
 from faintfield.recon.surface.evidence import DepthEvidence, Halves
 from faintfield.recon.surface.held_out import predicted, seen_of, squared_errors
 from faintfield.recon.surface.pinhole_views import UNKNOWN, PinholeViews
@@ -98,25 +98,11 @@ def test_no_window_is_more_certain_than_outliers_allow() -> None:
     np.testing.assert_allclose(votes[:, :, 3] - votes[:, :, 7], gap, rtol=1e-4)
 
 
-def test_outlines_are_moved_before_depths_are_returned(monkeypatch: pytest.MonkeyPatch) -> None:
-    evidence = DepthEvidence(surface_scene.drawn_views(LEVEL_E), DEPTHS, halves(NODES))
-    moved = np.full(SHAPE, 7, np.float32)
-    monkeypatch.setattr(estimate, "moved_edges", lambda *_: moved)
-    assert next_depths(evidence, evidence.explained(np.full(SHAPE, 3.0)))[0] is moved
-
-
 def test_what_is_called_sure_is_right() -> None:
     error, confidence = _error(_estimate()), _estimate().confidence
     assert 0 <= confidence.min() < confidence.max() < 1
     assert confidence[error < RIGHT_WITHIN].mean() > confidence[error > RIGHT_WITHIN].mean() + 0.2
     assert (error[confidence > 0.9] < RIGHT_WITHIN).mean() > 0.95
-
-
-def test_a_surface_is_the_same_again() -> None:
-    views = surface_scene.drawn_views(LEVEL_E)
-    again = estimate_surface(views, DEPTHS, NODES)
-    np.testing.assert_array_equal(again.inverse_depth, _estimate().inverse_depth)
-    np.testing.assert_array_equal(again.confidence, _estimate().confidence)
 
 
 def test_the_number_of_threads_changes_the_rounding_only(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,15 +124,6 @@ def test_pixels_without_a_number_matter_only_nearby() -> None:
     change = np.abs(found.inverse_depth / _estimate().inverse_depth - 1)
     assert (change[far_away] < RIGHT_WITHIN / 4).mean() > 0.97
     assert (_error(found)[surface_scene.away_from_edges(2)] < RIGHT_WITHIN).mean() > 0.95
-
-
-def test_swapped_halves_find_nearly_the_same() -> None:
-    views = surface_scene.drawn_views(LEVEL_E)
-    shifted = NODES + np.array([0, 1])
-    assert set(halves(shifted).first) == set(halves(NODES).second)
-    found = estimate_surface(views, DEPTHS, shifted)
-    change = np.abs(found.inverse_depth / _estimate().inverse_depth - 1)
-    assert (change < RIGHT_WITHIN / 4).mean() > 0.98
 
 
 def test_halves_are_a_checkerboard_of_those_that_count() -> None:
@@ -212,8 +189,8 @@ def test_the_range_stays_within_that_searched() -> None:
     assert 1 / 602 <= far < FAR < NEAR < near <= 1 / 498
 
 
-@pytest.mark.parametrize("level_e", [0.5, 5.0])
-def test_noise_alone_has_no_range(level_e: float) -> None:
+def test_noise_alone_has_no_range() -> None:
+    level_e = 5.0
     noise = np.random.default_rng(1)
     light = noise.poisson(level_e, (25, *SHAPE)) + noise.normal(0, surface_scene.READ_VARIANCE_E2**0.5, (25, *SHAPE))
     with pytest.raises(NothingInFocus, match=r"^the views tell the depth of [0-9.]+% of the picture; give"):

@@ -7,7 +7,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse import csr_array
-from skimage.restoration import denoise_tv_chambolle
 
 from faintfield.recon.surface.generalized_variation import PiecewisePlane
 from faintfield.recon.surface.paths import lowest, sum_over_paths
@@ -83,23 +82,6 @@ def test_a_slanted_plane_stays_as_it_is() -> None:
     np.testing.assert_allclose(surface.values, plane, atol=2e-3)
     np.testing.assert_allclose(surface.slopes[0, 1:-1, 1:-1], 0.3, atol=2e-3)
     np.testing.assert_allclose(surface.slopes[1, 1:-1, 1:-1], -0.2, atol=2e-3)
-
-
-def test_a_noisy_slanted_plane_gets_no_stairs() -> None:
-    plane = _plane(32, 40)
-    noisy = plane + np.random.default_rng(4).normal(0, 0.8, plane.shape)
-    surface = PiecewisePlane.start(noisy)
-    surface.approach(noisy, 1.0, (1.0, 6.0), 1500)
-    inner = np.s_[3:-3, 3:-3]
-
-    def error(found: NDArray[np.floating]) -> float:
-        return float(np.sqrt(np.mean((found - plane)[inner] ** 2)))
-
-    stairs = [denoise_tv_chambolle(noisy, weight, eps=1e-6, max_num_iter=600) for weight in (0.3, 0.5, 0.8, 1.2)]
-    assert error(surface.values) < 0.6 * min(map(error, stairs))
-    across = np.diff(surface.values, axis=1)[inner]
-    assert across.mean() == pytest.approx(0.3, abs=0.02)
-    assert across.std() < 0.5 * min(np.diff(stair, axis=1)[inner].std() for stair in stairs)
 
 
 def _differences(fields: NDArray[np.float64]) -> NDArray[np.float64]:

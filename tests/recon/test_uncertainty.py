@@ -103,8 +103,8 @@ def test_sigma_includes_contrast_that_the_penalty_removed_where_it_did() -> None
     assert sigmas[1][beside].mean() < 0.2
 
 
-@pytest.mark.parametrize("name", ["tv", "quadratic", "huber-tv"])
-def test_a_larger_weight_reduces_sigma(name: PenaltyName) -> None:
+def test_a_larger_weight_reduces_sigma() -> None:
+    name: PenaltyName = "tv"
     sigmas = [
         standard_deviation(constant(np.full((40, 40), 2.0)), weight, Penalty(name, 0.1), np.random.default_rng(1))
         for weight in (0.25, 0.5, 1.0)
@@ -128,8 +128,9 @@ def texture(size: int) -> Image:
     return np.asarray(np.maximum(1 + 0.25 * rough / rough.std(), 0), np.float32)
 
 
-@pytest.mark.parametrize("prior", ["tv", "patches"])
-@pytest.mark.parametrize("truth", [pieces(64), texture(64)], ids=["pieces", "texture"])
+@pytest.mark.parametrize(
+    ("truth", "prior"), [(pieces(64), "patches"), (texture(64), "tv")], ids=["pieces, patches", "texture, variation"]
+)
 def test_intervals_cover_the_truth_on_objects(truth: Image, prior: PriorName) -> None:
     held = []
     for seed in range(3):

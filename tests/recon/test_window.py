@@ -56,7 +56,7 @@ def large_operator() -> tuple[PlaneOperator, np.ndarray, Lens, PlaneGrid]:
     return PlaneOperator(homographies, lens.rays(), grid), homographies, lens, grid
 
 
-@pytest.mark.parametrize("corner", [(0, 0), (270, 0), (131, 207), (0, 371)])
+@pytest.mark.parametrize("corner", [(131, 207), (0, 371)])
 def test_a_small_window_of_a_large_plane_is_found_on_the_detector(corner: tuple[int, int]) -> None:
     operator, homographies, lens, grid = large_operator()
     rows, columns = (slice(first, first + 29) for first in corner)

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from faintfield.rig.cameras.settings import SimulatedSettings
 from faintfield.rig.errors import KeepOutCrossed, OutsideTravel
 from faintfield.rig.plan import MAX_FRAMES, CapturePlan, CaptureStep, Grid, centre_node
-from faintfield.rig.settings import SettleSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
@@ -62,7 +61,7 @@ def test_a_plan_of_too_many_frames_is_refused_before_they_are_listed() -> None:
         plan_of(Grid(1, 1, 1.0, Point(0.0, 0.0)), (CaptureStep("flat", (0.1,), 10**12),))
 
 
-@pytest.mark.parametrize("exposure_s", [0.0, -1.0, math.nan, math.inf, 1e6])
+@pytest.mark.parametrize("exposure_s", [-1.0, math.nan, 1e6])
 def test_impossible_exposure_times_are_refused(exposure_s: float) -> None:
     with pytest.raises(ValueError, match="exposure"):
         CaptureStep("flat", (0.1, exposure_s))
@@ -70,17 +69,11 @@ def test_impossible_exposure_times_are_refused(exposure_s: float) -> None:
 
 @pytest.mark.parametrize(
     "impossible",
-    [{"size_px": (200_000, 200_000)}, {"lit_photons_per_s": -1.0}, {"seed": -1}, {"saturation_dn": 2**16}],
+    [{"size_px": (200_000, 200_000)}, {"saturation_dn": 2**16}],
 )
 def test_impossible_simulated_cameras_are_refused(impossible: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"camera.*; "):
         SimulatedSettings(**impossible)
-
-
-@pytest.mark.parametrize("impossible", [{"longest_s": 3601.0}, {"wait_s": 1e9}, {"exposure_s": 1e9}])
-def test_endless_rests_are_refused(impossible: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match="at most 3600 s"):
-        SettleSettings(**impossible)
 
 
 def test_frames_and_disk_space() -> None:

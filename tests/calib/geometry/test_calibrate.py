@@ -13,7 +13,6 @@ from faintfield.calib.errors import NotIdentifiable, PoorFit, TooFewViews
 from faintfield.calib.geometry import (
     BoardObservation,
     GeometrySettings,
-    Node,
     RigGeometry,
     calibrate_geometry,
     rms_over_views,
@@ -45,7 +44,7 @@ def pose_errors(geometry: RigGeometry, truth: NDArray[np.float64]) -> tuple[NDAr
 
 @pytest.fixture(scope="module")
 def many() -> list[tuple[Simulated, RigGeometry]]:
-    return [(given, calibrated(given, LENIENT)) for given in (simulated(seed) for seed in range(16))]
+    return [(given, calibrated(given, LENIENT)) for given in (simulated(seed) for seed in range(8))]
 
 
 def test_corners_without_noise_give_the_truth() -> None:
@@ -57,12 +56,12 @@ def test_corners_without_noise_give_the_truth() -> None:
 
 
 def test_stated_covariance_is_that_of_the_errors(many: list[tuple[Simulated, RigGeometry]]) -> None:
-    """NEES: e' C⁻¹ e has mean one per number; 16 seeds of 57 numbers put three standard errors at 0.14."""
+    """NEES: e' C⁻¹ e has mean one per number; 8 seeds of 57 numbers put three standard errors at 0.2."""
     ratios = []
     for given, geometry in many:
         error, covariance = pose_errors(geometry, given.poses)
         ratios.append(error @ np.linalg.solve(covariance, error) / len(error))
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.14)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=0.2)
 
 
 def test_stated_centre_sigma_is_that_of_the_centres(many: list[tuple[Simulated, RigGeometry]]) -> None:
@@ -142,6 +141,7 @@ def test_boards_in_turn_reveal_the_repeatability_of_the_stage() -> None:
     assert geometry.sigma_px == pytest.approx(NOISE_PX, rel=0.03)
 
 
+@pytest.mark.deep
 def test_covariance_includes_the_repeatability_of_the_stage() -> None:
     """Without the gantry's share the ratio would be several; with it, 8 seeds of 57 numbers: 0.9 to 1.1 within 0.25."""
     ratios, blind = [], []
@@ -172,32 +172,20 @@ def test_one_board_that_faces_the_camera_is_refused_with_what_to_add() -> None:
     assert "\n" not in str(refusal.value)
 
 
-def test_boards_too_far_are_refused() -> None:
-    far = [replace(board, rt_ref_board=board.rt_ref_board * [1, 1, 1, 6, 6, 6]) for board in six_boards(6, 8, 40.0)]
-    with pytest.raises(NotIdentifiable, match=r"nearest board stands at \d+ mm: bring some to about 500 mm"):
-        calibrated(simulated(8, standing=far))
-
-
-@pytest.mark.parametrize("nodes", [((1, 1),), ((1, 1), (1, 2)), ((1, 1), (1, 2), (2, 2))])
-def test_too_few_nodes_are_refused(nodes: tuple[Node, ...]) -> None:
+def test_too_few_nodes_are_refused() -> None:
+    nodes = ((1, 1), (1, 2), (2, 2))
     few = [one for one in simulated(9).observations if one.node in nodes]
     with pytest.raises(TooFewViews, match=rf"^{len(nodes)} node\(s\) show the boards .*, limit 4; take more nodes"):
         calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1))
 
 
-@pytest.mark.parametrize("depth_mm", [0.5, 5.0])
-def test_a_plane_that_other_views_do_not_see_is_refused(depth_mm: float) -> None:
+def test_a_plane_that_other_views_do_not_see_is_refused() -> None:
+    depth_mm = 5.0
     given = simulated(9)
     with pytest.raises(NotIdentifiable, match=rf"plane at {depth_mm:g} mm: 0 of the 8 views .* --depth-mm in mm"):
         calibrate_geometry(
             BOARDS, given.observations, OPTICS.size_px, (1, 1), GeometrySettings(depths_mm=(500.0, depth_mm))
         )
-
-
-def test_few_nodes_are_named_where_the_transfer_is_not_known() -> None:
-    few = [one for one in simulated(9, standing=six_boards(6, 8, 40.0)[:2]).observations if one.node[0] <= 1]
-    with pytest.raises(NotIdentifiable, match=r"6 node\(s\) only: take at least 9"):
-        calibrate_geometry(BOARDS, few, OPTICS.size_px, (1, 1), GeometrySettings(max_transfer_sigma_px=0.1))
 
 
 def test_without_the_reference_node_nothing_is_solved() -> None:
@@ -242,8 +230,8 @@ def test_a_node_without_boards_is_left_out_and_the_others_stay() -> None:
     assert np.abs(centres_mm(geometry.rt_cam_ref) - centres_mm(truth)).max() < 0.5
 
 
-@pytest.mark.parametrize("lens_model", ["opencv4", "opencv5", "opencv8"])
-def test_other_lens_models(lens_model: str) -> None:
+def test_other_lens_models() -> None:
+    lens_model = "opencv8"
     geometry = calibrated(simulated(13, side=5), replace(LENIENT, lens_model=lens_model))
     assert len(geometry.lens.distortion) == int(lens_model[-1])
     assert geometry.lens.fx_px == pytest.approx(OPTICS.fx_px, abs=2.0)
@@ -272,6 +260,7 @@ def test_a_shaken_view_is_named_and_does_not_pull() -> None:
     assert calibrated(given).warnings == []
 
 
+@pytest.mark.deep
 def test_one_view_of_another_node_is_named() -> None:
     given = simulated(15)
     elsewhere = next(one for one in given.observations if (one.node, one.target.board) == ((2, 2), "board-3"))
@@ -295,6 +284,7 @@ def test_nodes_swapped_in_one_sweep_are_refused_by_name() -> None:
         calibrated(replace(given, observations=swapped))
 
 
+@pytest.mark.deep
 def test_a_board_that_is_not_the_print_is_refused() -> None:
     given = simulated(17)
     wider = {name: replace(board, columns=10) for name, board in BOARDS.items()}

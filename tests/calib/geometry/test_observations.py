@@ -62,11 +62,6 @@ def test_nodes_count_that_a_chain_of_boards_connects_to_the_reference_which_come
         gather(views, SHAPES, (5, 5))
 
 
-def test_a_sweep_is_named_only_where_there_are_several() -> None:
-    found = gather([seen((0, 0), "small", ALL_SMALL, sweep=7)], SHAPES, (0, 0))
-    assert found.view_name(0) == "node (0, 0), board 'small'"
-
-
 def test_corners_lie_on_the_lattice_of_the_largest_board_with_weights_relative_to_the_median_sigma() -> None:
     views = [
         seen((0, 0), "small", ALL_SMALL, sigma_px=0.1),

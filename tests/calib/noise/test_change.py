@@ -24,9 +24,9 @@ def test_numbers_without_errors_have_no_sigma() -> None:
     assert np.isnan(difference_in_sigma(1.0, (1.0, 1.0), 2.0, (2.0, 2.0)))
 
 
-@pytest.mark.parametrize("frames", [(10, 10), (4, 40)])
-def test_maps_of_one_sensor_differ_as_their_errors_say(frames: tuple[int, int]) -> None:
+def test_maps_of_one_sensor_differ_as_their_errors_say() -> None:
     """Posterior means of offsets with spread 2, from means over frames with noise 3 each."""
+    frames = (4, 40)
     rng = np.random.default_rng(1)
     truth = 2 * rng.standard_normal(20_000)
 

@@ -138,13 +138,6 @@ def test_what_is_missing_is_the_reason() -> None:
     assert found["threshold_e"].value is not None
 
 
-def test_no_gain_leaves_nothing() -> None:
-    why = "no gain"
-    given = inputs(gain_dn_per_e=why, read_noise_e=why, quantum_efficiency=why, saturation_e=why)
-    found = derived_quantities(given, 0.0)
-    assert {it.why for it in found.values()} == {"no gain"}
-
-
 def test_a_product_of_powers_has_the_error_of_its_logarithm() -> None:
     value, se = propagate(lambda a, b: a**3 / b, np.array([2.0, 5.0]), np.diag([0.02**2, 0.1**2]))
     assert value == pytest.approx(1.6)

@@ -9,7 +9,7 @@ from scipy import linalg, stats
 
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.likelihood.gaussian import dark_variances_dn2, negative_log_likelihood
-from faintfield.calib.noise.likelihood.maximum import GaussianProblem, fit_gaussian
+from faintfield.calib.noise.likelihood.maximum import GaussianProblem
 from faintfield.calib.noise.likelihood.moments import DarkMoments, Excess, FlatMoments, Moments, gather_moments
 from tests.calib.noise.cramer_rao import Sensor, cramer_rao
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
@@ -55,18 +55,7 @@ def dense_log_likelihood(
     return float(total + stats.norm(line, np.sqrt(level)).logpdf(levels).sum() - 0.5 * restricted)
 
 
-@pytest.mark.parametrize(
-    ("name", "changed"),
-    [
-        ("dsnu_dn2", 5.0),
-        ("dcnu_dn2_per_s2", 0.3),
-        ("log_gain", 0.8),
-        ("log_read_dn2", 2.4),
-        ("jitter_dn2", 0.2),
-        ("offset_dn", 0.3),
-    ],
-)
-def test_likelihood_is_that_of_the_dense_covariance(name: str, changed: float) -> None:
+def test_likelihood_is_that_of_the_dense_covariance() -> None:
     """P pixels rotated into P − 1 contrasts and a mean: each contrast is an independent normal vector."""
     rng = np.random.default_rng(0)
     y = rng.normal(0, 3, (PIXELS, FRAMES.sum())) + rng.normal(0, 2, (PIXELS, 1))
@@ -82,7 +71,14 @@ def test_likelihood_is_that_of_the_dense_covariance(name: str, changed: float) -
         "dcnu_dn2_per_s2": 0.1,
         "log_gain": 0.3,
     }
-    other = one | {name: changed}
+    other = one | {
+        "dsnu_dn2": 5.0,
+        "dcnu_dn2_per_s2": 0.3,
+        "log_gain": 0.8,
+        "log_read_dn2": 2.4,
+        "jitter_dn2": 0.2,
+        "offset_dn": 0.3,
+    }
     ours = negative_log_likelihood(other, moments) - negative_log_likelihood(one, moments)
     dense = dense_log_likelihood(one, contrasts, levels) - dense_log_likelihood(other, contrasts, levels)
     assert float(ours) == pytest.approx(dense, rel=1e-9)
@@ -95,56 +91,43 @@ def test_bound_on_the_gain_from_one_bright_flat_pair() -> None:
     assert bound / 2.0 == pytest.approx(np.sqrt(2 / 10_000), rel=0.02)
 
 
-def test_bound_falls_with_the_root_of_the_pixels() -> None:
-    sensor = Sensor(2.0, 12**0.5, 0.2, dsnu_e=1.5)
-    few, many = (cramer_rao(sensor, EXPOSURES_S, 10, pixels) for pixels in (4096, 65536))
-    for name in few:
-        assert few[name] == pytest.approx(4 * many[name], rel=1e-3)
-    assert many["gain_dn_per_e"] / 2.0 == pytest.approx(0.0038, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    "rough",
-    [
-        pytest.param(False, id="plain"),
-        pytest.param(True, id="jitter, banding, hot pixels, DCNU", marks=pytest.mark.slow),
-    ],
-)
-def test_errors_reach_the_bound_and_intervals_cover(rough: bool) -> None:
-    repeats, first_seed = 200, 1000
-    faults = {"jitter_dn": 1.0, "banding_dn": 1.0, "hot_fraction": 0.005, "dcnu": 0.1} if rough else {}
-    sensor = Sensor(2.0, 12**0.5, 0.2, dsnu_e=1.5, dcnu_e_per_s=0.02 * rough, jitter_dn=1.0 * rough)
-    bound = cramer_rao(sensor, EXPOSURES_S, 10, 64 * 64)
-    errors: dict[str, list[float]] = {name: [] for name in TRUTH}
-    covered = dict.fromkeys(TRUTH, 0)
-    for seed in range(first_seed, first_seed + repeats):
-        result = calibrate(take_darks(*specimen(seed, **faults)))
+def errors_and_stated(
+    repeats: int, **changes: object
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return errors and stated errors (repeat, quantity), and in which share of repeats intervals hold the truth."""
+    errors, stated, covered = [], [], []
+    for seed in range(1000, 1000 + repeats):
+        result = calibrate(take_darks(*specimen(seed, **changes)))
         for name, truth in TRUTH.items():
             estimate = result.estimates[name]
             assert estimate.value is not None
+            assert estimate.se is not None
             assert estimate.ci95 is not None
-            errors[name].append(estimate.value - truth)
-            covered[name] += estimate.ci95[0] <= truth <= estimate.ci95[1]
-    for name in TRUTH:
-        assert np.sqrt(np.mean(np.square(errors[name]))) <= 1.1 * bound[name], name
-        assert 0.92 <= covered[name] / repeats <= 0.98, name
+            errors.append(estimate.value - truth)
+            stated.append(estimate.se)
+            covered.append(estimate.ci95[0] <= truth <= estimate.ci95[1])
+    shape = (repeats, len(TRUTH))
+    return np.reshape(errors, shape), np.reshape(stated, shape), np.reshape(covered, shape).mean(axis=0)
 
 
-def test_a_profile_likelihood_is_off_by_a_tenth_where_the_marginal_one_is_not() -> None:
-    """Offsets fitted pixel by pixel and series by series leave n − 1 of n degrees of freedom, unaccounted for."""
-    chip, rng = specimen(7, shape=(256, 256))
-    series = take_darks(chip, rng)
-    moments = gather_moments(series, [], np.ones(chip.sensor.shape, bool))
-    d = moments.darks
-    profiled = d.within_dn2 / (d.frames * moments.pixels)
-    signal, _ = np.polyfit(d.exposure_s, d.mean_dn, 1)
-    excess, read_dn2 = np.polyfit(d.exposure_s, profiled, 1)
-    naive_gain, naive_read = excess / signal, np.sqrt(read_dn2) / (excess / signal)
-    assert naive_gain / 2.0 - 1 == pytest.approx(-0.10, abs=0.02)
-    assert naive_read / 12**0.5 - 1 == pytest.approx(0.055, abs=0.02)
-    fit = fit_gaussian(moments)
-    assert np.exp(fit.values["log_gain"]) / 2.0 - 1 == pytest.approx(0, abs=3 * fit.standard_error("log_gain"))
-    assert fit.standard_error("log_gain") < 0.005
+def test_stated_errors_are_those_of_repeated_calibrations() -> None:
+    """Squares of errors over stated errors have mean one; 24 repeats of two unlike numbers know it within 0.45."""
+    errors, stated, _ = errors_and_stated(24, shape=(48, 48))
+    assert np.mean((errors / stated) ** 2) == pytest.approx(1.0, abs=0.45)
+    # The median, since series that scatter by chance widen what some calibrations state
+    bound = cramer_rao(Sensor(**TRUTH, dsnu_e=1.5), EXPOSURES_S, 10, 48 * 48)
+    np.testing.assert_allclose(np.median(stated, axis=0), [bound[name] for name in TRUTH], rtol=0.1)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("rough", [False, True], ids=["plain", "jitter, banding, hot pixels, DCNU"])
+def test_errors_reach_the_bound_and_intervals_cover(rough: bool) -> None:
+    faults = {"jitter_dn": 1.0, "banding_dn": 1.0, "hot_fraction": 0.005, "dcnu": 0.1} if rough else {}
+    sensor = Sensor(**TRUTH, dsnu_e=1.5, dcnu_e_per_s=0.02 * rough, jitter_dn=1.0 * rough)
+    bound = cramer_rao(sensor, EXPOSURES_S, 10, 64 * 64)
+    errors, _, covered = errors_and_stated(200, **faults)
+    assert (np.sqrt(np.mean(errors**2, axis=0)) <= [1.1 * bound[name] for name in TRUTH]).all()
+    assert ((covered >= 0.92) & (covered <= 0.98)).all()
 
 
 def test_gain_and_read_noise_from_flats_are_sharper_and_right() -> None:

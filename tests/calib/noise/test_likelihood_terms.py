@@ -85,14 +85,12 @@ def by_scipy(values: dict[str, float], moments: Moments) -> float:
 
 
 @pytest.mark.parametrize("flats", [FLATS, NO_FLATS], ids=["with flats", "darks alone"])
-@pytest.mark.parametrize("changed", [[name] for name in HERE] + [list(HERE)], ids=lambda names: "+".join(names[:2]))
 def test_the_gaussian_likelihood_is_that_of_chi_squared_wishart_and_normal_variables(
-    changed: list[str], flats: FlatMoments
+    flats: FlatMoments,
 ) -> None:
     moments = Moments(1200.0, 1100.0, DARKS, flats)
-    there = HERE | {name: THERE[name] for name in changed}
-    rise = by_scipy(there, moments) - by_scipy(HERE, moments)
-    ours = float(negative_log_likelihood(HERE, moments)) - float(negative_log_likelihood(there, moments))
+    rise = by_scipy(THERE, moments) - by_scipy(HERE, moments)
+    ours = float(negative_log_likelihood(HERE, moments)) - float(negative_log_likelihood(THERE, moments))
     assert ours == pytest.approx(rise, rel=1e-9, abs=1e-7)
 
 

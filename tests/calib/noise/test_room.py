@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import DTypeLike, NDArray
 
 from faintfield.calib.noise import Conditions, Series, SeriesSums, calibrate
-from faintfield.calib.noise.room import maps_by, new_map, release
+from faintfield.calib.noise.room import maps_by, release
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 SHAPE = (300, 400)
@@ -75,12 +75,3 @@ def test_maps_in_files_are_those_in_memory() -> None:
     assert in_memory[0] == in_file[0]
     for name in ("offset_dn", "read_noise_e", "dark_current_e_per_s", "relative_response", "unusable"):
         np.testing.assert_array_equal(getattr(in_memory[1], name), getattr(in_file[1], name))
-
-
-@pytest.mark.parametrize("allocate", [np.empty, in_files])
-def test_a_released_map_keeps_its_values(allocate: Any) -> None:
-    with maps_by(allocate):
-        made = new_map((100, 1000))
-    made[...] = np.arange(1000)
-    release()
-    assert (made == np.arange(1000)).all()

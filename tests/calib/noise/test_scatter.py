@@ -1,17 +1,15 @@
 """Intervals grow by the scatter that the series show, and quantities that the series deny have no value."""
 
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
-import casadi as ca
 import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.noise_coverage import CASES, record
 from faintfield.calib.noise import Conditions, Series, calibrate, measure_series
 from faintfield.calib.noise.likelihood.groups import group_noise
-from faintfield.calib.noise.likelihood.maximum import GaussianProblem, NoiseFit
+from faintfield.calib.noise.likelihood.maximum import NoiseFit
 from tests.calib.noise.darkroom import Chip, darks, expose, specimen
 
 CHIP = {"gain_dn_per_e": 0.5, "read_noise_e": 8.0, "dsnu_e": 3.0, "shape": (40, 40)}
@@ -113,28 +111,6 @@ def test_the_quantile_is_students_where_the_scatter_rules_and_normal_where_it_do
     assert shrunk.quantile(np.array([1.0, 0.0])) == pytest.approx(stats.norm.ppf(0.975))
 
 
-def test_the_search_ends_where_the_likelihood_is_rounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """−ln L of many values is so large that its rounding leaves a gradient above IPOPT's usual limit."""
-    asked: list[str] = []
-    solved: list[str] = []
-
-    def counted_fit(self: GaussianProblem, *given: Any) -> NoiseFit:
-        asked.append("fit")
-        return fit(self, *given)
-
-    def counted_call(self: ca.Function, *given: Any, **named: Any) -> Any:
-        solved.append(self.name())
-        return call(self, *given, **named)
-
-    fit, call = GaussianProblem.fit, ca.Function.__call__
-    monkeypatch.setattr(GaussianProblem, "fit", counted_fit)
-    monkeypatch.setattr(ca.Function, "__call__", counted_call)
-    camera, session = CASES["noise off by 2 %"]
-    calibrate(record(camera, session, np.random.default_rng(5)), camera.highest_dn)
-    assert asked
-    assert solved.count("fit") == len(asked)  # no search failed and was begun anew
-
-
 def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
     rng = np.random.default_rng(2)
     sigma = np.ones((32, 32))
@@ -149,7 +125,7 @@ def test_blocks_of_pixels_have_the_noise_of_their_own() -> None:
 
 
 @pytest.mark.parametrize("kind", ["dark", "flat"])
-@pytest.mark.parametrize("blocks", [(8, 8), (3, 7), (3, 40)])
+@pytest.mark.parametrize("blocks", [(3, 7), (3, 40)])
 def test_groups_are_those_of_single_pixels(kind: Literal["dark", "flat"], blocks: tuple[int, int]) -> None:
     rng = np.random.default_rng(4)
     level = np.add.outer(np.linspace(100, 900, 41), np.linspace(0, 100, 30))

@@ -89,7 +89,7 @@ def _linear(gain: float, roughness: float, gain_dn: float | None = None) -> tupl
     return estimate_view_noise(blocks, least_variance_dn2=_rounding, gain_dn=gain_dn), read_e
 
 
-@pytest.mark.parametrize(("gain", "roughness"), [(0.1, 1.3), (1.0, 1.8), (10.0, 1.3), (100.0, 1.3)])
+@pytest.mark.parametrize(("gain", "roughness"), [(0.1, 1.3), (10.0, 1.3)])
 def test_gain_and_read_noise_are_found_under_texture_and_depth_edges(gain: float, roughness: float) -> None:
     found, read_e = _linear(gain, roughness)
     assert found.gain_dn.value == pytest.approx(gain, rel=0.15)
@@ -120,8 +120,8 @@ def _decoded(values: NDArray[Any]) -> Array:
 
 @pytest.mark.parametrize(
     ("full_e", "read_e", "quality", "off"),
-    [(500, 5, None, 0.25), (5000, 20, None, 0.25), (60_000, 30, None, 0.25), (2000, 10, 90, 0.25)],
-    ids=["few electrons", "more", "near the rounding", "JPEG"],
+    [(500, 5, None, 0.25), (60_000, 30, None, 0.25), (2000, 10, 90, 0.25)],
+    ids=["few electrons", "near the rounding", "JPEG"],
 )
 def test_the_variance_of_8_bit_pictures_without_their_curve_is_predicted(
     full_e: float, read_e: float, quality: int | None, off: float

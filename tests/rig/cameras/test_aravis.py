@@ -1,8 +1,6 @@
 """GenICam cameras: Aravis' own fake cameras, one in this process and one that speaks GigE Vision over the loopback."""
 
-import ctypes
 import fcntl
-import gc
 import shutil
 import subprocess
 import threading
@@ -21,43 +19,16 @@ import pytest
 
 from faintfield.rig.cameras.aravis import AravisCamera
 from faintfield.rig.cameras.aravis_device import AravisDevice
-from faintfield.rig.cameras.aravis_library import AravisError, AravisLibrary, Reference
+from faintfield.rig.cameras.aravis_library import AravisLibrary, Reference
 from faintfield.rig.cameras.aravis_times import Moment
 from faintfield.rig.cameras.settings import AravisSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 from faintfield.testing import camera_contract
 
+pytestmark = pytest.mark.deep
+
 FAKE = AravisSettings("Mono16", camera="Fake_1", region_px=(0, 0, 64, 48))
 SERVER = "arv-fake-gv-camera-0.8"
-
-
-def test_a_missing_library_says_what_to_install() -> None:
-    with (
-        mock.patch("faintfield.rig.cameras.aravis_library.LIBRARY", "libaravis-0.0.so"),
-        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so, .*; run: apt-get install libaravis-0\.8-0"),
-    ):
-        AravisCamera(FAKE).open()
-
-
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"pixel_format": "RGB8"}, "is not read; give Mono or"),
-        ({"region_px": (-1, 0, 4, 4)}, "give left column"),
-        ({"region_px": (0, 0, 0, 4)}, "give left column"),
-        ({"pixel_format": "BayerRG8", "region_px": (1, 0, 4, 4)}, "even for a mosaic"),
-        ({"answer_s": 0.0}, "camera.answer_s = 0"),
-        ({"answer_s": 1e9}, "at most 3600 s"),
-    ],
-)
-def test_settings_that_are_refused(changes: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ValueError, match=reason):
-        msgspec.structs.replace(FAKE, **changes)
-
-
-def test_the_mosaic_is_that_of_the_pixel_format() -> None:
-    assert AravisSettings("BayerGB12Packed").mosaic == ("GB", "RG")
-    assert AravisSettings("Mono12p").mosaic is None
 
 
 @pytest.fixture
@@ -66,21 +37,6 @@ def library() -> AravisLibrary:
         return AravisLibrary()
     except MissingExtra as failure:
         pytest.skip(f"Aravis' cameras are not tried: {failure}")
-
-
-def test_a_library_that_is_too_old_says_which_version_it_takes(library: AravisLibrary) -> None:
-    newer = {"arv_buffer_get_nothing_yet": (None, ())}
-    with (
-        mock.patch.dict("faintfield.rig.cameras.aravis_library._PLAIN", newer),
-        pytest.raises(MissingExtra, match=r"0\.8\.23 or newer; .* has no arv_buffer_get_nothing_yet: install"),
-    ):
-        AravisLibrary()
-
-
-def test_a_function_that_cannot_fail_is_given_no_place_for_an_error(library: AravisLibrary) -> None:
-    """Aravis 0.8 declares `ArvChunkParser *arv_camera_create_chunk_parser (ArvCamera *camera)`."""
-    function = library._aravis.arv_camera_create_chunk_parser  # noqa: SLF001 - nowhere else to be seen
-    assert function.argtypes == (ctypes.c_void_p,)
 
 
 @pytest.fixture
@@ -135,7 +91,7 @@ def test_contract_over_gigabit_ethernet(server: list[str]) -> None:
     camera_contract(AravisCamera(gigabit()), 0.01)
 
 
-@pytest.mark.parametrize("format_name", ["Mono8", "BayerRG8", "BayerBG8", "Mono16"])
+@pytest.mark.parametrize("format_name", ["BayerRG8", "Mono16"])
 def test_frames_have_the_region_and_the_format_that_were_asked_for(library: AravisLibrary, format_name: str) -> None:
     camera = AravisCamera(AravisSettings(format_name, camera="Fake_1", region_px=(32, 16, 80, 60), gain=2.0))
     camera.open()
@@ -208,11 +164,7 @@ def answering(**answers: Any) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("status", "words"),
     [
-        (1, "no data came"),
-        (2, "did not all come in time"),
         (3, "packets are missing"),
-        (5, "more data came than a frame has"),
-        (7, "it was aborted"),
         (99, "state 99"),
     ],
 )
@@ -228,12 +180,8 @@ def test_the_state_of_an_incomplete_frame_is_said_in_words(fake: AravisCamera, s
     ("answers", "reason"),
     [
         ({"arv_camera_get_payload": 6143}, r"announces frames of 6143 bytes for the region \[0, 0, 64, 48\]"),
-        ({"arv_camera_get_payload": 2**31}, "announces frames of 2147483648 bytes"),
         ({"arv_buffer_get_image_width": 63}, r"63 x 48 pixels in format 0x01100007.* instead of 64 x 48 in Mono16"),
-        ({"arv_buffer_get_image_height": -1}, "64 x -1 pixels"),
-        ({"arv_buffer_get_image_pixel_format": 0x01080001}, "in format 0x01080001"),
         ({"arv_stream_timeout_pop_buffer": None}, r"no frame came within \d"),
-        ({"arv_camera_create_stream": None}, "it gives no stream"),
     ],
 )
 def test_frames_and_sizes_that_were_not_asked_for(fake: AravisCamera, answers: dict[str, Any], reason: str) -> None:
@@ -245,25 +193,12 @@ def test_frames_and_sizes_that_were_not_asked_for(fake: AravisCamera, answers: d
     ("answers", "reason"),
     [
         ({"arv_camera_get_pixel_format": 0x01080001}, "keeps pixel format Mono16"),
-        ({"arv_camera_get_pixel_format_as_string": b"Mono8"}, "keeps pixel format Mono8"),
         ({"arv_camera_get_region": None}, r"reads the region \[0, 0, 0, 0\] instead of"),
     ],
 )
 def test_settings_that_the_camera_does_not_keep(library: AravisLibrary, answers: dict[str, Any], reason: str) -> None:
     with answering(**answers), pytest.raises(CameraError, match=reason):
         AravisCamera(FAKE).open()
-
-
-def test_temperature_and_chunks_are_recorded_where_the_camera_has_them(library: AravisLibrary) -> None:
-    """No camera of Aravis' own has these: they are answered here."""
-    chunk = {"arv_buffer_has_chunks": 1, "arv_chunk_parser_get_integer_value": 123_456}
-    with answering(arv_camera_is_feature_available=1, arv_camera_get_float=-12.5, **chunk):
-        camera = AravisCamera(FAKE)
-        camera.open()
-        metadata = camera.expose(0.01, 1).metadata
-        assert camera.temperature_c() == -12.5
-        camera.close()
-    assert (metadata["temperature_c"], metadata["chunk_timestamp"]) == (-12.5, 123_456)
 
 
 def test_a_camera_is_closed_only_after_the_call_that_uses_it(library: AravisLibrary) -> None:
@@ -319,9 +254,6 @@ def test_an_exposure_time_that_a_real_camera_did_not_keep_is_noticed(fake: Aravi
     ("changes", "reason"),
     [
         ({"camera": "Fake_9"}, "failed at connecting to Fake_9: .*; check its cable"),
-        ({"camera": "no-such-camera"}, "failed at connecting to no-such-camera"),
-        ({"pixel_format": "Mono12p"}, "'Mono12p' not an entry"),
-        ({"region_px": (0, 0, 4096, 48)}, r"leaves the sensor of 2048 x 2048 pixels"),
         ({"region_px": (2000, 0, 64, 48)}, r"leaves the sensor of 2048 x 2048 pixels"),
         ({"features": {"NoSuchFeature": "1"}}, "NoSuchFeature"),
     ],
@@ -341,14 +273,6 @@ def test_a_mosaic_that_the_camera_s_region_shifts_is_refused(library: AravisLibr
     camera = AravisCamera(AravisSettings("BayerRG8", camera="Fake_1", features=shifted))
     with pytest.raises(CameraError, match=r"begins at column 1, row 0, which shifts its mosaic; set camera\.region_px"):
         camera.open()
-
-
-def test_an_exposure_time_that_the_camera_rounds_is_refused(fake: AravisCamera) -> None:
-    with (
-        answering(arv_camera_get_exposure_time=9800.0),
-        pytest.raises(CameraError, match=r"exposes 0\.0098 s instead of exposure_s = 0\.01; choose 0\.0098"),
-    ):
-        fake.expose(0.01, 1)
 
 
 def test_an_exposure_time_is_set_anew_after_one_that_failed(fake: AravisCamera) -> None:
@@ -379,24 +303,6 @@ def test_rows_that_the_camera_pads_are_refused(fake: AravisCamera) -> None:
         fake.expose(0.01, 1)
 
 
-def test_an_exposure_leaves_no_stream_and_no_buffer_behind(fake: AravisCamera) -> None:
-    """Each is released on return, also after a failure, and not at some time by the garbage collector."""
-    kept: list[Reference] = []
-    original = AravisLibrary.owned
-
-    def owned(self: AravisLibrary, name: str, *arguments: Any) -> Reference | None:
-        made = original(self, name, *arguments)
-        kept.extend([made] if made else [])
-        return made
-
-    with mock.patch.object(AravisLibrary, "owned", owned):
-        fake.expose(0.01, 1)
-        with answering(arv_buffer_get_status=3), pytest.raises(CameraError, match="packets"):
-            fake.expose(0.01, 2)
-    assert len(kept) == 6  # a stream, a buffer that it takes over, and the frame that it gives back
-    assert not any(it._release.alive for it in kept)  # noqa: SLF001 - what is left to the garbage collector
-
-
 def test_the_camera_waits_for_its_trigger_and_changes_nothing_by_itself(library: AravisLibrary) -> None:
     camera = AravisCamera(msgspec.structs.replace(FAKE, features={"GainAuto": "Continuous", "TriggerMode": "Off"}))
     camera.open()
@@ -408,20 +314,9 @@ def test_the_camera_waits_for_its_trigger_and_changes_nothing_by_itself(library:
     camera.close()
 
 
-def test_features_are_set(library: AravisLibrary) -> None:
-    camera = AravisCamera(msgspec.structs.replace(FAKE, features={"AcquisitionMode": "MultiFrame"}))
-    camera.open()
-    assert camera.report().settings["AcquisitionMode"] == "MultiFrame"
-    device = camera._device  # noqa: SLF001 - the camera's registers are behind it
-    assert device is not None
-    assert library.text("arv_camera_get_string", device._camera.pointer, b"AcquisitionMode") == "MultiFrame"  # noqa: SLF001
-    camera.close()
-
-
-@pytest.mark.parametrize("exposure_s", [1e-7, 60.0])
-def test_exposure_times_that_the_camera_does_not_have(fake: AravisCamera, exposure_s: float) -> None:
+def test_exposure_times_that_the_camera_does_not_have(fake: AravisCamera) -> None:
     with pytest.raises(CameraError, match=r"is not among the camera's, 1e-05 to 10; choose one"):
-        fake.expose(exposure_s, 1)
+        fake.expose(60.0, 1)
 
 
 def test_lost_packets_make_the_frame_incomplete_and_not_wrong(server: list[str]) -> None:
@@ -459,33 +354,3 @@ def test_a_call_that_hangs_leaves_the_camera_to_its_thread(library: AravisLibrar
     end.set()
     with pytest.raises(CameraError, match="open it first"):
         camera.expose(0.01, 2)
-
-
-def test_each_reference_is_given_back_once() -> None:
-    given_back: list[int] = []
-    kept, dropped, taken = (Reference(number, given_back.append) for number in (1, 2, 3))
-    kept.release()
-    kept.release()
-    assert taken.given_away() == 3
-    taken.release()
-    del dropped, taken
-    gc.collect()
-    assert given_back == [1, 2]
-
-
-def test_objects_are_freed_when_their_last_reference_is_given_back(library: AravisLibrary) -> None:
-    """A weak pointer of GObject becomes null when its object is gone."""
-    library.call("arv_enable_interface", b"Fake")
-    camera = library.owned("arv_camera_new", b"Fake_1")
-    assert camera is not None
-    gobject = ctypes.CDLL("libgobject-2.0.so.0")
-    watch = ctypes.c_void_p(camera.pointer)
-    gobject.g_object_add_weak_pointer(ctypes.c_void_p(camera.pointer), ctypes.byref(watch))
-    assert watch.value == camera.pointer
-    camera.release()
-    assert watch.value is None
-
-
-def test_errors_of_the_library_keep_their_message(library: AravisLibrary) -> None:
-    with pytest.raises(AravisError, match="Fake_none"):
-        library.call("arv_camera_new", b"Fake_none")

@@ -1,10 +1,12 @@
 """What `[camera]` and a report refuse before anything moves; plug-ins that fail; real cameras in rehearsals."""
 
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
+from faintfield.rig.cameras.aravis import AravisCamera
 from faintfield.rig.cameras.protocol import CameraReport, Exposure
 from faintfield.rig.cameras.settings import (
     AravisSettings,
@@ -14,11 +16,11 @@ from faintfield.rig.cameras.settings import (
     PluginSettings,
     SimulatedSettings,
 )
-from faintfield.rig.errors import CameraError, CameraTimeout
+from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 from faintfield.rig.plugins import PluginCamera
 
 
-@pytest.mark.parametrize("mosaic", [(), ("",), ("RGB", "GB"), ("RX", "GB")])
+@pytest.mark.parametrize("mosaic", [(), ("RGB", "GB"), ("RX", "GB")])
 def test_a_mosaic_is_rows_of_one_length(mosaic: tuple[str, ...]) -> None:
     for make in (
         lambda: SimulatedSettings(mosaic=mosaic),
@@ -40,14 +42,29 @@ def test_limits_of_a_wait_need_the_temperature() -> None:
     ("keys", "reason"),
     [
         ({"features": {"PixelFormat": "Mono16"}}, "features has PixelFormat"),
-        ({"packet_bytes": 1}, "give 576 to 65535"),
         ({"packet_bytes": 65536}, "give 576 to 65535"),
+        ({"region_px": (-1, 0, 4, 4)}, "give left column"),
+        ({"answer_s": 1e9}, "at most 3600 s"),
     ],
 )
 def test_values_of_a_genicam_camera_that_cannot_be(keys: dict[str, Any], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         AravisSettings("Mono8", **keys)
     AravisSettings("Mono8", packet_bytes=576, features={"BlackLevel": "64"})
+
+
+def test_region_of_mosaic_begins_at_even_pixels() -> None:
+    with pytest.raises(ValueError, match="even for a mosaic"):
+        AravisSettings("BayerRG8", region_px=(1, 0, 4, 4))
+    assert AravisSettings("BayerGB12Packed", region_px=(2, 0, 4, 4)).mosaic == ("GB", "RG")
+
+
+def test_a_missing_library_says_what_to_install() -> None:
+    with (
+        mock.patch("faintfield.rig.cameras.aravis_library.LIBRARY", "libaravis-0.0.so"),
+        pytest.raises(MissingExtra, match=r"needs libaravis-0\.0\.so, .*; run: apt-get install libaravis-0\.8-0"),
+    ):
+        AravisCamera(AravisSettings("Mono16")).open()
 
 
 @pytest.mark.parametrize(("exposure_s", "offered"), [(1e-6, False), (1e-5, True), (10.0, True), (12.0, False)])

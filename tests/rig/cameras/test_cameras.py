@@ -1,7 +1,6 @@
 """Every camera meets the contract; gphoto2 and Micro-Manager with the real libraries and their virtual cameras."""
 
 import importlib
-import math
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 from faintfield.rig.cameras.bounded import call_within
 from faintfield.rig.cameras.gphoto2 import GPhoto2Camera, shutter_s
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
-from faintfield.rig.cameras.protocol import CameraReport, Exposure
+from faintfield.rig.cameras.protocol import Exposure
 from faintfield.rig.cameras.settings import GPhoto2Settings, MicroManagerSettings, SimulatedSettings
 from faintfield.rig.errors import CameraError, CameraTimeout, MissingExtra
 from faintfield.rig.simulation.controller.wire import SimulatedClock
@@ -37,18 +36,10 @@ def test_the_simulated_camera() -> None:
 
 @pytest.mark.parametrize(
     ("words", "seconds"),
-    [("1/250", 1 / 250), ("0.0100s", 0.01), ("30", 30.0), ("2.5", 2.5), ("10/3", 10 / 3), ("bulb", None),
-     ("auto", None), ("1/0", None), ("0", None), ("", None)],
+    [("1/250", 1 / 250), ("0.0100s", 0.01), ("30", 30.0), ("bulb", None), ("1/0", None), ("0", None)],
 )  # fmt: skip
 def test_exposure_times_in_a_camera_s_words(words: str, seconds: float | None) -> None:
     assert shutter_s(words) == (None if seconds is None else pytest.approx(seconds))
-
-
-def test_offered_exposure_times() -> None:
-    report = CameraReport("any", 1, exposures_s=(0.01, 0.1))
-    assert report.offers(0.1001)
-    assert not report.offers(0.05)
-    assert CameraReport("any", 1).offers(math.pi)
 
 
 def test_an_exposure_is_a_file_or_an_array() -> None:
@@ -99,10 +90,12 @@ def card(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield picture
 
 
+@pytest.mark.deep
 def test_gphoto2_virtual_camera(card: Path) -> None:
     camera_contract(GPhoto2Camera(GPhoto2Settings(frame_mb=1.0)), 0.01)
 
 
+@pytest.mark.deep
 def test_gphoto2_keeps_the_file_byte_for_byte(card: Path) -> None:
     camera = GPhoto2Camera(GPhoto2Settings(settings={"f-number": "f/8"}))
     camera.open()
@@ -121,6 +114,7 @@ def test_gphoto2_keeps_the_file_byte_for_byte(card: Path) -> None:
     camera.close()
 
 
+@pytest.mark.deep
 def test_gphoto2_faults(card: Path) -> None:
     with pytest.raises(CameraError, match="failed at connecting"):
         GPhoto2Camera(GPhoto2Settings(port="usb:999,999")).open()
@@ -144,10 +138,12 @@ def demo() -> MicroManagerCamera:
     return MicroManagerCamera(MicroManagerSettings(adapters=adapters.device_adapter_path()))
 
 
+@pytest.mark.deep
 def test_micromanager_demo_camera(demo: MicroManagerCamera) -> None:
     camera_contract(demo, 0.01)
 
 
+@pytest.mark.deep
 def test_micromanager_frames_are_arrays(demo: MicroManagerCamera) -> None:
     demo.open()
     exposure = demo.expose(0.01, 1)
@@ -159,6 +155,7 @@ def test_micromanager_frames_are_arrays(demo: MicroManagerCamera) -> None:
     demo.close()
 
 
+@pytest.mark.deep
 def test_micromanager_faults(demo: MicroManagerCamera, tmp_path: Path) -> None:
     broken = tmp_path / "broken.cfg"
     broken.write_text("Device,Camera,NoSuchAdapter,DCam\n")
@@ -174,6 +171,7 @@ def test_micromanager_faults(demo: MicroManagerCamera, tmp_path: Path) -> None:
     demo.close()
 
 
+@pytest.mark.deep
 def test_micromanager_time_out() -> None:
     pytest.importorskip("pymmcore_plus", reason="pymmcore-plus is not installed here: its time-out is not tried")
     with pytest.raises(CameraTimeout, match=r"within 1e-06 s; "):

@@ -107,12 +107,6 @@ def test_a_file_that_comes_before_the_exposure_can_end_is_refused(program: Progr
     assert camera.expose(2.0, 2).content == b"as asked for"  # the early file is not taken for it
 
 
-def test_a_file_that_comes_right_at_the_end_of_the_exposure_is_taken(program: Program) -> None:
-    camera = watching(program)
-    program.at(2.0, "right.nef", b"as asked for")
-    assert camera.expose(2.0, 1).metadata["camera_file"] == "right.nef"
-
-
 def test_a_file_that_was_last_changed_before_the_exposure_could_end_is_refused(program: Program) -> None:
     camera = watching(program)
     program.at(6.0, "moved.nef", b"of an hour ago", changed_s=-3600.0)
@@ -273,11 +267,6 @@ def test_a_file_that_is_renamed_when_it_is_whole(program: Program) -> None:
     assert camera.expose(0.1, 1).metadata["camera_file"] == "IMG.NEF"
 
 
-def test_a_folder_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(CameraError, match="is not a folder; create it"):
-        FolderCamera(FolderSettings(str(tmp_path / "absent")), SimulatedClock()).open()
-
-
 def test_a_folder_that_vanishes(tmp_path: Path) -> None:
     folder = tmp_path / "incoming"
     folder.mkdir()
@@ -317,12 +306,6 @@ def test_a_file_that_cannot_be_read(program: Program) -> None:
         camera.expose(0.1, 1)
 
 
-@pytest.mark.parametrize("quiet_s", [-1.0, 60.0])
-def test_a_quiet_time_beyond_the_limit_is_refused(quiet_s: float) -> None:
-    with pytest.raises(ValueError, match=r"quiet_s = .*; give less than arrival_s = 60"):
-        FolderSettings("incoming", quiet_s=quiet_s)
-
-
 @pytest.fixture
 def dng() -> bytes:
     """Return a raw file of a real camera."""
@@ -331,7 +314,7 @@ def dng() -> bytes:
     return (Path(os.environ["FAINTFIELD_DATA"]) / "raw" / "colorchart.dng").read_bytes()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.99, 0.9999])
+@pytest.mark.parametrize("share", [0.001, 0.9999])
 def test_a_raw_file_that_is_cut_short_is_damaged(tmp_path: Path, dng: bytes, share: float) -> None:
     path = tmp_path / "cut.dng"
     path.write_bytes(dng[: int(share * len(dng))])

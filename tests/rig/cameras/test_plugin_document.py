@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from faintfield.rig.clock import WallClock
-from faintfield.rig.errors import CameraError
 from faintfield.testing import camera_contract
 
 _DOCUMENT = Path(__file__).parents[3] / "docs" / "plugins.md"
@@ -67,18 +66,3 @@ def test_its_frames_are_those_of_the_server(module: types.ModuleType, port: int)
     assert sky.report().name == "Sky-1"
     np.testing.assert_array_equal(sky.expose(0.01, 1).pixels, _PICTURE)
     sky.close()
-
-
-def test_a_server_that_is_not_there_is_a_failure_of_the_camera(module: types.ModuleType, port: int) -> None:
-    with pytest.raises(CameraError, match="; start it"):
-        camera(module, host="127.0.0.1", port=1).open()
-    sky = camera(module, host="127.0.0.1", port=port, answer_s=0.2)
-    sky.open()
-    with pytest.raises(CameraError, match="sent 0 of 9 bytes"):
-        sky._ask("NOTHING", 9)  # noqa: SLF001 - a request that the server does not answer
-
-
-def test_the_class_is_as_short_as_the_document_says() -> None:
-    text = _DOCUMENT.read_text()
-    assert "some forty lines" in text
-    assert text[text.index("class SkyCamera") : text.index("\n\n\nPLUGIN")].count("\n") < 50

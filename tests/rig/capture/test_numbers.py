@@ -113,12 +113,9 @@ def board_frames(sweeps: int = 2, nodes: int = 6) -> list[PlannedFrame]:
 @pytest.mark.parametrize(
     ("corners", "words"),
     [
-        ([0, 5], []),
         ([0, 5, 3], ["board sweep 1: none of its first 3 frames shows 6 board corners, the most is 5"]),
-        ([0, 5, 6], []),
         ([0, 5, 6, 9, 9, 0], []),  # three of six are not more than half
         ([0, 5, 6, 9, 0, 0], ["board sweep 1: 4 of 6 frames show fewer than 6 board corners"]),
-        ([9, 9, 9, 9, 0, 0, 9, 9, 9, 9, 0], []),
         ([9, 9, 9, 9, 0, 0, 9, 9, 9, 9, 0, 5], ["2 of 6 nodes see 6 board corners in no sweep ([0, 4], [0, 5])"]),
         ([9, 9, 9, 9, 0, 0, 9, 9, 9, 0, 6, 6], []),
     ],
@@ -132,19 +129,6 @@ def test_boards_out_of_view_are_told_when_it_is_sure(corners: list[int], words: 
     assert [warning for warning in found if "nodes" in warning] == [
         next(it for it in found if it.startswith(word)) for word in words if "nodes" in word
     ]
-
-
-def test_a_sweep_of_two_frames_is_judged_by_both_and_six_nodes_are_named() -> None:
-    frames = board_frames(sweeps=1, nodes=2)
-    (first, second) = board_warnings(frames[1], frames, {0: 0, 1: 2}, 6)
-    assert first.startswith("board sweep 1: none of its first 2 frames shows 6 board corners, the most is 2; ")
-    assert second.startswith("2 of 2 nodes")
-    frames = board_frames(sweeps=1, nodes=8)
-    many = board_warnings(frames[7], frames, dict.fromkeys(range(8), 0), 6)[-1]
-    assert "[0, 5] …)" in many
-    assert "[0, 6]" not in many
-    six = board_frames(sweeps=1, nodes=6)
-    assert "…" not in board_warnings(six[5], six, dict.fromkeys(range(6), 0), 6)[-1]
 
 
 def shifted(shift: tuple[float, float]) -> NDArray[np.float64]:
@@ -225,9 +209,3 @@ def test_the_remaining_time_is_the_sum_of_motions_stops_exposures_and_checks() -
         bench.clock.sleep_s(100.0)
         pace.arrive(b, timed=timed)
     assert pace.remaining_s(again, 0) == pytest.approx(4.0 + 0.9 + 7.0 + 0.5 + 7.0)
-
-
-def test_where_one_corner_is_enough_a_node_that_sees_none_is_named() -> None:
-    frames = board_frames(sweeps=1, nodes=3)
-    (found,) = (it for it in board_warnings(frames[2], frames, {0: 4, 1: 0, 2: 4}, 1) if "nodes" in it)
-    assert found.startswith("1 of 3 nodes see 1 board corners in no sweep ([0, 1])")

@@ -1,9 +1,11 @@
 """The measurement of settling, on a scene that is shifted by a known function of time."""
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from faintfield.rig.cameras.protocol import Pixels
 from faintfield.rig.capture.settling import measure_settling
@@ -15,19 +17,22 @@ from faintfield.rig.simulation.scene import render
 
 def shifting(shift_px: Callable[[float], float], clock: SimulatedClock, light: float) -> Callable[[float], Pixels]:
     """Return a camera that sees the paper's scene shifted by a function of time."""
-    planes, optics = paper_experiment(96, 72).grey().planes, paper_experiment(96, 72).optics
+    scene = paper_experiment(64, 48).grey()
     generator = np.random.default_rng(5)
 
+    @cache
+    def light_at(shift_mm: float) -> NDArray[np.float32]:
+        return next(render(scene.planes, scene.optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
+
     def expose(exposure_s: float) -> Pixels:
-        shift_mm = shift_px(clock.now_s()) * 600.0 / optics.fx_px
-        seen = next(render(planes, optics, np.array([[0, 0, 0, shift_mm, 0.0, 0.0]]))).light
+        seen = light_at(shift_px(clock.now_s()) * 600.0 / scene.optics.fx_px)
         clock.sleep_s(exposure_s + 0.05)
         return np.asarray(generator.poisson(100.0 + light * seen), np.uint16)
 
     return expose
 
 
-@pytest.mark.parametrize("rest_s", [0.0, 0.7, 1.5])
+@pytest.mark.parametrize("rest_s", [0.0, 0.7])
 def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
     clock = SimulatedClock()
     expose = shifting(lambda now_s: 0.6 if now_s < rest_s else 0.0, clock, light=2e4)
@@ -38,7 +43,7 @@ def test_settling_ends_when_the_shift_does(rest_s: float) -> None:
     assert all(0.3 < shift < 0.9 for time, shift in shifts.items() if time < rest_s)
 
 
-@pytest.mark.parametrize(("slight_px", "ends_s"), [(0.6, 1.2), (0.3, 1.2), (0.05, 0.4)])
+@pytest.mark.parametrize(("slight_px", "ends_s"), [(0.3, 1.2), (0.05, 0.4)])
 def test_the_rig_swings_as_long_as_the_picture_is_off_by_more_than_the_limit(slight_px: float, ends_s: float) -> None:
     """A large shift until 0.4 s and a slight one until 1.2 s; the limit is 0.1 px."""
     clock = SimulatedClock()

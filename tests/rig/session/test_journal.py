@@ -1,6 +1,5 @@
 """The journal: whatever its file holds, it is read as it was written or refused."""
 
-import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from faintfield.rig.session.session import read_plan, taken_frames
 from faintfield.rig.session.verify import verify
 from faintfield.rig.stages.protocol import Point
 from tests.faults.capturing import FRAMES, capture_small
-from tests.rig.session.forging import chain_again, columns, edit, flip, make_format_1, old_sessions
+from tests.rig.session.forging import chain_again, edit, flip, old_sessions
 
 RECORD = FrameRecord(Point(1.0, 2.0), 0.1)
 
@@ -48,18 +47,10 @@ def journal_file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def interrupted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of a session of twelve frames that a stop has interrupted."""
-    folder = tmp_path_factory.mktemp("interrupted") / "session"
-    capture_small(folder)
-    (folder / "SHA256SUMS").unlink()
-    return folder
-
-
-@pytest.fixture
-def session(interrupted: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(interrupted, tmp_path / "session"))
+def unsealed_old_session(folder: Path) -> Path:
+    session = old_sessions(folder / "old") / "complete"
+    (session / "SHA256SUMS").unlink()
+    return session
 
 
 def refused_everywhere(folder: Path) -> None:
@@ -72,95 +63,34 @@ def refused_everywhere(folder: Path) -> None:
 
 # --- The chain of hashes
 
-# A value of each type that no row holds, given the present one
-OTHER = {"INTEGER": "{0} + 1000", "TEXT": "{0} || ' '", "REAL": "{0} + 0.5", "BLOB": "CAST({0} || x'00' AS BLOB)"}
-COLUMNS = [
-    (table, name, kind)
-    for table, names in {
-        "event": "id:INTEGER at:TEXT kind:TEXT frame:INTEGER detail:TEXT",
-        "intent": "id:INTEGER at:TEXT frame:INTEGER",
-        "commit": "intent:INTEGER at:TEXT file:TEXT sha256:TEXT bytes:INTEGER detail:TEXT",
-        "void": "intent:INTEGER at:TEXT why:TEXT",
-        "traffic": "id:INTEGER at_s:REAL direction:TEXT data:BLOB",
-        "chain": "id:INTEGER table:TEXT first:INTEGER last:INTEGER sha256:BLOB",
-    }.items()
-    for name, kind in (it.split(":") for it in names.split())
+LAST = "WHERE rowid = (SELECT max(rowid) FROM"
+CHANGES = [
+    f"UPDATE event SET detail = detail || ' ' {LAST} event)",
+    f"UPDATE intent SET frame = frame + 1000 {LAST} intent)",
+    f'UPDATE "commit" SET sha256 = sha256 || \' \' {LAST} "commit")',
+    f"UPDATE void SET at = at || ' ' {LAST} void)",
+    f"UPDATE traffic SET at_s = at_s + 0.5 {LAST} traffic)",
+    f"UPDATE chain SET last = last + 1000 {LAST} chain)",
+    *(
+        f'DELETE FROM "{table}" {LAST} "{table}")'
+        for table in ("event", "intent", "commit", "void", "traffic", "chain")
+    ),
+    "INSERT INTO traffic VALUES (NULL, 0.0, 'sent', x'00')",
 ]
 
 
-def test_the_columns_are_those_that_the_tests_edit(journal_file: Path) -> None:
-    assert sorted(columns(journal_file)) == sorted(COLUMNS)
-
-
-@pytest.mark.parametrize(("table", "name", "kind"), COLUMNS)
-@pytest.mark.parametrize("row", ["min", "max"])
-def test_an_edited_value_is_found(journal_file: Path, table: str, name: str, kind: str, row: str) -> None:
-    value = OTHER[kind].format(f'ifnull("{name}", 0)')
-    edit(journal_file, f'UPDATE "{table}" SET "{name}" = {value} WHERE rowid = (SELECT {row}(rowid) FROM "{table}")')
-    with pytest.raises(SessionCorrupt, match=r"journal\.sqlite: .*; restore the journal from a copy"):
-        Journal(journal_file, read_only=True)
-
-
-@pytest.mark.parametrize(("table", "name", "kind"), [it for it in COLUMNS if it[0] != "chain"])
-def test_an_edited_value_of_a_session_is_neither_verified_nor_resumed(
-    session: Path, table: str, name: str, kind: str
-) -> None:
-    if table == "void":
-        capture_again(session)
-    value = OTHER[kind].format(f'ifnull("{name}", 0)')
-    edit(
-        session / "journal.sqlite",
-        f'UPDATE "{table}" SET "{name}" = {value} WHERE rowid = (SELECT max(rowid) FROM "{table}")',
-    )
-    with pytest.raises(SessionCorrupt, match=r"journal\.sqlite"):
-        verify(session)
-    refused_everywhere(session)
-
-
-def capture_again(session: Path) -> None:
-    """Lose a frame, and take it again."""
-    sorted((session / "frames").iterdir())[0].unlink()
-    capture_small(session)
-    (session / "SHA256SUMS").unlink()
-
-
-@pytest.mark.parametrize("table", ["event", "intent", "commit", "void", "traffic", "chain"])
-@pytest.mark.parametrize("row", ["min", "max"])
-def test_a_removed_row_is_found(journal_file: Path, table: str, row: str) -> None:
-    edit(journal_file, f'DELETE FROM "{table}" WHERE rowid = (SELECT {row}(rowid) FROM "{table}")')
-    with pytest.raises(SessionCorrupt):
-        Journal(journal_file)
-
-
-@pytest.mark.parametrize("table", ["event", "intent", "traffic", "void"])
-def test_rows_that_changed_places_are_found(journal_file: Path, table: str) -> None:
-    edit(
-        journal_file,
-        *(f'UPDATE "{table}" SET rowid = {new} WHERE rowid = {old}' for old, new in ((1, -1), (2, 1), (-1, 2))),
-    )
-    with pytest.raises(SessionCorrupt):
-        Journal(journal_file)
-
-
-@pytest.mark.parametrize(
-    "statement",
-    [
-        "INSERT INTO event VALUES (NULL, '', 'suspect', NULL, '{\"intents\": [1]}')",
-        "INSERT INTO intent VALUES (NULL, '', 0)",
-        "INSERT INTO void VALUES (4, '', 'forged')",
-        "INSERT INTO traffic VALUES (NULL, 0.0, 'sent', x'00')",
-    ],
-)
-def test_an_added_row_is_found(journal_file: Path, statement: str) -> None:
+@pytest.mark.parametrize("statement", CHANGES)
+def test_changed_lost_and_foreign_rows_are_refused(journal_file: Path, statement: str) -> None:
     edit(journal_file, statement)
-    with pytest.raises(SessionCorrupt, match=r"rows, its chain"):
-        Journal(journal_file)
-
-
-def test_links_over_the_same_rows_again_and_again_end_soon(journal_file: Path) -> None:
-    edit(journal_file, *('INSERT INTO chain SELECT NULL, "table", first, last, sha256 FROM chain' for _ in range(3)))
     with pytest.raises(SessionCorrupt):
         Journal(journal_file)
+
+
+def test_session_of_changed_journal_is_not_used(unsealed: Path) -> None:
+    edit(unsealed / "journal.sqlite", "UPDATE event SET kind = kind || ' ' WHERE rowid = 1")
+    with pytest.raises(SessionCorrupt, match=r"journal\.sqlite"):
+        verify(unsealed)
+    refused_everywhere(unsealed)
 
 
 def test_the_chain_is_the_one_that_the_documents_describe(journal_file: Path) -> None:
@@ -181,160 +111,84 @@ def test_a_failed_entry_leaves_the_chain_whole(journal_file: Path) -> None:
     assert content(journal_file)[1] == [(5, 0)]
 
 
-# --- Names
-
-NAMES = [
-    "../../victim.txt",
-    "/etc/hostname",
-    "..",
-    ".",
-    "",
-    "a/b",
-    "a\\b",
-    "a\0b",
-    "line\nline",
-    "x" * 201,
-    "\u202etiff.exe",
-]
+# --- What the file of another laboratory may hold
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["../../victim.txt", "line\nline"])
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_name_that_leads_elsewhere_moves_nothing(session: Path, tmp_path: Path, name: str, version: int) -> None:
+def test_file_name_outside_the_session_moves_nothing(unsealed: Path, tmp_path: Path, name: str, version: int) -> None:
     victim = tmp_path / "victim.txt"
     victim.write_text("important")
     if version == 1:
-        make_format_1(session)
-    quoted = "||".join(f"char({ord(it)})" for it in name) or "''"
-    edit(session / "journal.sqlite", f'UPDATE "commit" SET file = {quoted} WHERE intent = 3')
+        unsealed = unsealed_old_session(tmp_path)
+    quoted = "||".join(f"char({ord(it)})" for it in name)
+    edit(unsealed / "journal.sqlite", f'UPDATE "commit" SET file = {quoted} WHERE intent = 3')
     if version == 2:
-        chain_again(session / "journal.sqlite")
+        chain_again(unsealed / "journal.sqlite")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(SessionCorrupt, match="is not the name of a frame; restore"):
-        verify(session)
-    refused_everywhere(session)
+        verify(unsealed)
+    refused_everywhere(unsealed)
     assert victim.read_text() == "important"
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("file", ["00001_bright_0_r0_c1_x3.tiff", "00002_bright_0_r0_c2_x2.tiff", "00002_bright.tiff"])
-def test_a_name_of_another_exposure_is_refused(session: Path, file: str) -> None:
-    edit(session / "journal.sqlite", f"UPDATE \"commit\" SET file = '{file}' WHERE intent = 3")
-    chain_again(session / "journal.sqlite")
-    assert any("is not a frame of the plan" in problem for problem in verify(session).problems)
-    refused_everywhere(session)
+def test_a_name_of_another_exposure_is_refused(unsealed: Path) -> None:
+    edit(unsealed / "journal.sqlite", "UPDATE \"commit\" SET file = '00001_bright_0_r0_c1_x3.tiff' WHERE intent = 3")
+    chain_again(unsealed / "journal.sqlite")
+    assert any("is not a frame of the plan" in problem for problem in verify(unsealed).problems)
+    refused_everywhere(unsealed)
 
-
-# --- Types and ranges
 
 WRONG_VALUES = [
-    ("intent", "frame", "'x'"),
-    ("intent", "frame", "-1"),
-    ("intent", "frame", "100000"),
-    ("intent", "frame", "0.5"),
-    ("intent", "frame", "9223372036854775807"),
-    ("commit", "bytes", "-1"),
-    ("commit", "bytes", "'many'"),
-    ("commit", "sha256", "'f00'"),
-    ("commit", "sha256", "zeroblob(64)"),
-    ("commit", "file", "7"),
-    ("commit", "detail", "'{'"),
-    ("commit", "detail", "'[]'"),
-    ("commit", "detail", "x'ff'"),
-    ("commit", "detail", "CAST(x'ffff' AS TEXT)"),
-    ("commit", "detail", '\'{"position_mm": [1, 2], "exposure_s": 7}\''),
-    ("commit", "detail", "replace(hex(zeroblob(50000)), '0', '[')"),
-    ("commit", "detail", "printf('%.*c', 20000000, 'x')"),
-    ("void", "why", "zeroblob(3)"),
-]
-# Those that a strict table does not take
-NOT_STORED = [
-    ("intent", "frame", "'x'"),
-    ("intent", "frame", "0.5"),
-    ("commit", "bytes", "'many'"),
-    ("commit", "sha256", "zeroblob(64)"),
-    ("commit", "detail", "x'ff'"),
-    ("void", "why", "zeroblob(3)"),
+    (2, "intent", "frame = -1"),
+    (2, "commit", "sha256 = 'f00'"),
+    (2, "commit", "detail = '[]'"),
+    (2, "commit", "detail = CAST(x'ffff' AS TEXT)"),
+    (2, "commit", "detail = replace(hex(zeroblob(50000)), '0', '[')"),
+    (2, "commit", "detail = printf('%.*c', 20000000, 'x')"),
+    (1, "intent", "frame = 'x'"),
+    (1, "commit", "bytes = 0.5"),
 ]
 
 
-@pytest.mark.parametrize(("table", "name", "value"), WRONG_VALUES)
-@pytest.mark.parametrize("version", [1, 2])
-def test_a_value_of_a_wrong_type_or_size_is_refused(
-    session: Path, table: str, name: str, value: str, version: int
+@pytest.mark.parametrize(("version", "table", "change"), WRONG_VALUES)
+def test_value_of_wrong_type_or_size_is_refused(
+    unsealed: Path, tmp_path: Path, version: int, table: str, change: str
 ) -> None:
-    if table == "void":
-        capture_again(session)
     if version == 1:
-        make_format_1(session)
-    statement = f'UPDATE "{table}" SET "{name}" = {value} WHERE rowid = (SELECT max(rowid) FROM "{table}")'
-    if version == 2 and (table, name, value) in NOT_STORED:
-        with pytest.raises(sqlite3.IntegrityError, match="cannot store"):
-            edit(session / "journal.sqlite", statement)
-        return
-    edit(session / "journal.sqlite", statement)
+        unsealed = unsealed_old_session(tmp_path)
+    edit(unsealed / "journal.sqlite", f'UPDATE "{table}" SET {change} {LAST} "{table}")')
     if version == 2:
-        chain_again(session / "journal.sqlite")
-    try:
-        problems = verify(session).problems
-    except SessionCorrupt as failure:
-        problems = (str(failure),)
-    assert problems
-    refused_everywhere(session)
+        chain_again(unsealed / "journal.sqlite")
+    with pytest.raises(SessionCorrupt, match=r"journal\.sqlite"):
+        verify(unsealed)
+    refused_everywhere(unsealed)
 
 
-# --- What a file may declare
-
-DECLARED = [
-    "CREATE TRIGGER more AFTER INSERT ON intent BEGIN UPDATE \"commit\" SET file = '../../victim.txt'; END",
-    "CREATE TRIGGER more AFTER UPDATE ON event BEGIN DELETE FROM event; END",
-    "CREATE VIEW more AS SELECT * FROM event",
-    "CREATE TABLE more (value)",
-    "CREATE INDEX more ON event (kind)",
-    "CREATE VIRTUAL TABLE more USING fts5(value)",
-    "ALTER TABLE event ADD COLUMN more TEXT",
-    "ALTER TABLE event RENAME COLUMN kind TO sort",
-    "DROP TABLE void",
-]
-
-
-@pytest.mark.parametrize("statement", DECLARED)
-@pytest.mark.parametrize("version", [1, 2])
-def test_other_tables_triggers_and_views_are_refused(session: Path, statement: str, version: int) -> None:
-    if version == 1:
-        make_format_1(session)
-    edit(session / "journal.sqlite", statement)
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "CREATE TRIGGER more AFTER INSERT ON intent BEGIN UPDATE \"commit\" SET file = '../../victim.txt'; END",
+        "ALTER TABLE event RENAME COLUMN kind TO sort",
+        "DROP TABLE void",
+    ],
+)
+def test_other_tables_and_triggers_are_refused(unsealed: Path, statement: str) -> None:
+    edit(unsealed / "journal.sqlite", statement)
     with pytest.raises(SessionCorrupt, match="has other tables than a journal; restore"):
-        verify(session)
-    refused_everywhere(session)
+        verify(unsealed)
+    refused_everywhere(unsealed)
 
 
-def test_a_table_that_takes_the_place_of_a_view_is_refused(session: Path) -> None:
-    edit(
-        session / "journal.sqlite",
-        "ALTER TABLE event RENAME TO hidden",
-        "CREATE VIEW event AS SELECT * FROM hidden",
-    )
-    refused_everywhere(session)
-
-
-def test_a_journal_of_another_format_than_its_plan_is_refused(session: Path) -> None:
-    plan = (session / "plan.json").read_bytes()
-    make_format_1(session)
-    (session / "plan.json").write_bytes(plan)
-    with pytest.raises(SessionCorrupt, match="has format 1, the plan 2; restore"):
-        verify(session)
-    refused_everywhere(session)
-
-
-def test_a_rollback_journal_is_not_played_back(session: Path, tmp_path: Path) -> None:
+def test_a_rollback_journal_is_not_played_back(unsealed: Path, tmp_path: Path) -> None:
     victim = tmp_path / "victim.txt"
     victim.write_text("important")
-    (session / "journal.sqlite-journal").write_bytes(b"anything")
+    (unsealed / "journal.sqlite-journal").write_bytes(b"anything")
     with pytest.raises(SessionCorrupt, match=r"journal\.sqlite-journal: is not written by a capture; move it away"):
-        verify(session)
+        verify(unsealed)
     with pytest.raises(SessionCorrupt, match=r"is not written by a capture; move it away"):
-        capture_small(session)
+        capture_small(unsealed)
 
 
 def test_the_wal_of_a_lost_journal_is_not_taken_for_a_new_one(tmp_path: Path) -> None:
@@ -344,70 +198,22 @@ def test_the_wal_of_a_lost_journal_is_not_taken_for_a_new_one(tmp_path: Path) ->
     assert not (tmp_path / "journal.sqlite").exists()
 
 
-def test_pages_that_lead_to_the_same_pages_again_and_again_end_soon(tmp_path: Path) -> None:
-    path = tmp_path / "journal.sqlite"
-    write_journal(path)
-    make_bomb(path)
-    with pytest.raises(SessionCorrupt, match="; restore"):
-        Journal(path)
-
-
-def make_bomb(path: Path, depth: int = 12, width: int = 300) -> None:
-    """Put a tree of `depth` levels over the schema, in which every page leads `width` times to the same one below."""
-    content = bytearray(path.read_bytes())
-    size = int.from_bytes(content[16:18], "big")
-    leaf = bytearray(content[:size])
-    last = len(content) // size
-    leaf[:size] = bytes(100) + leaf[100:]
-    # The leaf is a copy of the schema's page; its header lies at the beginning of the page, not after that of the file
-    leaf[:8] = leaf[100:108]
-    cells = int.from_bytes(leaf[3:5], "big")
-    leaf[8 : 8 + 2 * cells] = leaf[108 : 108 + 2 * cells]
-    pages = [leaf]
-    for level in range(depth):
-        child = last + 1 + level
-        offset = 100 if level == depth - 1 else 0
-        page = bytearray(size)
-        page[:offset] = content[:offset]
-        cell = child.to_bytes(4, "big") + b"\x01"
-        at = size - len(cell) * width
-        page[at:] = cell * width
-        page[offset : offset + 12] = (
-            b"\x05\0\0" + width.to_bytes(2, "big") + at.to_bytes(2, "big") + b"\0" + child.to_bytes(4, "big")
-        )
-        for index in range(width):
-            page[offset + 12 + 2 * index : offset + 14 + 2 * index] = (at + 5 * index).to_bytes(2, "big")
-        pages.append(page)
-    root = pages.pop()
-    total = last + len(pages)
-    root[28:32] = total.to_bytes(4, "big")
-    path.write_bytes(root + content[size:] + b"".join(pages))
-
-
 # --- Whose fault an error is
 
-CODES = {
-    sqlite3.SQLITE_FULL: "make room",
-    sqlite3.SQLITE_IOERR_FSYNC: "check the disk",
-    sqlite3.SQLITE_READONLY_DBMOVED: "make the folder writable",
-    sqlite3.SQLITE_CANTOPEN: "make the folder writable",
-    sqlite3.SQLITE_BUSY: "end the program that holds the journal",
-    sqlite3.SQLITE_CORRUPT_VTAB: None,
-    sqlite3.SQLITE_NOTADB: None,
-    sqlite3.SQLITE_SCHEMA: None,
-    sqlite3.SQLITE_ERROR: None,
-    sqlite3.SQLITE_CONSTRAINT_CHECK: None,
-    sqlite3.SQLITE_TOOBIG: None,
-    sqlite3.SQLITE_INTERRUPT: None,
-}
 
-
-@pytest.mark.parametrize("code", CODES)
-@pytest.mark.parametrize("kind", [sqlite3.OperationalError, sqlite3.DatabaseError])
-def test_errors_are_classified_by_their_code(code: int, kind: type[sqlite3.Error]) -> None:
-    failure = kind("it failed")
+@pytest.mark.parametrize(
+    ("code", "remedy"),
+    [
+        (sqlite3.SQLITE_FULL, "make room"),
+        (sqlite3.SQLITE_IOERR_FSYNC, "check the disk"),
+        (sqlite3.SQLITE_BUSY, "end the program that holds the journal"),
+        (sqlite3.SQLITE_CORRUPT_VTAB, None),
+        (sqlite3.SQLITE_TOOBIG, None),
+    ],
+)
+def test_error_code_tells_system_from_file(code: int, remedy: str | None) -> None:
+    failure = sqlite3.OperationalError("it failed")
     failure.sqlite_errorcode = code
-    remedy = CODES[code]
     for read_only, blames_system in ((True, SessionUnreadable), (False, SessionUnwritable)):
         with (
             pytest.raises(SessionCorrupt if remedy is None else blames_system) as caught,
@@ -416,13 +222,6 @@ def test_errors_are_classified_by_their_code(code: int, kind: type[sqlite3.Error
             raise failure
         expected = "restore the journal from a copy" if remedy is None else "folder" if read_only else remedy
         assert expected in str(caught.value).rpartition("; ")[2]
-
-
-def test_a_wrong_use_of_sqlite_is_no_failure_of_the_file(journal_file: Path) -> None:
-    journal = Journal(journal_file)
-    journal.close()
-    with pytest.raises(sqlite3.ProgrammingError):
-        journal.events()
 
 
 # --- Flipped bits
@@ -454,29 +253,22 @@ def flips(content: bytes, each: int) -> list[int]:
     return sorted({*range(8 * 100), *of_bytes, *range(0, 8 * len(content), each)})
 
 
-def test_any_flipped_bit_is_found_or_does_no_harm(journal_file: Path) -> None:
+@pytest.mark.parametrize("share", [10, pytest.param(1, marks=pytest.mark.deep)])
+def test_any_flipped_bit_is_found_or_does_no_harm(journal_file: Path, share: int) -> None:
     expected, written = content(journal_file), journal_file.read_bytes()
-    bits = flips(written, each=1997)
+    bits = flips(written, each=61)[::share]
     refused = 0
     for bit in bits:
         flip(journal_file, written, bit)
         refused += is_refused(journal_file, expected)
-    assert len(bits) > 2000
-    assert refused > 1000
-
-
-@pytest.mark.campaign
-def test_any_of_many_flipped_bits_is_found_or_does_no_harm(journal_file: Path) -> None:
-    expected, written = content(journal_file), journal_file.read_bytes()
-    for bit in flips(written, each=61):
-        flip(journal_file, written, bit)
-        is_refused(journal_file, expected)
+    assert len(bits) > 200
+    assert refused > 0.1 * len(bits)
 
 
 # --- Sessions of the earlier version
 
 
-def test_a_complete_session_of_the_earlier_version_is_in_order(tmp_path: Path) -> None:
+def test_complete_session_of_earlier_version_is_whole(tmp_path: Path) -> None:
     folder = old_sessions(tmp_path) / "complete"
     verdict = verify(folder)
     assert verdict.problems == ()
@@ -522,37 +314,37 @@ class Interruptible:
 
 
 @pytest.mark.parametrize("after", [False, True], ids=["before", "after"])
-@pytest.mark.parametrize("statement", range(1, 12))
-def test_an_interrupt_at_any_statement_leaves_a_sound_journal(
-    statement: int, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_interrupt_at_any_statement_leaves_sound_journal(
+    after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "journal.sqlite"
-    opened: list[Interruptible] = []
+    connections: list[Interruptible] = []
 
     def connect(*words: Any, **options: Any) -> Interruptible:
-        opened.append(Interruptible(database.connect(*words, **options)))
-        return opened[-1]
+        connections.append(Interruptible(database.connect(*words, **options)))
+        return connections[-1]
 
-    with monkeypatch.context() as patch:
-        patch.setattr("faintfield.rig.session.journal.connect", connect)
-        journal = Journal(path, create=True)
-    journal.event("first")
-    journal.record(1.0, "sent", b"before")
-    opened[0].statements_left, opened[0].after = statement, after
-    interrupted = False
-    try:
-        journal.event("second")
-    except KeyboardInterrupt:
-        interrupted = True
-    assert interrupted == (statement <= 10), "the statements of one entry and its traffic were counted wrongly"
-    opened[0].statements_left = 0
-    journal.record(2.0, "sent", b"later")
-    journal.close()
-    with Journal(path) as again:
-        kinds = [event.kind for event in again.events()]
-        assert kinds in (["first"], ["first", "second"])
-        assert interrupted or kinds == ["first", "second"]
-        assert [data for _, _, data in again.traffic()] == [b"before", b"later"]
-        again.event("third")
-    with Journal(path, read_only=True) as last:
-        assert [event.kind for event in last.events()] == [*kinds, "third"]
+    for statement in range(1, 12):
+        path = tmp_path / f"{statement}.sqlite"
+        with monkeypatch.context() as patch:
+            patch.setattr("faintfield.rig.session.journal.connect", connect)
+            journal = Journal(path, create=True)
+        journal.event("first")
+        journal.record(1.0, "sent", b"before")
+        connections[-1].statements_left, connections[-1].after = statement, after
+        interrupted = False
+        try:
+            journal.event("second")
+        except KeyboardInterrupt:
+            interrupted = True
+        assert interrupted == (statement <= 10), "the statements of one entry and its traffic were counted wrongly"
+        connections[-1].statements_left = 0
+        journal.record(2.0, "sent", b"later")
+        journal.close()
+        with Journal(path) as again:
+            kinds = [event.kind for event in again.events()]
+            assert kinds in (["first"], ["first", "second"])
+            assert interrupted or kinds == ["first", "second"]
+            assert [data for _, _, data in again.traffic()] == [b"before", b"later"]
+            again.event("third")
+        with Journal(path, read_only=True) as last:
+            assert [event.kind for event in last.events()] == [*kinds, "third"]

@@ -5,13 +5,22 @@ import os
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from faintfield.rig.session.disk import set_aside, write_new
 from faintfield.rig.session.durable import make_folder, sync_folder
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
-from tests.faults.capturing import FRAMES, capture_small
+from faintfield.rig.settings import StepSettings
+from tests.faults.capturing import SMALL_RIG, capture_small
 from tests.rig.session.power_cuts import Disk, record
+
+FRAMES = 3
+THREE_FRAMES = replace(
+    SMALL_RIG,
+    grid=replace(SMALL_RIG.grid, rows=1, columns=2),
+    step=(StepSettings("bright", 0.1), StepSettings("dark", 0.1)),
+)
 
 
 class Cuts:
@@ -47,7 +56,7 @@ def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cu
     cuts.all_entries = all_entries
     root = live(tmp_path)
     with record(root, cuts):
-        capture_small(root / "new" / "session")
+        capture_small(root / "new" / "session", THREE_FRAMES)
     assert len(cuts.remains) > 6 * FRAMES
     present = []
     for remains in cuts.remains:
@@ -64,14 +73,15 @@ def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cu
     assert verify(cuts.remains[-1] / "new" / "session").sealed
 
 
-def test_a_capture_resumes_after_a_power_cut(tmp_path: Path, cuts: Cuts) -> None:
+@pytest.mark.parametrize("each", [12, pytest.param(1, marks=pytest.mark.deep)])
+def test_a_capture_resumes_after_a_power_cut(tmp_path: Path, cuts: Cuts, each: int) -> None:
     root = live(tmp_path)
     with record(root, cuts):
-        capture_small(root / "session")
-    for remains in [*cuts.remains[:16:2], *cuts.remains[16:-10:11], *cuts.remains[-10::2]]:
+        capture_small(root / "session", THREE_FRAMES)
+    for remains in cuts.remains[::each]:
         session = remains / "session"
         if not (session / "SHA256SUMS").exists():
-            capture_small(session)
+            capture_small(session, THREE_FRAMES)
         verdict = verify(session)
         assert (verdict.problems, verdict.present, verdict.sealed) == ((), FRAMES, True)
 
@@ -94,9 +104,9 @@ def test_what_is_set_aside_is_on_disk_in_one_of_the_two_places(tmp_path: Path, c
 def test_orphans_survive_a_power_cut_at_any_moment_of_a_resumed_capture(tmp_path: Path, cuts: Cuts) -> None:
     root = live(tmp_path)
     with record(root, cuts):
-        capture_small(root / "session")
+        capture_small(root / "session", THREE_FRAMES)
         (root / "session" / "SHA256SUMS").unlink()
-        damaged = sorted((root / "session" / "frames").iterdir())[3]
+        damaged = sorted((root / "session" / "frames").iterdir())[1]
         damaged.write_bytes(b"damaged")
         with damaged.open("rb") as file:
             os.fsync(file.fileno())

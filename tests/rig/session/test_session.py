@@ -1,14 +1,12 @@
 """The session on disk: all changes are noticed, nothing is overwritten or deleted."""
 
 import os
-import shutil
 import sqlite3
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from unittest import mock
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -20,44 +18,22 @@ from faintfield.rig.session import journal as journal_module
 from faintfield.rig.session.disk import set_aside, write_new
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan, read_plan
 from faintfield.rig.session.verify import verify
 from tests.faults.capturing import FRAMES, SMALL_RIG, capture_small, in_process
 from tests.patience import HANG_S
-
-
-@pytest.fixture(scope="module")
-def complete(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a complete session, to be copied."""
-    folder = tmp_path_factory.mktemp("complete") / "session"
-    capture_small(folder)
-    return folder
-
-
-@pytest.fixture
-def session(complete: Path, tmp_path: Path) -> Path:
-    """Return a copy of a complete session."""
-    return Path(shutil.copytree(complete, tmp_path / "session"))
-
-
-@pytest.fixture
-def unsealed(session: Path) -> Path:
-    """Return a complete session that is not sealed."""
-    (session / "SHA256SUMS").unlink()
-    return session
 
 
 def frame_files(folder: Path) -> list[Path]:
     return sorted((folder / "frames").iterdir())
 
 
-def test_a_complete_session_is_in_order(session: Path) -> None:
-    before = {path: path.read_bytes() for path in session.rglob("*") if path.is_file()}
-    verdict = verify(session)
+def test_a_complete_session_is_in_order(sealed: Path) -> None:
+    before = {path: path.read_bytes() for path in sealed.rglob("*") if path.is_file()}
+    verdict = verify(sealed)
     assert verdict.problems == ()
     assert (verdict.planned, verdict.present, verdict.missing, verdict.sealed) == (FRAMES, FRAMES, (), True)
-    assert before == {path: path.read_bytes() for path in session.rglob("*") if path.is_file()}
-    lines = (session / "SHA256SUMS").read_text().splitlines()
+    assert before == {path: path.read_bytes() for path in sealed.rglob("*") if path.is_file()}
+    lines = (sealed / "SHA256SUMS").read_text().splitlines()
     assert len(lines) == FRAMES + 2
     assert all(len(line.split("  ")[0]) == 64 for line in lines)
 
@@ -76,34 +52,34 @@ def read_plan_of_small_rig() -> CapturePlan:
     return survey(open_rig(SMALL_RIG), SMALL_RIG).plan
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("name", ["plan.json", "journal.sqlite", "SHA256SUMS", "frame"])
-def test_any_flipped_bit_is_found(session: Path, name: str, seed: int) -> None:
+def test_any_flipped_bit_is_found(sealed: Path, name: str, seed: int) -> None:
     generator = np.random.default_rng(seed)
-    path = generator.choice(np.array(frame_files(session))) if name == "frame" else session / name
+    path = generator.choice(np.array(frame_files(sealed))) if name == "frame" else sealed / name
     content = bytearray(path.read_bytes())
     content[generator.integers(len(content))] ^= 1 << generator.integers(8)
     path.write_bytes(content)
     try:
-        problems = verify(session).problems
+        problems = verify(sealed).problems
     except SessionCorrupt as failure:
         problems = (str(failure),)
     assert problems
     assert any(path.name in problem for problem in problems)
 
 
-@pytest.mark.parametrize("sealed", [True, False])
-def test_missing_and_extra_files_are_found(session: Path, sealed: bool) -> None:
-    if not sealed:
-        (session / "SHA256SUMS").unlink()
-    gone, renamed = frame_files(session)[3:5]
+@pytest.mark.parametrize("with_sums", [True, False])
+def test_missing_and_extra_files_are_found(sealed: Path, with_sums: bool) -> None:
+    if not with_sums:
+        (sealed / "SHA256SUMS").unlink()
+    gone, renamed = frame_files(sealed)[3:5]
     gone.unlink()
-    renamed.rename(session / "frames" / "stranger.tiff")
-    verdict = verify(session)
+    renamed.rename(sealed / "frames" / "stranger.tiff")
+    verdict = verify(sealed)
     for expected in (f"{gone.name}: is missing", f"{renamed.name}: is missing", "stranger.tiff: is not in the journal"):
         assert any(expected in problem for problem in verdict.problems)
     assert verdict.present == FRAMES - 2
-    assert not any("does not agree" in problem for problem in verdict.problems) or sealed
+    assert not any("does not agree" in problem for problem in verdict.problems) or with_sums
 
 
 def test_frames_that_changed_places_are_found(unsealed: Path) -> None:
@@ -114,22 +90,22 @@ def test_frames_that_changed_places_are_found(unsealed: Path) -> None:
     assert len(verify(unsealed).problems) == 2
 
 
-@pytest.mark.parametrize("sealed", [True, False])
-def test_an_edited_plan_is_found_and_not_resumed(session: Path, sealed: bool) -> None:
-    if not sealed:
-        (session / "SHA256SUMS").unlink()
-    plan = session / "plan.json"
+@pytest.mark.parametrize("with_sums", [True, False])
+def test_an_edited_plan_is_found_and_not_resumed(sealed: Path, with_sums: bool) -> None:
+    if not with_sums:
+        (sealed / "SHA256SUMS").unlink()
+    plan = sealed / "plan.json"
     plan.write_text(plan.read_text().replace("50.0", "51.0"))
-    assert any("plan.json" in problem for problem in verify(session).problems)
-    (session / "SHA256SUMS").unlink(missing_ok=True)
+    assert any("plan.json" in problem for problem in verify(sealed).problems)
+    (sealed / "SHA256SUMS").unlink(missing_ok=True)
     with pytest.raises(SessionCorrupt, match=r"plan\.json: was changed after the session was begun; restore it"):
-        capture_small(session)
+        capture_small(sealed)
 
 
-def test_verify_reads_a_write_protected_session(session: Path) -> None:
-    for path in (*session.rglob("*"), session):
+def test_verify_reads_a_write_protected_session(sealed: Path) -> None:
+    for path in (*sealed.rglob("*"), sealed):
         path.chmod(0o500 if path.is_dir() else 0o400)
-    process = in_process(verify_without_rights, session)
+    process = in_process(verify_without_rights, sealed)
     process.join(HANG_S)
     assert process.exitcode == 0
 
@@ -177,16 +153,16 @@ def test_a_folder_with_other_things_is_no_place_for_a_session(tmp_path: Path) ->
         pass
 
 
-@pytest.mark.parametrize("altered", [None, "plan.json", "journal.sqlite", "SHA256SUMS", "frames"])
-def test_a_complete_session_is_not_written_to(session: Path, altered: str | None) -> None:
+@pytest.mark.parametrize("altered", [None, "plan.json", "frames"])
+def test_a_complete_session_is_not_written_to(sealed: Path, altered: str | None) -> None:
     if altered is not None:  # whatever else is wrong with it
-        path = frame_files(session)[0] if altered == "frames" else session / altered
+        path = frame_files(sealed)[0] if altered == "frames" else sealed / altered
         path.write_bytes(b"altered" + path.read_bytes())
-    before = {path: path.read_bytes() if path.is_file() else None for path in session.rglob("*")}
+    before = {path: path.read_bytes() if path.is_file() else None for path in sealed.rglob("*")}
     with pytest.raises(SessionCorrupt, match="is complete and is not written to"):
-        capture_small(session)
-    assert before == {path: path.read_bytes() if path.is_file() else None for path in session.rglob("*")}
-    assert altered is not None or verify(session).problems == ()
+        capture_small(sealed)
+    assert before == {path: path.read_bytes() if path.is_file() else None for path in sealed.rglob("*")}
+    assert altered is not None or verify(sealed).problems == ()
 
 
 def test_orphans_are_set_aside_and_nothing_is_deleted(unsealed: Path) -> None:
@@ -255,16 +231,10 @@ def test_the_journal_is_as_durable_as_sqlite_can_be(tmp_path: Path) -> None:
         other.close()
 
 
-def test_the_stage_s_traffic_is_in_the_journal(session: Path) -> None:
-    with Journal(session / "journal.sqlite", read_only=True) as journal:
+def test_the_stage_s_traffic_is_in_the_journal(sealed: Path) -> None:
+    with Journal(sealed / "journal.sqlite", read_only=True) as journal:
         sent = b"".join(data for _, direction, data in journal.traffic() if direction == "sent")
         received = b"".join(data for _, direction, data in journal.traffic() if direction == "received")
     assert b"$H" in sent
     assert sent.count(b"$J=") >= FRAMES - 4
     assert b"Grbl 1.1" in received
-
-
-def test_a_plan_survives_its_file(session: Path) -> None:
-    frozen = read_plan(session)
-    assert msgspec.json.decode(msgspec.json.encode(frozen), type=FrozenPlan) == frozen
-    assert frozen.rig == SMALL_RIG

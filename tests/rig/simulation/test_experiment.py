@@ -1,14 +1,10 @@
 """The grid, the paper's experiment and its toys."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
 from faintfield.rig.plan import centre_node, grid_nodes, nominal_poses_rt_cam_ref
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
-from faintfield.rig.simulation.objects import toy_airplane, toy_truck
-from faintfield.rig.simulation.scene import TexturedPlane, render
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +12,7 @@ def experiment() -> SimulatedExperiment:
     return paper_experiment(80, 60)
 
 
-@pytest.mark.parametrize(("rows", "columns"), [(7, 7), (1, 1), (3, 5), (4, 2)])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 1), (3, 5), (4, 2)])
 def test_poses_follow_the_nodes_in_raster_order_from_the_centre(rows: int, columns: int) -> None:
     poses = nominal_poses_rt_cam_ref(rows, columns, 50.0)
     nodes, centre = grid_nodes(rows, columns), centre_node(rows, columns)
@@ -54,15 +50,6 @@ def test_the_field_of_view_does_not_depend_on_the_number_of_pixels() -> None:
     np.testing.assert_allclose(edges[:2], edges[2:], rtol=1e-12)
 
 
-def test_the_toys_are_whole_in_the_reference_view_and_mostly_in_the_others(experiment: SimulatedExperiment) -> None:
-    views = list(render(experiment.grey().planes, experiment.optics, experiment.nominal_poses_rt_cam_ref()))
-    for name in ("truck", "airplane"):
-        areas_px = np.array([view.visible[name].sum() for view in views])
-        assert areas_px[experiment.reference_view] > 0.95 * areas_px.max()
-        assert areas_px[experiment.reference_view] > 0.05 * 80 * 60
-        assert areas_px.mean() > 0.6 * areas_px.max()
-
-
 def test_pose_errors_have_the_deviations_asked_for_and_spare_the_reference() -> None:
     experiment = SimulatedExperiment((), paper_experiment(8, 6).optics, rows=61, columns=61)
     poses = experiment.poses_rt_cam_ref(0.5, 2e-3, np.random.default_rng(20110919))
@@ -71,20 +58,6 @@ def test_pose_errors_have_the_deviations_asked_for_and_spare_the_reference() -> 
     # A standard deviation from n numbers is known to 1 / √(2 n) of itself
     np.testing.assert_allclose(errors.std(axis=0), [2e-3] * 3 + [0.5] * 3, rtol=4 / np.sqrt(2 * 61**2))
     np.testing.assert_allclose(errors.mean(axis=0), 0, atol=4 * 0.5 / 61)
-
-
-@pytest.mark.parametrize(("toy", "length_mm"), [(toy_truck, 190.0), (toy_airplane, 265.0)])
-def test_toys_are_as_long_as_they_say_and_reflect_between_nothing_and_everything(
-    toy: Callable[[float, float, float], TexturedPlane], length_mm: float
-) -> None:
-    plane = toy(10.0, -20.0, 500.0)
-    columns = np.flatnonzero((plane.opacity > 0.5).any(axis=0))
-    assert np.ptp(columns) * plane.pitch_mm == pytest.approx(length_mm, abs=2.0)
-    assert plane.rt_ref_plane == (0, 0, 0, 10.0, -20.0, 500.0)
-    assert plane.reflectance.shape == (*plane.opacity.shape, 3)
-    assert plane.opacity.min() == 0
-    assert plane.opacity.max() == 1
-    assert 0 <= plane.reflectance.min() < plane.reflectance.max() <= 1
 
 
 def test_a_grey_experiment_sees_the_mean_of_the_colours(experiment: SimulatedExperiment) -> None:

@@ -13,7 +13,7 @@ def optics_of(distortion: tuple[float, ...], *, vignetting: bool = True) -> Simu
     return SimulatedOptics((31, 21), 40.0, 42.0, 14.0, 11.5, distortion, vignetting)
 
 
-@pytest.mark.parametrize("distortion", [(), (-0.2,), (-0.2, 0.05, 1e-3, -2e-3), RATIONAL])
+@pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 1e-3, -2e-3), RATIONAL])
 def test_distortion_is_opencvs(distortion: tuple[float, ...]) -> None:
     rays = np.random.default_rng(1).uniform(-0.4, 0.4, (50, 2))
     coefficients = np.array([*distortion, *[0.0] * (8 - len(distortion))])
@@ -24,8 +24,8 @@ def test_distortion_is_opencvs(distortion: tuple[float, ...]) -> None:
     np.testing.assert_allclose(np.column_stack([x, y]), projected[:, 0], atol=1e-14)
 
 
-@pytest.mark.parametrize("distortion", [(), (-0.2, 0.05, 1e-3, -2e-3), RATIONAL])
-@pytest.mark.parametrize("samples_per_px", [1, 2, 3])
+@pytest.mark.parametrize("distortion", [(-0.2, 0.05, 1e-3, -2e-3), RATIONAL])
+@pytest.mark.parametrize("samples_per_px", [1, 2])
 def test_samples_lie_evenly_within_each_pixel(distortion: tuple[float, ...], samples_per_px: int) -> None:
     rays = optics_of(distortion).rays(samples_per_px).astype(float)
     x, y = distort(rays[..., 0], rays[..., 1], distortion)

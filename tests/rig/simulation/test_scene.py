@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import permutations
 
 import numpy as np
 import pytest
@@ -72,7 +71,7 @@ def test_a_card_covers_its_rectangle_with_the_right_share_of_each_pixel(x_mm: fl
     np.testing.assert_allclose(view.light, 0.6 * np.outer(down, across), atol=1e-5)
 
 
-@pytest.mark.parametrize("order", list(permutations(range(3))))
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_nearer_cards_hide_farther_ones_by_their_opacity_in_whatever_order_they_are_given(
     order: tuple[int, ...],
 ) -> None:
@@ -159,8 +158,7 @@ def test_each_colour_is_rendered_as_if_it_were_alone_and_grey_is_their_mean() ->
     np.testing.assert_allclose(view_of([plane.grey() for plane in planes]).light, seen.mean(axis=2), atol=1e-3)
 
 
-@pytest.mark.parametrize("samples_per_px", [1, 3])
-@pytest.mark.parametrize("distortion", [(), (-0.1, 0.02, 1e-3, -1e-3)])
+@pytest.mark.parametrize(("samples_per_px", "distortion"), [(1, (-0.1, 0.02, 1e-3, -1e-3)), (3, ())])
 def test_the_renderer_and_the_operator_see_the_same_of_a_smooth_plane(
     distortion: tuple[float, ...], samples_per_px: int
 ) -> None:

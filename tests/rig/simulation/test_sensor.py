@@ -5,7 +5,7 @@ import pytest
 
 from faintfield.rig.simulation.sensor import SimulatedSensor
 
-PIXELS = (1000, 1000)
+PIXELS = (400, 400)
 
 
 @pytest.mark.parametrize("photons", [0.0, 3.84, 5000.0])

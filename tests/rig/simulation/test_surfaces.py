@@ -13,7 +13,6 @@ from faintfield.rig.simulation.experiment import SimulatedExperiment, surface_ex
 from faintfield.rig.simulation.optics import SimulatedOptics
 from faintfield.rig.simulation.scene import RenderedView
 from faintfield.rig.simulation.shapes import Cylinder, Rectangle, Shape, Sphere
-from faintfield.rig.simulation.surface_objects import surface_scene
 from faintfield.rig.simulation.surfaces import Surface, render_surfaces, true_depth_mm
 
 type Points = NDArray[np.float64]
@@ -119,14 +118,6 @@ def test_depth_of_a_rod_across_the_axis_is_that_of_a_circle() -> None:
     np.testing.assert_allclose(true_depth_mm([rod], PINHOLE), np.repeat(expected[:, np.newaxis], 41, 1), rtol=1e-6)
 
 
-def test_a_thin_rod_covers_its_share_of_each_row() -> None:
-    rod = painted("rod", Cylinder((0.7, -500.0, 300.0), (0.7, 500.0, 300.0), 3.0), 1.0)
-    share = view_of([rod], samples_per_px=16).visible["rod"]
-    expected = 2 * 100 * np.tan(np.arcsin(3 / np.hypot(0.7, 300)))
-    np.testing.assert_allclose(share.sum(axis=1), expected, atol=2 / 16)
-    assert ((share > 0) & (share < 1)).any(axis=1).all()
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_normals_are_where_the_distance_grows_fastest(name: str) -> None:
     shape, outside = SHAPES[name]
@@ -224,7 +215,7 @@ def smooth(surface: Surface) -> Surface:
     )
 
 
-@pytest.mark.parametrize("view", [0, 27, 45])
+@pytest.mark.parametrize("view", [0, 45])
 def test_each_view_is_the_reference_moved_by_the_true_depth_where_nothing_hides_it(
     view: int, experiment: SimulatedExperiment
 ) -> None:
@@ -251,37 +242,6 @@ def test_each_view_is_the_reference_moved_by_the_true_depth_where_nothing_hides_
 
     assert share_that_agrees(depth) > 0.98
     assert share_that_agrees(1.03 * depth) < 0.7
-
-
-def test_every_view_is_filled_and_shows_the_thin_rod_before_all_else(experiment: SimulatedExperiment) -> None:
-    poses = experiment.poses_rt_cam_ref(0.3, 3.5e-3, np.random.default_rng(6))
-    names = {surface.name for surface in experiment.surfaces}
-    (rod,) = (surface for surface in experiment.surfaces if surface.name == "rod")
-    views = list(experiment.render(poses, samples_per_px=1))
-    assert len(views) == 49
-    for view, pose in zip(views, poses, strict=True):
-        np.testing.assert_array_equal(sum(view.visible.values()), 1.0)
-        assert set(view.visible) == names
-        rows = view.visible["rod"].sum(axis=1)
-        assert np.mean(rows > 0) > 0.65
-        assert rows.max() < 6  # of 160
-        alone = view_of([rod], experiment.optics, pose).visible["rod"]
-        # Nothing is before it but the floor, on which it stands
-        np.testing.assert_array_equal(view.visible["rod"], alone * (1 - view.visible["floor"]))
-    reference = views[24].visible
-    assert all(reference[name].mean() > 0.005 for name in names)
-
-
-def test_the_scene_is_where_it_says_and_always_the_same(experiment: SimulatedExperiment) -> None:
-    depth = true_depth_mm(experiment.surfaces, experiment.optics.ideal())
-    assert np.isfinite(depth).all()
-    assert 510 < depth.min() < 525
-    assert 990 < depth.max() < 1020
-    for one, again in zip(surface_scene(), surface_scene(), strict=True):
-        np.testing.assert_array_equal(one.reflectance, again.reflectance)
-        assert one.shape == again.shape
-        assert 0 <= one.reflectance.min() < one.reflectance.max() <= 1
-        assert one.reflectance.std(axis=(0, 1)).min() > 0.02
 
 
 def test_each_colour_is_rendered_as_if_it_were_alone_and_grey_is_their_mean() -> None:

@@ -65,28 +65,6 @@ def test_one_idle_report_does_not_end_a_wait() -> None:
     assert told
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({22: "0"}, r"\$22=0.*set \$22=1"),
-        ({13: "1"}, r"\$13=1.*set \$13=0"),
-        ({100: "0.000"}, r"\$100=0.000"),
-        ({110: "0.000"}, r"\$110"),
-    ],
-)
-def test_settings_that_cannot_be_driven_are_refused_before_motion(settings: dict[int, str], message: str) -> None:
-    bench = Bench(SimulatedGrbl)
-    grbl(bench).settings.update(settings)
-    with pytest.raises(WrongFirmware, match=message):
-        bench.stage().connect()
-
-
-def test_settings_that_should_be_changed_are_told() -> None:
-    stage = Bench(partial(SimulatedGrbl, settings={20: "0", 1: "25"})).stage()
-    stage.connect()
-    assert [warning.split(":")[0] for warning in stage.identify().warnings] == ["$20=0", "$1=25"]
-
-
 def test_the_wrong_firmware_is_refused() -> None:
     bench = Bench(SimulatedGrbl)
     for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
@@ -97,14 +75,6 @@ def test_the_wrong_firmware_is_refused() -> None:
     marlin = bench.stage(StageSettings(protocol="marlin", port="simulated"))
     with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):
         marlin.connect()
-
-
-def test_travel_follows_the_homing_direction_where_the_switch_is_the_origin() -> None:
-    bench = Bench(partial(SimulatedGrbl, settings={23: "1"}))
-    bench.wire.filters_to_host.append(lambda data: data.replace(b"[OPT:V,", b"[OPT:VZ,"))
-    stage = bench.stage()
-    stage.connect()
-    assert stage.travel() == Box((0.0, 400.0), (-400.0, 0.0))
 
 
 def test_configured_limits_narrow_the_travel() -> None:

@@ -7,41 +7,21 @@ from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.grbl.failures import alarm_failure, error_failure, state_failure
 from faintfield.rig.stages.grbl.messages import Report
-from faintfield.rig.stages.protocol import Point, StageSettings
+from faintfield.rig.stages.protocol import StageSettings
 from tests.rig.stages.benches import grbl, homed
 
 
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (1, "limit switch"), (2, "soft limits"), (3, "reset while moving"), (4, "probe"), (5, "probe"),
-        (6, "reset during homing"), (7, "door"), (8, "pulling off"), (9, "no switch was found"), (10, "second motor"),
-        (10, "release the emergency stop"), (11, "homing is required"), (12, "off its switch"), (17, "motor driver"),
-        (18, "$22"),
-        (99, "firmware's list of alarms"),
-    ],
-)  # fmt: skip
-def test_the_message_of_an_alarm_says_what_it_means_and_only_soft_limits_keep_the_position(
-    code: int, words: str
-) -> None:
+@pytest.mark.parametrize(("code", "words"), [(1, "limit switch"), (2, "soft limits"), (99, "list of alarms")])
+def test_only_soft_limits_keep_the_position(code: int, words: str) -> None:
     failure = alarm_failure(code)
     assert str(failure).startswith(f"ALARM:{code}: ")
     assert words in str(failure)
     assert failure.code == code
     assert failure.position_kept == (code == 2)
-    assert ("home it" in str(failure)) == (code != 2)
 
 
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [
-        (2, "number format"), (3, "unknown $ command"), (5, "homing is not enabled"), (8, "only allowed when idle"),
-        (9, "locked"), (11, "line too long"), (15, "target outside the travel"), (16, "bad jog"), (20, "unsupported"),
-        (22, "no feed rate"), (13, "door"), (45, "limit switch"), (46, "homing is required"), (50, "release it"),
-        (79, "before the alarm is cleared"), (99, "firmware's list of errors"),
-    ],
-)  # fmt: skip
-def test_the_message_of_a_refusal_names_the_command_and_the_reason(code: int, words: str) -> None:
+@pytest.mark.parametrize(("code", "words"), [(15, "target outside the travel"), (99, "list of errors")])
+def test_refusal_names_command_and_reason(code: int, words: str) -> None:
     message = str(error_failure("$J=X1", code))
     assert "'$J=X1'" in message
     assert f"error:{code}, " in message
@@ -51,8 +31,7 @@ def test_the_message_of_a_refusal_names_the_command_and_the_reason(code: int, wo
 @pytest.mark.parametrize(
     ("state", "kept"),
     [
-        ("Hold", True), ("Door", True), ("Jog", True), ("Run", True), ("Check", True),
-        ("Home", False), ("Sleep", False), ("Tool", False),
+        ("Hold", True), ("Jog", True), ("Home", False), ("Sleep", False), ("Tool", False),
     ],
 )  # fmt: skip
 def test_states_without_power_or_with_a_search_for_switches_lose_the_position(state: str, kept: bool) -> None:
@@ -71,16 +50,6 @@ def test_an_alarm_is_told_again_until_it_is_cleared() -> None:
     stage.recover()
     stage.home()
     assert stage.position().trusted
-
-
-def test_an_alarm_cleared_by_hand_without_a_reset_still_loses_the_position() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = homed(bench)
-    grbl(bench).alarm(4)
-    bench.firmware.receive(b"$X\n")
-    assert grbl(bench).state == "Idle"
-    stage.recover()
-    assert not stage.trusted
 
 
 @pytest.mark.parametrize("motion", [b"G53 G1 X-100 F6000\n", b"$J=G53 G90 X-100 F6000\n"])
@@ -111,18 +80,6 @@ def test_no_position_is_reported_while_the_stage_moves_or_is_held() -> None:
     with pytest.raises(StageAlarm, match="is on hold"):
         stage.verify_at(-300.0, -300.0)
     assert stage.trusted, "a hold slows down without losing steps"
-
-
-def test_holding_takes_no_longer_than_slowing_down_and_two_reports() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = homed(bench)
-    stage.move_to(-300.0, -300.0)
-    bench.firmware.receive(b"$J=G53 G90 X-100 F6000\n")
-    bench.clock.sleep_s(0.5)
-    begun_s = bench.clock.now_s()
-    stage.hold()
-    assert bench.clock.now_s() - begun_s < 1.5
-    assert not bench.firmware.mechanics.moving
 
 
 def test_a_stage_that_moves_far_longer_than_predicted_is_stopped() -> None:
@@ -163,12 +120,3 @@ def test_a_position_just_off_its_target_is_not_believed() -> None:
     with pytest.raises(PositionLost):
         stage.verify_at(-100.0, -100.0 - 1.6 * tolerance_mm)
     assert not stage.trusted
-
-
-def test_the_longest_jog_of_a_stage_that_is_not_homed_is_ten_millimetres() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = bench.stage()
-    stage.connect()
-    before = bench.true_position()
-    stage.jog(-6.0, -8.0, unlock=True)
-    assert bench.true_position() == pytest.approx(Point(before.x_mm - 6.0, before.y_mm - 8.0), abs=0.01)

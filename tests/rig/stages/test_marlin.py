@@ -1,6 +1,5 @@
 """The Marlin driver on a simulated controller: one test for each peculiarity of the protocol."""
 
-import re
 from collections.abc import Callable
 from functools import partial
 
@@ -69,27 +68,6 @@ def test_recovery_notices_an_unseen_restart() -> None:
     bench.firmware.restart()
     bench.clock.sleep_s(5.0)
     stage.recover()
-    assert not stage.trusted
-
-
-def test_a_board_that_answers_is_recovered_without_restarting_it() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = homed(bench)
-    bench.wire.filters_to_host.append(without(b"start"))
-    bench.firmware.restart()
-    bench.clock.sleep_s(5.0)
-    begun_s = bench.clock.now_s()
-    stage.recover()
-    assert not stage.trusted
-    assert bench.clock.now_s() - begun_s < 2.0, "a restart takes a second, and the wait for its greeting three"
-
-
-def test_an_answer_without_a_position_is_an_error() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = homed(bench)
-    bench.wire.filters_to_host.append(without(b"X:"))
-    with pytest.raises(StageTimeout, match="without a position"):
-        stage.position()
     assert not stage.trusted
 
 
@@ -179,17 +157,6 @@ def test_travel_is_what_all_sources_allow() -> None:
     assert stage.travel() == Box((0.0, 350.0), (0.0, 400.0))
 
 
-def test_travel_that_is_not_reported_must_be_configured() -> None:
-    bench = Bench(SimulatedMarlin)
-    bench.wire.filters_to_host.append(without(b"area:", b"echo:Soft"))
-    with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
-        bench.stage().connect()
-    travel = Box((0.0, 300.0), (0.0, 300.0))
-    stage = bench.stage(StageSettings(protocol="marlin", port="simulated", travel_mm=travel))
-    stage.connect()
-    assert stage.travel() == travel
-
-
 def test_settings_that_change_while_read_are_not_believed() -> None:
     bench = Bench(SimulatedMarlin)
     seen: list[bytes] = []
@@ -205,61 +172,6 @@ def test_settings_that_change_while_read_are_not_believed() -> None:
         bench.stage().connect()
 
 
-@pytest.mark.parametrize("line", [b"FIRMWARE_NAME", b"echo: M92", b"echo: M203", b"echo: M201", b"echo: M204"])
-def test_firmware_that_does_not_report_a_needed_setting_is_refused(line: bytes) -> None:
-    bench = Bench(SimulatedMarlin)
-    bench.wire.filters_to_host.append(without(line))
-    with pytest.raises(WrongFirmware):
-        bench.stage().connect()
-
-
-def test_what_a_killed_controller_said_last_is_no_answer_to_the_recovery() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = homed(bench)
-    assert isinstance(bench.firmware, SimulatedMarlin)
-    bench.firmware.kill("Heating failed")
-    stage.recover()
-    assert not stage.trusted
-    stage.home()
-    assert stage.trusted
-
-
-def test_a_jog_goes_by_its_distances() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = homed(bench)
-    stage.move_to(100.0, 200.0)
-    assert stage.jog(3.0, -4.0).is_at(Point(103.0, 196.0))
-    assert bench.true_position() == pytest.approx((103.0, 196.0), abs=0.01)
-
-
-def test_a_report_without_one_of_the_axes_is_refused() -> None:
-    bench = Bench(SimulatedMarlin)
-    bench.wire.filters_to_host.append(lambda data: re.sub(rb" Z:\S+", b"", data))
-    bench.wire.filters_to_host.append(lambda data: data.replace(b" Y", b" Z") if data.startswith(b"echo: M") else data)
-    travel = Box((0.0, 400.0), (0.0, 400.0))
-    stage = bench.stage(StageSettings(protocol="marlin", port="simulated", axes=("X", "Z"), travel_mm=travel))
-    stage.connect()
-    with pytest.raises(WrongFirmware, match=r"no position of axis 'Z'; set stage\.axes"):
-        stage.position()
-
-
-def test_a_busy_message_among_the_settings_does_not_change_them() -> None:
-    bench = Bench(SimulatedMarlin)
-    told: list[bool] = []
-
-    def busy_once(data: bytes) -> bytes:
-        if data.startswith(b"echo: M92") and not told:
-            told.append(True)
-            return b"echo:busy: processing\n" + data
-        return data
-
-    bench.wire.filters_to_host.append(busy_once)
-    stage = bench.stage()
-    stage.connect()
-    assert told
-    assert stage.travel() == Box((0.0, 400.0), (0.0, 400.0))
-
-
 def test_a_motion_that_is_refused_until_the_stage_is_homed_is_an_error() -> None:
     bench = Bench(SimulatedMarlin)
     stage = homed(bench)
@@ -268,17 +180,6 @@ def test_a_motion_that_is_refused_until_the_stage_is_homed_is_an_error() -> None
     )
     with pytest.raises(StageRejected, match=r"refused 'G1 .*Home XY First; home the stage first"):
         stage.move_to(100.0, 100.0)
-
-
-def test_missing_limits_and_a_missing_emergency_parser_are_told() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = bench.stage()
-    stage.connect()
-    assert stage.identify().warnings == ()
-    bench.wire.filters_to_host.append(lambda data: data.replace(b"EMERGENCY_PARSER:1", b"EMERGENCY_PARSER:0"))
-    stage.connect()
-    (warning,) = stage.identify().warnings
-    assert warning.startswith("no emergency parser")
 
 
 def test_the_wrong_firmware_is_refused() -> None:
@@ -349,13 +250,3 @@ def test_a_motion_slower_than_predicted_is_waited_for_while_busy_is_told_but_not
     with pytest.raises(StageTimeout, match="it says that it is busy; "):
         stage.move_to(200.0, 200.0)
     assert bound_s + 10.0 < bench.clock.now_s() - begun_s < bound_s + 16.0
-
-
-def test_a_mute_controller_is_not_waited_for_longer_than_before() -> None:
-    bench = Bench(SimulatedMarlin)
-    stage = homed(bench)
-    bench.wire.filters_to_host.append(lambda data: b"")
-    begun_s = bench.clock.now_s()
-    with pytest.raises(StageTimeout, match=r"no answer to 'G1 .*' within 2\.0 s; look"):
-        stage.move_to(100.0, 100.0)
-    assert bench.clock.now_s() - begun_s < 3.0

@@ -1,34 +1,28 @@
-"""XY stages of Micro-Manager: the contract on its demonstration stage, and a core that fails when it is told to."""
+"""XY stages of Micro-Manager, on a core that fails when it is told to."""
 
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import pytest
 from msgspec.structs import replace
 
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.settings import MicroManagerSettings, SimulatedSettings
-from faintfield.rig.clock import WallClock
-from faintfield.rig.devices import open_rig, open_stage
+from faintfield.rig.devices import open_rig
 from faintfield.rig.errors import (
-    CameraError,
     NotHomed,
     PlanRefused,
     PositionLost,
     StageLost,
     StageTimeout,
     StageUnfit,
-    WrongFirmware,
 )
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
 from faintfield.rig.simulation.controller.wire import SimulatedClock
-from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.micromanager.controller import MicroManagerController
 from faintfield.rig.stages.micromanager.settings import MicroManagerStage
@@ -184,8 +178,6 @@ def test_positions_are_micrometres_of_the_adapter() -> None:
     ("options", "message"),
     [
         ({"device": "Camera"}, r"no XY stage 'Camera'; choose from XY$"),
-        ({"properties": {"Velocity": "1"}}, r"no property 'Velocity'; choose from Speed, Position$"),
-        ({"properties": {"Speed": "5", "Position": "1"}}, r"'Position' of XY cannot be set; remove it$"),
         ({"properties": {"Speed": "2"}}, r"'Speed' of XY cannot be '2'; choose from 1, 5$"),
     ],
 )
@@ -196,20 +188,6 @@ def test_what_the_configuration_does_not_offer_is_refused_with_what_it_does(opti
         controller.connect()
     assert "setProperty" not in shared.core.calls
     assert "unloadAllDevices" in shared.core.calls
-
-
-def test_properties_are_set_when_the_stage_is_connected() -> None:
-    shared, _ = rehearsed(properties={"Speed": "1"})
-    assert shared.core.calls.count("setProperty") == 1
-
-
-def test_each_position_is_approached_from_below() -> None:
-    shared, stage = rehearsed()
-    stage.home()
-    stage.move_to(8.0, 8.0)
-    shared.core.calls.clear()
-    stage.move_to(5.0, 8.0)
-    assert shared.core.calls.count("setXYPosition") == 2
 
 
 def test_a_report_counts_only_when_the_next_is_equal() -> None:
@@ -232,16 +210,6 @@ def test_a_report_counts_only_when_the_adapter_is_not_busy() -> None:
     shared.core.arrives_s = shared.clock.now_s() + 60.0
     with pytest.raises(StageTimeout, match="does not come to rest"):
         stage.position()
-
-
-def test_a_stage_that_stops_beside_its_target_is_lost() -> None:
-    shared, stage = rehearsed()
-    stage.home()
-    shared.core.off_um = 6.0
-    with pytest.raises(PositionLost, match=r"instead of \(5\.000, 5\.000\) mm"):
-        stage.move_to(5.0, 5.0)
-    assert not stage.trusted
-    assert "stop" in shared.core.calls
 
 
 def test_a_motion_that_takes_too_long_is_stopped_and_named() -> None:
@@ -325,6 +293,17 @@ def test_a_confirmed_origin_is_good_for_one_homing_of_a_connection() -> None:
     assert stage.trusted
 
 
+def rig(**options: Any) -> RigSettings:
+    """Return a rig whose camera and stage are Micro-Manager's."""
+    return RigSettings(
+        stage=StageSettings("micromanager", travel_mm=TRAVEL, options=options),
+        camera=MicroManagerSettings(),
+        grid=Grid(rows=2, columns=2, pitch_mm=2.0, origin_mm=Point(1.0, 1.0)),
+        step=(StepSettings("bright", 0.01),),
+        drift=DriftSettings(check=False),
+    )
+
+
 def test_a_confirmed_origin_is_not_confirmed_again_by_a_recovery() -> None:
     shared, stage = rehearsed(origin="confirmed", answer_s=0.5)
     stage.home()
@@ -337,38 +316,6 @@ def test_a_confirmed_origin_is_not_confirmed_again_by_a_recovery() -> None:
     with pytest.raises(StageUnfit, match="the position is lost"):
         stage.home()
     assert not stage.trusted
-
-
-def test_a_stop_counts_as_loss_of_the_position() -> None:
-    _, stage = rehearsed()
-    stage.home()
-    stage.hold()
-    assert not stage.trusted
-
-
-def test_what_is_missing_or_wrong_is_said_before_anything_moves() -> None:
-    with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
-        Gantry(
-            MicroManagerController(RehearsedCore(), MicroManagerStage(), None, SimulatedClock()),
-            StageSettings("micromanager"),
-            SimulatedClock(),
-        ).connect()
-    for changes in ({"rate_mm_per_s": 0.0}, {"tolerance_mm": -1.0}, {"answer_s": float("nan")}):
-        with pytest.raises(ValueError, match="give more than 0"):
-            MicroManagerStage(**changes)  # type: ignore[arg-type]
-    with pytest.raises(PlanRefused, match="unknown field `rate`"):
-        open_stage(StageSettings("micromanager", options={"rate": 3.0}))
-
-
-def rig(**options: Any) -> RigSettings:
-    """Return a rig whose camera and stage are Micro-Manager's."""
-    return RigSettings(
-        stage=StageSettings("micromanager", travel_mm=TRAVEL, options=options),
-        camera=MicroManagerSettings(),
-        grid=Grid(rows=2, columns=2, pitch_mm=2.0, origin_mm=Point(1.0, 1.0)),
-        step=(StepSettings("bright", 0.01),),
-        drift=DriftSettings(check=False),
-    )
 
 
 def test_camera_and_stage_share_one_core() -> None:
@@ -414,107 +361,3 @@ def test_a_camera_that_hangs_does_not_take_the_core_from_the_stage() -> None:
     core.getXYPosition("XY")
     shared.release("stage")
     assert "unloadAllDevices" not in shared.core.calls  # it would wait for the call that hangs
-
-
-def test_a_load_that_was_given_up_and_returns_late_is_unloaded() -> None:
-    shared = RehearsedCore()
-    begun, end = threading.Event(), threading.Event()
-    load = RehearsedCore._loaded  # noqa: SLF001 - where a real one hangs
-
-    def slow(self: RehearsedCore) -> Core:
-        core = load(self)
-        begun.set()
-        end.wait(30.0)
-        return core
-
-    outcome: list[BaseException] = []
-
-    def acquire_late() -> None:
-        try:
-            shared.acquire("stage")
-        except RuntimeError as failure:
-            outcome.append(failure)
-
-    late = threading.Thread(target=acquire_late)
-    with mock.patch.object(RehearsedCore, "_loaded", slow):
-        late.start()
-        assert begun.wait(30.0)
-    shared.abandon("stage")
-    second = shared.acquire("camera")
-    end.set()
-    late.join(30.0)
-    assert "too late" in str(outcome)
-    assert "unloadAllDevices" in shared.cores[0].calls
-    assert shared.acquire("camera") is second
-    shared.release("camera")
-    assert "unloadAllDevices" in shared.cores[1].calls  # the late one is not its user
-
-
-@pytest.fixture
-def adapters() -> str:
-    """Return the folder of Micro-Manager's demonstration devices."""
-    why = "pymmcore-plus and mm-test-adapters are not installed here: their stage is not tried"
-    pytest.importorskip("pymmcore_plus", reason=why)
-    return str(pytest.importorskip("mm_test_adapters", reason=why).device_adapter_path())
-
-
-def demo(adapters: str, **options: Any) -> Gantry:
-    """Return the demonstration stage, which moves at 10 mm/s in real time."""
-    options = {"adapters": adapters, "rate_mm_per_s": 10.0, "acceleration_mm_per_s2": 1000.0} | options
-    return open_stage(StageSettings("micromanager", approach_mm=0.2, travel_mm=TRAVEL, options=options))
-
-
-def test_contract_of_the_demonstration_stage(adapters: str) -> None:
-    stage_contract(demo(adapters))
-
-
-def test_conformance_of_the_demonstration_stage(adapters: str) -> None:
-    """All that a Micro-Manager stage can show; its drift cannot be timed."""
-    stage = demo(adapters)
-    stage.connect()
-    found = list(check_conformance(stage))
-    stage.close()
-    assert [(it.name, it.passed) for it in found] == [
-        (name, True) for name in ("settings", "homing", "limits", "speed", "arrival", "report rate")
-    ], found
-
-
-def test_faults_of_the_demonstration_stage(adapters: str, tmp_path: Path) -> None:
-    empty = tmp_path / "empty.cfg"
-    empty.write_text("Property,Core,Initialize,0\nProperty,Core,Initialize,1\n")
-    with pytest.raises(PlanRefused, match="the configuration has no XY stage; name another"):
-        demo(adapters, configuration=str(empty)).connect()
-    with pytest.raises(PlanRefused, match=r"no XY stage 'Camera'; choose from XY$"):
-        demo(adapters, device="Camera").connect()
-    with pytest.raises(PlanRefused, match=r"no property 'Speed'; choose from .*Velocity"):
-        demo(adapters, properties={"Speed": "1"}).connect()
-    stage = demo(adapters, properties={"Velocity": "0.5"}, rate_mm_per_s=50.0)
-    stage.connect()
-    stage.home()
-    begun_s = time.monotonic()
-    with pytest.raises(StageTimeout, match=r"did not finish moving to \(3\.000, 0\.000\) mm within 2\.\d s"):
-        stage.move_to(3.0, 0.0)
-    assert time.monotonic() - begun_s < 8.0
-    stage.close()
-
-
-def test_a_camera_of_the_same_core_works_beside_the_stage(adapters: str) -> None:
-    shared = SharedCore(adapters=adapters)
-    camera = MicroManagerCamera(MicroManagerSettings(adapters=adapters), shared)
-    options = MicroManagerStage(adapters=adapters, rate_mm_per_s=10.0)
-    clock = WallClock()
-    stage = Gantry(
-        MicroManagerController(shared, options, TRAVEL, clock), StageSettings("micromanager", travel_mm=TRAVEL), clock
-    )
-    stage.connect()
-    camera.open()
-    stage.home()
-    here = stage.move_to(1.0, 0.5).point
-    camera.close()
-    with pytest.raises(CameraError, match="open it first"):
-        camera.expose(0.01, 1)
-    camera.open()
-    assert camera.expose(0.01, 1).pixels is not None
-    assert stage.verify_at(*here).trusted  # closing the camera did not unload the stage
-    camera.close()
-    stage.close()

@@ -54,7 +54,7 @@ def test_no_axis_arrives_downwards(start: Point, target: Point, approach_mm: flo
     assert path_duration_s(path, LIMITS) >= duration_s(start, target, LIMITS) - 1e-9
 
 
-@settings(deadline=None, max_examples=300)
+@settings(deadline=None, max_examples=25)
 @given(points, points, points, st.floats(1.0, 200.0), st.floats(1.0, 200.0))
 def test_a_segment_meets_a_box_where_a_sample_of_it_lies(
     start: Point, end: Point, corner: Point, width: float, height: float

@@ -16,9 +16,12 @@ from faintfield.testing import stage_contract
 PYTHON = Path(__file__).parents[3] / "build" / "octoprint" / "bin" / "python"
 SERVER = Path(__file__).with_name("octoprint_server.py")
 
-pytestmark = pytest.mark.skipif(
-    not PYTHON.exists(), reason=f"OctoPrint is not installed in {PYTHON.parents[1]}; .ci/run does it"
-)
+pytestmark = [
+    pytest.mark.deep,
+    pytest.mark.skipif(
+        not PYTHON.exists(), reason=f"OctoPrint is not installed in {PYTHON.parents[1]}; make deep does it"
+    ),
+]
 
 type Command = Callable[[str], None]
 

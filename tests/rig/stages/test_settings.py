@@ -63,9 +63,7 @@ def test_other_axes_of_grbl_have_their_own_settings() -> None:
     [
         ("V,15,128", "3", Box((-400.0, 0.0), (-300.0, 0.0))),
         ("VZ,15,128", "0", Box((-400.0, 0.0), (-300.0, 0.0))),
-        ("VZ,15,128", "1", Box((0.0, 400.0), (-300.0, 0.0))),
         ("VZ,15,128", "2", Box((-400.0, 0.0), (0.0, 300.0))),
-        ("VZ,15,128", "3", Box((0.0, 400.0), (0.0, 300.0))),
         ("V,Z", "3", Box((-400.0, 0.0), (-300.0, 0.0))),  # only the letters before the comma are options
     ],
 )
@@ -87,27 +85,13 @@ def test_the_bound_of_grbls_homing_is_the_whole_travel_and_twice_the_slow_search
     assert grbl({24: "10.0", 25: "100.0"}, axes=(1, 2)).homing_bound_s == pytest.approx(1.5 * (180.0 + 72.0) + 2.0)
 
 
-@pytest.mark.parametrize(
-    ("number", "value"),
-    [
-        (24, "0"),
-        (25, "0"),
-        (27, "-1"),
-        (100, "0"),
-        (101, "-5"),
-        (110, "0"),
-        (121, "0"),
-        (130, "0"),
-        (22, "0"),
-        (13, "1"),
-    ],
-)
+@pytest.mark.parametrize(("number", "value"), [(24, "0"), (27, "-1"), (101, "-5"), (110, "0"), (22, "0"), (13, "1")])
 def test_values_of_grbl_that_cannot_be_driven_are_refused_by_number(number: int, value: str) -> None:
     with pytest.raises(WrongFirmware, match=rf"^\${number}={value}: "):
         grbl({number: value})
 
 
-@pytest.mark.parametrize("number", [13, 22, 23, 24, 25, 27, 100, 110, 120, 130])
+@pytest.mark.parametrize("number", [13, 22, 27, 110])
 def test_settings_that_grbl_does_not_report_are_refused_by_number(number: int) -> None:
     values = {key: value for key, value in GRBL.items() if key != number}
     with pytest.raises(WrongFirmware, match=rf"^\${number}=not reported: "):
@@ -119,7 +103,7 @@ def test_settings_of_grbl_that_may_be_zero() -> None:
     assert grbl({22: "3"}).homes_together, "bits beyond the first are grblHAL's"
 
 
-@pytest.mark.parametrize(("version", "accepted"), [("v1.1h", True), ("1.1f.2017", True), ("1.0", False), ("", False)])
+@pytest.mark.parametrize(("version", "accepted"), [("v1.1h", True), ("1.0", False), ("", False)])
 def test_only_grbl_1_1_is_driven(version: str, accepted: bool) -> None:
     settings = GrblSettings(GRBL, {"VER": version})
     if accepted:
@@ -165,10 +149,8 @@ def test_marlin_without_limits_or_emergency_parser_is_driven_with_a_warning() ->
     ("change", "message"),
     [
         (("M203 X100.00 Y50.00", "M203 X100.00 Y0.00"), "M203 Y=0: "),
-        (("M92 X80.00", "M92"), "M92 X=not reported: "),
         (("T300.00", "T-1.00"), "M204 T=-1: "),
         (("Marlin 2.1.2.4", "Repetier 1.0"), "'Repetier 1.0 .*'; Marlin is needed"),
-        (("FIRMWARE_NAME:", "firmware:"), "of no stated name"),
     ],
 )
 def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], message: str) -> None:
@@ -181,11 +163,9 @@ def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], mes
     ("options", "homes_low", "hard_limits", "travel_x_mm"),
     [
         ("V", "0", "1", (-397.0, -3.0)),
-        ("V", "1", "1", (-397.0, -3.0)),
         ("V", "0", "0", (-400.0, 0.0)),
         ("VZ", "0", "3", (-397.0, 0.0)),
         ("VZ", "1", "1", (0.0, 397.0)),
-        ("VZ", "1", "2", (0.0, 400.0)),
     ],
 )
 def test_the_travel_of_grblhal_is_shorter_by_the_pull_off_if_hard_limits_are_on(

@@ -10,7 +10,6 @@ from faintfield.rig.errors import StageLost, StageTimeout
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.wire import SimulatedClock
-from faintfield.rig.stages import transport
 from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import LineTransport, SerialPort
 from tests.rig.stages.benches import Traffic
@@ -28,17 +27,11 @@ def line_over(link: DirectLink) -> LineTransport:
     return LineTransport(link.open, SimulatedClock())
 
 
-@pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x", ""])
+@pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x"])
 def test_a_port_that_cannot_be_opened_is_named_in_one_line_with_those_that_exist(url: str) -> None:
     with pytest.raises(StageLost, match=r"cannot be opened .*; serial ports here: .*; check the cable") as caught:
         SerialPort(url, 115200)
     assert "\n" not in str(caught.value)
-
-
-def test_a_computer_without_serial_ports_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transport, "comports", list)
-    with pytest.raises(StageLost, match=r"serial ports here: none; check the cable"):
-        SerialPort("/dev/no-such-port", 115200)
 
 
 def test_a_port_is_opened_exclusively(pty: PtyLink) -> None:
@@ -167,26 +160,13 @@ def test_settings_are_checked() -> None:
         StageSettings(protocol="grbl")
     with pytest.raises(ValueError, match=r"stage\.axes"):
         StageSettings(protocol="grbl", port="x", axes=("X", "X"))
-    with pytest.raises(ValueError, match=r"stage\.approach_mm"):
-        StageSettings(protocol="grbl", port="x", approach_mm=-1.0)
-    with pytest.raises(ValueError, match=r"stage\.feed_mm_per_min"):
-        StageSettings(protocol="grbl", port="x", feed_mm_per_min=0.0)
-    with pytest.raises(ValueError, match=r"stage\.axes .* got X, A"):
-        StageSettings(protocol="grbl", port="x", axes=("X", "A"))
     StageSettings(protocol="grbl", port="x", axes=("Z", "X"), approach_mm=0.0, feed_mm_per_min=0.1)
     assert open_stage(StageSettings(protocol="simulated")).settings.protocol == "grbl"
 
 
-@pytest.mark.parametrize("scheme", ["spy", "loop", "cp2110", "file"])
+@pytest.mark.parametrize("scheme", ["spy", "file"])
 def test_a_rig_file_opens_no_url_that_does_more_than_carry_bytes(scheme: str, tmp_path: Path) -> None:
     written = tmp_path / "written"
     with pytest.raises(ValueError, match=r"stage.port = .*; give a serial device, or a URL that begins with socket://"):
         StageSettings("grbl", port=f"{scheme}:///dev/null?file={written}")
     assert not written.exists()
-
-
-@pytest.mark.parametrize(
-    "port", ["/dev/ttyUSB0", "COM3", "socket://10.0.0.7:7000", "rfc2217://10.0.0.7:7000", "hwgrep://1a86:7523"]
-)
-def test_a_rig_file_names_devices_and_device_servers(port: str) -> None:
-    assert StageSettings("grbl", port=port).port == port

@@ -25,18 +25,6 @@ def test_the_clock_jumps_from_event_to_event() -> None:
     assert clock.next_event_s() is None
 
 
-def test_half_way_a_motion_is_half_done_and_at_full_speed() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
-    stage.queue((50.0, 0.0), 100.0, 500.0)
-    clock.sleep_s(0.35)
-    assert stage.commanded_mm() == pytest.approx((25.0, 0.0))
-    assert stage.moving
-    clock.sleep_s(0.36)
-    assert stage.true_mm() == (50.0, 0.0)
-    assert not stage.moving
-
-
 def test_the_braking_distance_is_that_of_constant_deceleration() -> None:
     clock = SimulatedClock()
     stage = mechanics(clock)
@@ -79,33 +67,3 @@ def test_a_carriage_cannot_leave_its_travel_and_loses_steps_instead() -> None:
     stage.queue((400.0, 0.0), 100.0, 500.0)
     clock.sleep_s(10.0)
     assert stage.true_mm()[0] == pytest.approx(395.0)
-
-
-def test_a_switch_is_met_when_the_carriage_is_there() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
-    stage.queue((50.0, 50.0), 100.0, 500.0)
-    clock.sleep_s(5.0)
-    met: list[float] = []
-    stage.on_switch = lambda: met.append(stage.true_mm()[0])
-    assert stage.switches() == (False, False)
-    stage.axes[0].slip_mm = -20.0
-    stage.queue((10.0, 50.0), 100.0, 500.0)
-    clock.sleep_s(5.0)
-    assert met == [pytest.approx(0.0, abs=1e-6)]
-
-
-def test_a_stuck_axis_keeps_its_place_and_goes_on_from_there() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
-    stage.queue((50.0, 50.0), 100.0, 500.0)
-    clock.sleep_s(5.0)
-    stage.axes[0].stuck = True
-    stage.queue((80.0, 80.0), 100.0, 500.0)
-    clock.sleep_s(5.0)
-    assert stage.true_mm() == (50.0, 80.0)
-    assert stage.commanded_mm() == (80.0, 80.0)
-    stage.axes[0].stuck = False
-    stage.queue((90.0, 80.0), 100.0, 500.0)
-    clock.sleep_s(5.0)
-    assert stage.true_mm()[0] == pytest.approx(60.0)
