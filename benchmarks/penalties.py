@@ -6,6 +6,7 @@ square errors, the object scaled to run from 0 to 1.
 
 import json
 import sys
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from faintfield.recon.solver.initialization import smooth_start, universal_penal
 from faintfield.recon.solver.penalties import Penalty, PenaltyName
 from faintfield.recon.solver.pmlem import pmlem
 from faintfield.rig.simulation.objects import shaded_ball, star_chart, toy_airplane, toy_truck
+from faintfield.rig.simulation.scene import TexturedPlane
 
 _VIEWS, _SIZE_PX, _SNR, _READ_VARIANCE_E2, _DARK_E = 49, 192, 0.16, 12.0, 0.02
 _PENALTIES: tuple[PenaltyName, ...] = ("tv", "huber-tv", "quadratic")
@@ -26,10 +28,15 @@ _FACTORS = np.geomspace(0.35, 5.6, 9)
 
 def pictures() -> dict[str, Image]:
     """Return the four objects' textures, scaled from 0 to 1."""
-    made = {"truck": toy_truck, "airplane": toy_airplane, "star": star_chart, "ball": shaded_ball}
+    makers: dict[str, Callable[[float, float, float], TexturedPlane]] = {
+        "truck": toy_truck,
+        "airplane": toy_airplane,
+        "star": star_chart,
+        "ball": shaded_ball,
+    }
     places = np.linspace(0, 1, _SIZE_PX)
     scaled = {}
-    for name, make in made.items():
+    for name, make in makers.items():
         shown = make(0.0, 0.0, 500.0)
         reflectance = shown.reflectance if shown.reflectance.ndim == 2 else shown.reflectance.mean(axis=2)
         picture = (reflectance * shown.opacity).astype(float)
