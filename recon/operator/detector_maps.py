@@ -1,4 +1,4 @@
-"""What the kernels read of each detector pixel: its ray and its response."""
+"""Rays and response of the detector pixels, as the kernels read them."""
 
 import numpy as np
 from numpy.typing import NDArray

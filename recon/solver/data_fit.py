@@ -1,4 +1,4 @@
-"""What solvers need of a scene: the likelihood's value, its gradient, and a diagonal that bounds its curvature."""
+"""Value and gradient of the likelihood, and a diagonal that bounds its curvature, for the solvers."""
 
 from dataclasses import dataclass, replace
 
