@@ -95,9 +95,11 @@ def draw_relief(
     tear = _MAX_STEP * grid.pitch_mm / farthest if farthest > 0 else np.inf
     whole = np.pad(_whole_cells(inverse_depth, tear), _BORDER, mode="edge")
     heights = _continued(inverse_depth - relief.origin).astype(np.float32)
-    (left, top), (right, bottom) = (of(rays.reshape(-1, 2), axis=0) - grid.pitch_mm for of in (np.min, np.max))
+    (left, top), (right, bottom) = (
+        (of(rays.reshape(-1, 2), axis=0) - grid.pitch_mm).astype(float).tolist() for of in (np.min, np.max)
+    )
     shape = (int((bottom - top) / grid.pitch_mm) + 3, int((right - left) / grid.pitch_mm) + 3)
-    buffer_grid = PlaneGrid(shape, grid.pitch_mm, (float(left), float(top)))
+    buffer_grid = PlaneGrid(shape, grid.pitch_mm, (left, top))
     maps = [np.ascontiguousarray(lattice, np.float32) for lattice in rays]
     # Views of a mosaic appear once per lattice, but are drawn once
     distinct, drawing = np.unique(ray_from_surface.reshape(-1, 12), axis=0, return_inverse=True)

@@ -318,4 +318,4 @@ class SceneOperator:
             raise ValueError(f"views must be whole numbers, none of them twice, got {views}")
         if chosen.min() < 0 or chosen.max() >= len(self.all_views):
             raise ValueError(f"views must lie within 0 and {len(self.all_views) - 1}, got {views}")
-        return chosen.astype(np.intp)
+        return np.ascontiguousarray(chosen, np.intp)

@@ -54,12 +54,11 @@ def all_mutants(modules: Iterable[str]) -> list[Mutant]:
         mutant for path in sorted(files) for mutant in mutants_of(path.relative_to(_ROOT).as_posix(), path.read_text())
     ]
     entries = tomllib.loads((Path(__file__).parent / "equivalent.toml").read_text())["mutant"]
-    equivalent = {entry["name"] for entry in entries}
-    names = {mutant.name for mutant in mutants}
-    for name in sorted(equivalent - names):
-        if _ROOT / name.partition(" ")[0] in files:
+    equivalent = tuple(entry["name"] for entry in entries)
+    for name in equivalent:
+        if _ROOT / name.partition(" ")[0] in files and not any(mutant.name.startswith(name) for mutant in mutants):
             print(f"equivalent.toml: no such mutant: {name}")
-    return [mutant for mutant in mutants if mutant.name not in equivalent]
+    return [mutant for mutant in mutants if not mutant.name.startswith(equivalent)]
 
 
 def sample_of(mutants: Iterable[Mutant], size: int, seed: int) -> list[Mutant]:
