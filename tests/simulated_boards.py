@@ -32,7 +32,8 @@ def board_picture(board: Board, pitch_mm: float) -> NDArray[np.float32]:
     height, width = (round(count * board.square_mm / pitch_mm) + 2 * margin for count in (board.rows, board.columns))
     ink = np.zeros((height, width), np.float32)
     for left, top, across, down in black_rectangles_mm(board) / pitch_mm + [margin, margin, 0, 0]:
-        ink += np.outer(_covered(top, down, height), _covered(left, across, width)).astype(np.float32)
+        rows, columns = (slice(int(start), int(start + size) + 1) for start, size in ((top, down), (left, across)))
+        ink[rows, columns] += np.outer(_covered(top, down, height)[rows], _covered(left, across, width)[columns])
     return np.asarray(_WHITE + (_BLACK - _WHITE) * np.clip(ink, 0, 1), np.float32)
 
 
@@ -58,22 +59,8 @@ def simulate_board_set(
 ) -> None:
     """Write photographs of boards that stand at six places, one after another, from every node.
 
-    The gantry is assumed to return to each node exactly, so that all sweeps share their poses.
-
-    Parameters
-    ----------
-    out : Path
-        Folder to write, which exists.
-    experiment : SimulatedExperiment
-        The camera and its grid.
-    poses_rt_cam_ref : array (view, 6)
-        Where the camera really is.
-    boards : sequence of Board
-        One per place, all of one shape.
-    generator : Generator
-        Source of the sensor's noise.
-    white_e : float
-        Electrons per pixel of white paper on the axis.
+    The gantry returns to each node exactly, so that all sweeps share their poses (view, 6). White paper on the axis
+    gives `white_e` electrons per pixel.
     """
     rows, columns = boards[0].corner_shape
     places = six_boards(rows, columns, boards[0].square_mm)

@@ -1,5 +1,6 @@
 """Control a real Chromium by its DevTools protocol over a pipe."""
 
+import base64
 import json
 import os
 import shutil
@@ -9,6 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from tests.patience import HANG_S
 
@@ -44,10 +49,28 @@ class Tab:
 
     def set_slider(self, name: str, value: float) -> None:
         """Move a slider as a hand does: by its value and its event."""
-        self.evaluate(
-            f"(it => {{ it.value = {value}; it.dispatchEvent(new Event('input', {{bubbles: true}})); }})"
-            f"(document.getElementById('{name}'))"
-        )
+        self._set(name, str(value), "input")
+
+    def choose(self, name: str, option: str) -> None:
+        """Choose an option of a list by its value or its text."""
+        words = json.dumps(option)
+        same = f"[...box.options].find(it => it.text === {words} || it.value === {words}).value"
+        self._set(name, same, "input", "change")
+        self.draw()
+
+    def _set(self, name: str, value: str, *events: str) -> None:
+        fire = "; ".join(f"box.dispatchEvent(new Event('{event}', {{bubbles: true}}))" for event in events)
+        self.evaluate(f"(box => {{ box.value = {value}; {fire}; }})(document.getElementById('{name}'))")
+
+    def box(self, selector: str) -> tuple[float, float, float, float]:
+        """Return left, top, width and height of an element on the screen, in pixels."""
+        box = f"document.querySelector('{selector}').getBoundingClientRect()"
+        left, top, width, height = self.evaluate(f"(box => [box.left, box.top, box.width, box.height])({box})")
+        return left, top, width, height
+
+    def screen(self) -> NDArray[np.uint8]:
+        """Return what the screen shows (row, column, BGR)."""
+        return decoded(self.call("Page.captureScreenshot", format="png")["data"])
 
     def reload(self) -> None:
         """Load the page again and wait for it: a call to the old page would never be answered."""
@@ -123,6 +146,12 @@ class Tab:
         ):
             self.complaints.append(json.dumps(event["params"]))
         return dict(event)
+
+
+def decoded(picture: str) -> NDArray[np.uint8]:
+    """Return the pixels (row, column, BGR) of a picture in base64."""
+    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(picture), np.uint8), cv2.IMREAD_COLOR)
+    return np.asarray(pixels, np.uint8)
 
 
 @contextmanager

@@ -23,27 +23,20 @@ type Pictures = dict[tuple[int, int], NDArray[np.float32]]
 type Writer = Callable[[Path, dict[str, NDArray[np.float32]]], None]
 
 
-@dataclass(frozen=True)
-class Scene:
-    """The rendered views with their margin, by node (row, column)."""
-
-    wide: Views
-
-    def views(self, aligned_px: int, square: bool = False) -> Pictures:
-        """Return the views, 5 x 7 or 7 x 7, in which each point moves by so many px more from node to node."""
-        rows = range(0, 7) if square else range(1, 6)
-        found = {}
-        for row in rows:
-            for column in range(COLUMNS):
-                top, left = (_MARGIN_PX - aligned_px * (it - 3) for it in (row, column))
-                found[row - rows[0], column] = self.wide[row, column][top : top + HEIGHT, left : left + WIDTH]
-        return found
+def rendered() -> Views:
+    """Return the one scene of the corpus: 7 x 7 views with a margin."""
+    return light_field(CARDS, grid=(7, 7), size_px=(WIDTH + 2 * _MARGIN_PX, HEIGHT + 2 * _MARGIN_PX))
 
 
-def rendered() -> Scene:
-    """Return the one scene of the corpus."""
-    size_px = (WIDTH + 2 * _MARGIN_PX, HEIGHT + 2 * _MARGIN_PX)
-    return Scene(light_field(CARDS, grid=(7, 7), size_px=size_px))
+def views_of(scene: Views, aligned_px: int, square: bool = False) -> Pictures:
+    """Return the views, 5 x 7 or 7 x 7, in which each point moves by so many px more from node to node."""
+    rows = range(0, 7) if square else range(1, 6)
+    views = {}
+    for row in rows:
+        for column in range(COLUMNS):
+            top, left = (_MARGIN_PX - aligned_px * (index - 3) for index in (row, column))
+            views[row - rows[0], column] = scene[row, column][top : top + HEIGHT, left : left + WIDTH]
+    return views
 
 
 def other_scene(seed: int) -> NDArray[np.float32]:
@@ -58,15 +51,7 @@ def lettered(row: int, column: int) -> str:
 
 @dataclass(frozen=True)
 class Names:
-    """How nodes become names: numbers first, as turned as this says, then text.
-
-    Attributes
-    ----------
-    text : callable
-        The stem of two numbers (row, column).
-    transpose, flip_rows, flip_columns : bool
-        The numbers count columns first, rows from the bottom, columns from the right.
-    """
+    """Names of nodes: `text` gives the stem of two numbers, which may be turned before."""
 
     text: Numbers = lettered
     transpose: bool = False
@@ -141,10 +126,7 @@ png16 = written(".png", _sixteen)
 FILES: dict[str, Writer] = {
     "8-bit PNG": written(".png", _eight),
     "JPEG 95": written(".jpg", _coloured, cv2.IMWRITE_JPEG_QUALITY, 95),
-    "BMP": written(".bmp", _coloured),
     "16-bit TIFF": written(".tiff", _sixteen),
-    "16-bit PGM": written(".pgm", _sixteen),
-    "PPM": written(".ppm", _coloured),
     "float TIFF": _floats,
     "multi-page TIFF": _pages,
     "mosaic in one file": _mosaic,
@@ -170,30 +152,9 @@ focus_distance_m = {HCI_FX_PX * HCI_PITCH_MM / HCI_FOCUS_PX / 1000}
 class Variant:
     """One way in which the scene comes.
 
-    Attributes
-    ----------
-    names : Names
-        Of the files; those in one file have an order only.
-    aligned_px : int
-        By how much each point moves more from node to node.
-    square : bool
-        7 x 7 views in place of 5 x 7.
-    change : callable, optional
-        What is done to the pictures before they get names.
-    write : callable
-        Writes pictures by their names.
-    options : tuple of str
-        What nobody could know from the pictures.
-    beside : dict of str to str
-        Files beside the pictures.
-    kept : callable
-        Whether a node of the scene is in the set.
-    ratio : float
-        Pitch along columns over pitch along rows.
-    said : str
-        What is printed.
-    refused : str
-        Errors, one of which is named; empty if the set is to be as rendered.
+    `aligned_px`: by how much each point moves more from node to node. `square`: 7 x 7 views in place of 5 x 7.
+    `change`: what is done to the pictures before they get names. `options`, `beside`: of the command; further files.
+    `kept`: whether a node is in the set. `ratio`: pitch along columns over that along rows. `words`: what is printed.
     """
 
     names: Names = field(default_factory=Names)
@@ -205,21 +166,16 @@ class Variant:
     beside: dict[str, str] = field(default_factory=dict)
     kept: Callable[[int, int], bool] = lambda row, column: True
     ratio: float = 1.0
-    said: str = ""
-    refused: str = ""
+    words: str = ""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return (7 if self.square else ROWS), COLUMNS
-
-    def source(self, scene: Scene, folder: Path) -> Path:
+    def source(self, scene: Views, folder: Path) -> Path:
         """Write the files; return what is to be imported."""
         folder.mkdir()
-        views = scene.views(self.aligned_px, self.square)
+        views = views_of(scene, self.aligned_px, self.square)
         if self.change is not None:
             views = self.change(views)
-        self.write(folder, {self.names.stem(node, self.size): view for node, view in views.items()})
+        size = (7 if self.square else ROWS), COLUMNS
+        self.write(folder, {self.names.stem(node, size): view for node, view in views.items()})
         for name, text in self.beside.items():
             (folder / name).write_text(text)
         files = list(folder.iterdir())

@@ -10,21 +10,14 @@ from unittest import mock
 import pytest
 
 from faintfield.pipelines import cli
-from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.rig.session.disk import lock_session
 from faintfield.rig.session.journal import Journal
 from faintfield.rig.session.session import taken_frames
 from faintfield.rig.simulation.lab import SimulatedLab
+from tests.end_to_end.rigs import write_small_rig
 
 # Kind and frames of each step of the rig.toml that `init` writes, on a grid of 2 x 2, with a frame for each exposure.
-STEPS = [
-    *[("charuco", 4)] * 6,
-    ("bright", 4),
-    ("dark_scene", 4),
-    ("noise_reference", 4),
-    ("dark", 4),
-    ("flat", 2),
-]
+STEPS = [*[("charuco", 4)] * 6, ("bright", 4), ("dark_scene", 4), ("noise_reference", 4), ("dark", 4), ("flat", 2)]
 FRAMES = sum(count for _, count in STEPS)
 
 
@@ -41,6 +34,7 @@ class Shell:
         self.output = self.words = ""
 
     def run(self, *arguments: object) -> int:
+        self._capsys.readouterr()
         code = cli.run([str(argument) for argument in arguments])
         self.output, self.words = self._capsys.readouterr()
         return code
@@ -59,15 +53,15 @@ class Shell:
 def shell(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Shell:
     """Return a shell beside a rig.toml as `init` writes it, of few pixels."""
     shell = Shell(capsys, tmp_path)
-    assert shell.run("init", shell.rig) == 0
-    shell.edit("size_px = [640, 480]", "size_px = [64, 48]")
+    write_small_rig(shell.rig, 7, 7, frames=10)
     return shell
 
 
+@pytest.fixture
 def small(shell: Shell) -> Shell:
-    """Make the session small."""
-    shell.edit("frames_per_node = 10", "frames_per_node = 1")
-    shell.edit("rows = 7\ncolumns = 7", "rows = 2\ncolumns = 2")
+    """Return a shell beside a rig.toml of few frames."""
+    shell.rig.unlink()
+    write_small_rig(shell.rig, 2, 2)
     return shell
 
 
@@ -75,10 +69,7 @@ def small(shell: Shell) -> Shell:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Capture the whole experiment on a small grid; to be read only."""
     folder = tmp_path_factory.mktemp("whole")
-    assert cli.run(["init", str(folder / "rig.toml")]) == 0
-    text = (folder / "rig.toml").read_text().replace("size_px = [640, 480]", "size_px = [64, 48]")
-    text = text.replace("frames_per_node = 10", "frames_per_node = 1")
-    (folder / "rig.toml").write_text(text.replace("rows = 7\ncolumns = 7", "rows = 2\ncolumns = 2"))
+    write_small_rig(folder / "rig.toml", 2, 2)
     assert cli.run(["capture", str(folder / "rig.toml"), str(folder / "session"), "--yes"]) == 0
     return folder / "session"
 
@@ -125,11 +116,6 @@ def test_check_moves_nothing_and_counts_frames(shell: Shell) -> None:
     assert "501 frames in 11 steps" in shell.words
 
 
-def test_template_has_board_poses_enough_for_geometry(shell: Shell) -> None:
-    settings = read_rig(shell.rig)
-    assert len(settings.board) * sum(step.kind == "charuco" for step in settings.step) >= 6
-
-
 def test_check_remembers_settings_of_stage(shell: Shell) -> None:
     stored = shell.rig.with_suffix(".stage.json")
     assert shell.result("check", shell.rig)["changed_settings"] == []
@@ -152,15 +138,10 @@ def test_check_remembers_settings_of_stage(shell: Shell) -> None:
         ("origin_mm = [-350.0", "origin_mm = [-250.0", "OutsideTravel", "outside the travel"),
         ("# [[stage.keep_out]]", f"{KEEP_OUT}\n#", "KeepOutCrossed", "meets"),
         ("pitch_mm", "pich_mm", "UnknownKey", "did you mean 'pitch_mm'?"),
-        ('kind = "bright"', 'kind = "brigth"', "BadValue", "did you mean 'bright'?"),
         ('protocol = "simulated"', 'protocol = "klipper"', "UnknownPlugin", "choose from 'grbl', 'marlin', "),
-        ('backend = "simulated"', 'backend = "gphoto"', "UnknownPlugin", "did you mean 'gphoto2'?"),
         ('backend = "simulated"', 'backend = "gphoto2"', "UnknownKey", "'camera.size_px' is not a key"),
         ("square_mm = 40.0", "square_mm = 4.0", "BadValue", "markers smaller"),
-        ("exposure_s = 0.1\n", "exposure_s = 0.0\n", "BadValue", "above 0 s"),
         ("exposure_s = 0.1\n", "exposure_s = nan\n", "BadValue", "step[6].exposure_s = nan; numbers are"),
-        ("pitch_mm = ", "pitch_mm = inf #", "BadValue", "grid.pitch_mm = inf; numbers are finite"),
-        ("saturated_share = ", "saturated_share = 7 #", "BadValue", "a share lies between 0 and 1"),
         ("size_px = [64, 48]", "size_px = [200000, 200000]", "BadValue", "at most 40000000 are"),
         ("rows = 7\ncolumns = 7", "rows = 100000\ncolumns = 100000", "BadValue", "10000000000 nodes, at most"),
         ("frames_per_node = 10", f"frames_per_node = {10**9}", "BadValue", "at most 100000 are"),
@@ -172,12 +153,8 @@ def test_check_refuses_impossible_rigs(shell: Shell, old: str, new: str, failure
     assert f"faintfield: {failure}: " in shell.words
     assert words in shell.words
     assert len(shell.words.splitlines()) == 1
-
-
-def test_capture_refuses_what_check_refuses(shell: Shell) -> None:
-    shell.edit("origin_mm = [-350.0", "origin_mm = [-250.0")
     assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
-    assert "faintfield: OutsideTravel: " in shell.words
+    assert f"faintfield: {failure}: " in shell.words
     assert not (shell.session / "plan.json").exists()
 
 
@@ -194,15 +171,12 @@ def test_init_overwrites_nothing(shell: Shell) -> None:
     assert shell.run("init", shell.rig) == 1
     assert "OutputExists" in shell.words
     assert shell.rig.read_bytes() == before
-
-
-def test_prompts_need_terminal_page_or_yes(shell: Shell) -> None:
     assert shell.run("capture", shell.rig, shell.session) == 2
     assert "give --yes, or --page" in shell.words
 
 
-def test_capture_resumes_after_ctrl_c(shell: Shell) -> None:
-    small(shell)
+def test_capture_resumes_after_ctrl_c(small: Shell) -> None:
+    shell = small
     expose = SimulatedLab.expose
     calls = []
 
@@ -226,8 +200,8 @@ def test_capture_resumes_after_ctrl_c(shell: Shell) -> None:
     assert shell.result("verify", shell.session)["session"]["sealed"] is True
 
 
-def test_session_stays_with_rig_and_one_capture(shell: Shell) -> None:
-    small(shell)
+def test_session_stays_with_rig_and_one_capture(small: Shell) -> None:
+    shell = small
     with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):
         assert shell.run("capture", shell.rig, shell.session, "--yes") == 1
     assert "Interrupted" in shell.words
@@ -240,8 +214,8 @@ def test_session_stays_with_rig_and_one_capture(shell: Shell) -> None:
     assert "PlanRefused: the rig.toml differs from the plan.json of the session: grid.pitch_mm was 50.0" in shell.words
 
 
-def test_check_compares_rig_with_session(shell: Shell) -> None:
-    small(shell)
+def test_check_compares_rig_with_session(small: Shell) -> None:
+    shell = small
     assert shell.run("check", shell.rig, "--session", shell.session) == 1
     assert "MissingFile" in shell.words
     with mock.patch.object(SimulatedLab, "expose", side_effect=KeyboardInterrupt):

@@ -1,24 +1,18 @@
 """The page of a capture, in a real headless browser: what the terminal can do it can do, and the two agree."""
 
-import base64
 import errno
 import http.client
-import json
-import multiprocessing
 import re
 import socket
-import subprocess
-import sys
 import threading
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -39,8 +33,8 @@ from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.session.verify import verify
 from tests.end_to_end.browser import Tab
-from tests.faults.besieging import besiege
-from tests.faults.capturing import FRAMES, SMALL_RIG, in_process
+from tests.end_to_end.rigs import write_small_rig
+from tests.faults.capturing import FRAMES, SMALL_RIG
 from tests.patience import HANG_S
 
 
@@ -85,11 +79,16 @@ def running(tmp_path: Path) -> Iterator[Running]:
         yield running
 
 
-def test_a_whole_capture_by_clicks(running: Running, browser: Tab) -> None:
+def test_clicks_lead_through_capture(running: Running, browser: Tab) -> None:
     browser.open(running.address)
     browser.wait_until("document.getElementById('title').textContent === 'Homing'")
     assert "The stage moves to its switches" in browser.text()
     browser.click("go")
+    browser.wait_until("document.getElementById('title').textContent.includes('Bright set')")
+    blue, green, red = (channel for channel in np.moveaxis(browser.screen(), 2, 0))
+    assert max(blue.max(), green.max()) <= 60  # the room is dark
+    assert red.max() <= 230
+    assert red.mean() < 12
     for title in ("Step 1 of 3: Bright set", "Step 2 of 3: Dark-scene set", "Step 3 of 3: Dark frames"):
         browser.wait_until(f"document.getElementById('title').textContent === '{title}'")
         browser.wait_until(
@@ -130,7 +129,7 @@ def test_terminal_and_page_agree(running: Running, browser: Tab, capsys: pytest.
         assert [event.detail["answer"] for event in journal.events("prompt")] == ["go", "skip", "stop"]
 
 
-def test_no_name_becomes_a_part_of_the_page(browser: Tab) -> None:
+def test_no_name_becomes_part_of_page(browser: Tab) -> None:
     hostile = "</li><script>document.title = 'mine'</script><img src=x onerror=\"document.title = 'mine'\">"
     panel = CapturePanel(unattended=False)
     panel.asked = OpenPrompt(1, Prompt(hostile, hostile, (hostile,), ("go",), "go"))
@@ -145,18 +144,6 @@ def test_no_name_becomes_a_part_of_the_page(browser: Tab) -> None:
         assert browser.evaluate("document.querySelectorAll('script').length") == 1
 
 
-def test_the_page_is_dark_red(running: Running, browser: Tab) -> None:
-    browser.call("Emulation.setDeviceMetricsOverride", width=1200, height=800, deviceScaleFactor=1, mobile=False)
-    browser.open(running.address)
-    browser.click("go")
-    browser.wait_until("document.getElementById('title').textContent.includes('Bright set')")
-    picture = base64.b64decode(browser.call("Page.captureScreenshot", format="png")["data"])
-    blue, green, red = cv2.split(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR))
-    assert max(blue.max(), green.max()) <= 60
-    assert red.max() <= 230
-    assert red.mean() < 12
-
-
 def status_of(address: str, data: bytes | None = None, **headers: str) -> int:
     """Return the HTTP status of a request."""
     try:
@@ -167,19 +154,6 @@ def status_of(address: str, data: bytes | None = None, **headers: str) -> int:
         return failure.code
 
 
-def test_nothing_is_found_without_the_token(running: Running) -> None:
-    parts = urllib.parse.urlsplit(running.address)
-    assert parts.hostname == "127.0.0.1"
-    token = parts.path.strip("/")
-    assert len(token) >= 32
-    root = f"http://{parts.netloc}/"
-    assert status_of(running.address) == 200
-    assert status_of(running.address + "state") == 200
-    for place in ("", "state", "press", "x" * len(token) + "/", token[:-1] + "/state", "docs"):
-        assert status_of(root + place) == 404
-        assert status_of(root + place, b"{}") in (404, 405)
-
-
 def answer_to(address: str, method: str, **headers: str) -> http.client.HTTPResponse:
     """Return the answer to a request with these headers."""
     parts = urllib.parse.urlsplit(address)
@@ -188,193 +162,70 @@ def answer_to(address: str, method: str, **headers: str) -> http.client.HTTPResp
         return connection.getresponse()
 
 
-def turned_away(address: str) -> list[http.client.HTTPResponse]:
-    """Return the answers to requests without the token, or from a foreign page."""
-    wrong_token = address[:-2] + ("a/" if address[-2] != "a" else "b/")
-    return [
-        answer_to(wrong_token + "state", "GET"),
-        answer_to(wrong_token + "press", "POST"),
-        answer_to(address + "state", "GET", Host="evil.example"),
-        answer_to(address + "state", "GET", Host="localhost.evil.example:80"),
-        answer_to(address + "state", "GET", Host=""),
-        answer_to(address + "press", "POST", Origin="http://evil.example"),
-        answer_to(address + "press", "POST", Origin="null"),
-        answer_to(address + "press", "POST", Origin="http://127.0.0.1:1"),
-        answer_to(address + "press", "POST", Origin="https://" + urllib.parse.urlsplit(address).netloc),
-    ]
-
-
-def test_who_is_turned_away_learns_nothing_and_presses_nothing() -> None:
+def test_strangers_learn_nothing_and_press_nothing() -> None:
     panel = CapturePanel(unattended=True)
-    with serve_page(panel) as address:
-        answers = turned_away(address)
-    headers = {tuple((name, it) for name, it in answer.getheaders() if name != "date") for answer in answers}
+    with serve_page(panel) as address, serve_page(CapturePanel(unattended=True)) as other:
+        parts = urllib.parse.urlsplit(address)
+        token = parts.path.strip("/")
+        assert parts.hostname == "127.0.0.1"
+        assert len(token) >= 32
+        assert urllib.parse.urlsplit(other).path.strip("/") != token
+        root, wrong_token = f"http://{parts.netloc}/", address[:-2] + ("a/" if address[-2] != "a" else "b/")
+        places = [root, root + "state", root + "docs", root + token[:-1] + "/state", wrong_token + "state"]
+        hosts = ["evil.example", "localhost.evil.example:80", ""]
+        origins = ["http://evil.example", "null", "http://127.0.0.1:1", f"https://{parts.netloc}"]
+        answers = [
+            *(answer_to(place, "GET") for place in places),
+            *(answer_to(place, "POST") for place in (root + "press", wrong_token + "press")),
+            *(answer_to(address + "state", "GET", Host=host) for host in hosts),
+            *(answer_to(address + "press", "POST", Origin=origin) for origin in origins),
+        ]
+        assert status_of(address) == status_of(address + "state") == 200
     assert [answer.status for answer in answers] == [404] * len(answers)
-    assert len(headers) == 1
-    [names] = [{name for name, _ in one} for one in headers]
+    (headers,) = {tuple((name, value) for name, value in it.getheaders() if name != "date") for it in answers}
+    names = {name for name, _ in headers}
     assert "server" not in names
     assert {"referrer-policy", "cache-control", "connection"} <= names
     assert panel.take_request() is None
 
 
-@pytest.mark.parametrize("through", ["no tunnel", "a tunnel"])
-def test_the_page_itself_may_press(through: str) -> None:
+@pytest.mark.parametrize("host", ["", "127.0.0.1:8000"], ids=["directly", "through a tunnel"])
+def test_page_itself_may_press(host: str) -> None:
     panel = CapturePanel(unattended=True)
     with serve_page(panel) as address:
-        host = urllib.parse.urlsplit(address).netloc if through == "no tunnel" else "127.0.0.1:8000"
+        host = host or urllib.parse.urlsplit(address).netloc
         assert answer_to(address + "press", "POST", Host=host, Origin=f"http://{host}").status == 200
-    assert panel.take_request() == "stop"
+        assert panel.take_request() == "stop"
+        for body in (
+            *(b"", b"[]", b"[" * 999, b'{"word": "explode"}', b'{"word": "go", "more": 1}', b'{"word": 5}'),
+            *(b'{"word": "\xff"}', b'{"word": "go"}' + b" " * 1000, b"x" * 100_000),
+        ):
+            assert status_of(address + "press", body) == 400, body
+    assert panel.take_request() is None
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        b"",
-        b"[]",
-        b"[" * 999,
-        b'{"word": "explode"}',
-        b'{"word": "go", "more": 1}',
-        b'{"word": 5}',
-        b'{"word": "\xff"}',
-        b'{"word": "go"}' + b" " * 1000,
-        b"x" * 100_000,
-    ],
-)
-def test_nonsense_presses_no_button(running: Running, body: bytes) -> None:
-    assert status_of(running.address + "press", body) == 400
-
-
-def test_one_page_has_another_token_than_the_next() -> None:
-    with serve_page(CapturePanel(unattended=True)) as one, serve_page(CapturePanel(unattended=True)) as other:
-        assert urllib.parse.urlsplit(one).path != urllib.parse.urlsplit(other).path
-
-
-_CAPTURE = """
-import resource, sys
-from pathlib import Path
-from faintfield.pipelines.live.guided import capture_session
-from tests.faults.capturing import SMALL_RIG
-resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[2]), int(sys.argv[2])))
-capture_session(SMALL_RIG, Path(sys.argv[1]), unattended=False, page=True)
-"""
-
-
-class Besieged:
-    """A capture with a page in a process of its own, which may open only so many files, and the page's user."""
-
-    def __init__(self, folder: Path, max_files: int) -> None:
-        command = [sys.executable, "-c", _CAPTURE, str(folder), str(max_files)]
-        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2])
-
-    def __enter__(self) -> "Besieged":
-        assert self.process.stderr is not None
-        said = next(line for line in self.process.stderr if line.startswith("page: "))
-        self.address = said.removeprefix("page: ").strip()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.communicate()
-
-    def end(self) -> str:
-        """Wait until the capture has ended well, and return what it has said since it began."""
-        _, said = self.process.communicate(timeout=HANG_S)
-        assert self.process.returncode == 0, said
-        return said
-
-    def state(self) -> dict[str, Any]:
-        found: dict[str, Any] = json.loads(self.ask("state"))
-        return found
-
-    def ask(self, place: str, data: bytes | None = None) -> bytes:
-        """Ask the page as a browser does: until an answer comes."""
-        for _ in range(10_000):
-            assert self.process.poll() is None, "the capture has ended"
-            with suppress(OSError, http.client.HTTPException), urllib.request.urlopen(self.address + place, data) as it:
-                return bytes(it.read())
-        raise AssertionError(f"{place}: no answer")
-
-    def wait_for(self, title: str) -> int:
-        """Wait for the prompt with this title, and return its number."""
-        while (prompt := self.state()["prompt"]) is None or prompt["title"] != title:
-            pass
-        return int(prompt["number"])
-
-    def answer(self, title: str) -> None:
-        """Wait for the prompt with this title, and go on."""
-        self.ask("press", json.dumps({"word": "go", "prompt": self.wait_for(title)}).encode())
-
-    def memory_mb(self, which: str) -> float:
-        """Return `VmRSS`, the memory in use, or `VmHWM`, its highest value since it was last forgotten."""
-        status = Path(f"/proc/{self.process.pid}/status").read_text()
-        return int(re.search(rf"{which}:\s+(\d+) kB", status)[1]) / 1000  # type: ignore[index]
-
-    def forget_highest_memory(self) -> None:
-        Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
-
-
-@contextmanager
-def besieged(address: str, idle: int, slow: int, body_bytes: int) -> Iterator[None]:
-    """Besiege a page while the block runs, which begins when every connection is open and every request was made."""
-    signal, other_end = multiprocessing.Pipe()
-    besieger = in_process(besiege, address, idle, slow, body_bytes, other_end)
-    assert signal.poll(HANG_S), "the page takes no more requests"
-    yield
-    signal.send("stop")
-    besieger.join(HANG_S)
-    assert besieger.exitcode == 0
-
-
-@pytest.mark.deep
-def test_besieged_page_leaves_capture_alone(tmp_path: Path) -> None:
-    with Besieged(tmp_path / "session", max_files=1024) as capture:
-        capture.answer("Homing")
-        capture.answer("Step 1 of 3: Bright set")
-        capture.wait_for("Step 2 of 3: Dark-scene set")
-        assert capture.ask("frame.png").startswith(b"\x89PNG")
-        # Whatever a capture and its page need has been in memory once
-        capture.forget_highest_memory()
-        before_mb = capture.memory_mb("VmRSS")
-        with besieged(capture.address, idle=2000, slow=200, body_bytes=600_000_000):
-            capture.answer("Step 2 of 3: Dark-scene set")
-            capture.wait_for("Step 3 of 3: Dark frames")
-            assert capture.memory_mb("VmHWM") - before_mb < 50.0
-        assert status_of(capture.address) == status_of(capture.address + "frame.png") == 200
-        capture.answer("Step 3 of 3: Dark frames")
-        said = capture.end()
-    assert "Traceback" not in said
-    assert "the page" not in said
-    verdict = verify(tmp_path / "session")
-    assert (verdict.problems, verdict.present, verdict.sealed) == ((), FRAMES, True)
-
-
-def test_a_silent_connection_is_closed(running: Running, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(capture_page, "_MAX_REQUEST_S", 0.05)
-    parts = urllib.parse.urlsplit(running.address)
-    beginnings = (b"", b"GET / HT", f"POST {parts.path}press HTTP/1.1\r\nHost: 127.0.0.1\r\n".encode())
-    for beginning in beginnings:
-        with socket.create_connection((parts.hostname, parts.port), HANG_S) as connection:
-            connection.sendall(beginning)
-            with suppress(ConnectionResetError):
-                assert connection.recv(1) == b""
-
-
-def test_who_does_not_read_the_answer_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connection_that_stalls_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(capture_page, "_MAX_REQUEST_S", 0.05)
     monkeypatch.setattr(capture_page, "_state", lambda panel: "x" * 50_000_000)
     with serve_page(CapturePanel(unattended=True)) as address:
         parts = urllib.parse.urlsplit(address)
-        with socket.create_connection((parts.hostname, parts.port), HANG_S) as connection:
+        place = (parts.hostname, parts.port or 0)
+        for beginning in (b"", b"GET / HT", f"POST {parts.path}press HTTP/1.1\r\nHost: 127.0.0.1\r\n".encode()):
+            with socket.create_connection(place, HANG_S) as connection:
+                connection.sendall(beginning)
+                with suppress(ConnectionResetError):
+                    assert connection.recv(1) == b""
+        with socket.create_connection(place, HANG_S) as connection:
             connection.sendall(f"GET {parts.path}state HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
-            read = 0
+            count = 0
             with suppress(ConnectionResetError):
                 while data := connection.recv(256):  # takes far longer than the page allows
-                    read += len(data)
-            assert read < 50_000_000
+                    count += len(data)
+            assert count < 50_000_000
         assert status_of(address) == 200
 
 
-def test_what_fails_in_the_page_stays_there(
+def test_failure_in_page_stays_there(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(panel: CapturePanel) -> NoReturn:
@@ -388,56 +239,54 @@ def test_what_fails_in_the_page_stays_there(
     assert caplog.messages == []
 
 
-def _rig(tmp_path: Path) -> Path:
-    """Return a rig.toml of a small simulated rig."""
-    path = tmp_path / "rig.toml"
-    assert cli.run(["init", str(path)]) == 0
-    text = path.read_text().replace("size_px = [640, 480]", "size_px = [64, 48]")
-    path.write_text(text.replace("rows = 7\ncolumns = 7", "rows = 1\ncolumns = 2"))
-    return path
+def _capture(tmp_path: Path, *options: str) -> int:
+    """Capture a small session, and return the exit code."""
+    rig = tmp_path / "rig.toml"
+    if not rig.exists():
+        write_small_rig(rig)
+    return cli.run(["capture", str(rig), str(tmp_path / "session"), "--page", *options])
 
 
-def test_the_terminal_shows_the_address_and_no_log_holds_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig, session, log = _rig(tmp_path), tmp_path / "session", tmp_path / "day.log"
-    assert cli.run(["capture", str(rig), str(session), "--yes", "--page", "--log", str(log)]) == 0
-    [token] = re.findall(r"page: http://127\.0\.0\.1:\d+/(\S+)/\n", capsys.readouterr().err)
+def test_terminal_shows_address_and_no_log_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = tmp_path / "day.log"
+    assert _capture(tmp_path, "--yes", "--live-sweep-mm", "400:600:3", "--log", str(log)) == 0
+    complaint = capsys.readouterr().err
+    assert "live planes" not in complaint
+    [token] = re.findall(r"page: http://127\.0\.0\.1:\d+/(\S+)/\n", complaint)
     assert re.search(r"INFO page: http://127\.0\.0\.1:\d+/\(concealed\)/\n", log.read_text())
-    for path in (log, *session.rglob("*.*")):
+    for path in (log, *(tmp_path / "session").rglob("*.*")):
         assert token.encode() not in path.read_bytes()
+    assert verify(tmp_path / "session").sealed
 
 
-def test_a_capture_that_gets_no_page_goes_on_if_it_can(
+def test_capture_without_page_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def refuse(*_: object) -> NoReturn:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    rig, session = _rig(tmp_path), tmp_path / "session"
     monkeypatch.setattr("socket.create_server", refuse)
-    assert cli.run(["capture", str(rig), str(session), "--page"]) == 1
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said.startswith(
-        "faintfield: CaptureStopped: there is no page ([Errno 24] Too many open files) and no terminal"
-    )
-    assert cli.run(["capture", str(rig), str(session), "--page", "--yes"]) == 0
+    assert _capture(tmp_path) == 1
+    complaint = capsys.readouterr().err.splitlines()[-1]
+    assert complaint.startswith("faintfield: CaptureStopped: there is no page ([Errno 24] Too many open files) and no")
+    assert _capture(tmp_path, "--yes") == 0
     assert "warning: there is no page ([Errno 24] Too many open files); " in capsys.readouterr().err
-    assert verify(session).sealed
+    assert verify(tmp_path / "session").sealed
 
 
-def test_a_capture_whose_page_fails_goes_on(
+def test_capture_whose_page_fails_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     async def fail(*_: object, **__: object) -> NoReturn:
         raise OSError(errno.EMFILE, "Too many open files")
 
-    rig, session = _rig(tmp_path), tmp_path / "session"
     monkeypatch.setattr("uvicorn.Server.serve", fail)
-    assert cli.run(["capture", str(rig), str(session), "--page", "--yes"]) == 0
+    assert _capture(tmp_path, "--yes") == 0
     assert "warning: the page has ended (OSError: [Errno 24] Too many open files); " in capsys.readouterr().err
-    assert verify(session).sealed
+    assert verify(tmp_path / "session").sealed
 
 
-def test_pixels_that_are_no_numbers_are_no_frame(tmp_path: Path) -> None:
+def test_pixels_without_numbers_are_refused(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "frame.tiff", np.array([[1.0, np.nan]], np.float32))
     with pytest.raises(CameraError, match=r"values that are no numbers; "):
         guided.read_pixels(tmp_path / "frame.tiff")

@@ -11,9 +11,11 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import encoded
 from faintfield.pipelines.formats.results.records import JOINT_METHODS, Method
 from faintfield.pipelines.paper import demo as paper
 from faintfield.pipelines.reconstruction import request
@@ -66,14 +68,19 @@ class _Pictures(HTMLParser):
             self.alternatives.append(attributes["alt"] or "")
 
 
+def _save_nothing(_: Figure, file: Any, format: str, **__: object) -> None:
+    file.write("<svg></svg>" if format == "svg" else encoded(np.zeros((4, 4), np.uint8), ".png"))
+
+
 def test_small_demo_from_capture_to_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Nine nodes, and two methods that are fast."""
     methods = ["backprojection", "pmlem-osl"]
-    monkeypatch.setattr(paper, "QUICK", paper.DemoSize(3, 150.0, (320, 240), 4))
+    monkeypatch.setattr(paper, "QUICK", paper.DemoSize(3, 100.0, (288, 216), 3))
     monkeypatch.setattr(importlib.import_module("faintfield.pipelines.commands.demo"), "_METHODS", methods)
     monkeypatch.setattr(request, "DEFAULT_METHOD", "pmlem-osl")
+    monkeypatch.setattr(Figure, "savefig", _save_nothing)  # text takes most of the time of a page
     out = tmp_path / "demo"
     assert run(["demo", str(out), "--quick", "--json"]) == 0
     metrics = _metrics(out)
@@ -97,11 +104,7 @@ def test_small_demo_from_capture_to_report(
         for poses in ("measured", "nominal", "true"):
             assert f"PMLEM (one-step-late, TV), {poses} poses at {depth:g} mm" in shown
     assert "The noise reference" in shown
-    words = [word for name in methods for word in ("--method", name)]
     assert run(["verify", str(out / "session")]) == 0
-    capsys.readouterr()
-    assert run(["run", str(out / "session"), *words, "--prior", "tv", "--json"]) == 0
-    assert [step["ran"] for step in json.loads(capsys.readouterr().out)["steps"]] == [False] * 4
 
 
 @pytest.mark.deep
@@ -138,20 +141,14 @@ def test_memory_of_reconstruction_is_bounded_by_images(prior: str, beside: float
     assert simulated.returncode == 0, simulated.stderr
     words = ["reconstruct", str(tmp_path / "scene"), "--out", str(tmp_path / "planes"), "--depth-mm", "500"]
     words += ["--prior", prior]
-    # Of the 200 MB, 90 are library code. How much of that is resident the page cache decides, not this program: what
-    # is its own is the peak less the mapped files, and has the rest as its bound.
+    # Of the 200 MB, 90 are library code, of which the page cache decides how much is resident: it is left out
     own_kb = (
         "from faintfield.pipelines.cli import run; assert run({words!r}) == 0; "
         "lines = dict(line.split(':') for line in open('/proc/self/status')); "
         "print(*(int(lines[key].split()[0]) for key in ('VmHWM', 'RssFile')))"
     )
-    said = subprocess.run(
-        [sys.executable, "-c", own_kb.format(words=[*words, "--passes", "5"])],
-        capture_output=True,
-        text=True,
-        check=True,
-        cwd=_ROOT,
-    ).stdout
+    command = [sys.executable, "-c", own_kb.format(words=[*words, "--passes", "5"])]
+    said = subprocess.run(command, capture_output=True, text=True, check=True, cwd=_ROOT).stdout
     peak_kb, files_kb = (int(word) for word in said.split()[-2:])
     images_bytes = 49 * 480 * 640 * 4
     assert (peak_kb - files_kb) * 1024 <= 1.5 * images_bytes + beside

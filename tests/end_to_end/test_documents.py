@@ -17,10 +17,10 @@ DOCUMENTS = ("README.md", "docs/guide.md", "docs/api.md")
 
 # Smaller numbers for the examples of the README, so that all of them run with the quick tests.
 SMALLER = {
-    "--size-px 480 360": "--size-px 240 180",
-    "--fx-px 600": "--fx-px 300",
+    "--size-px 480 360": "--size-px 160 120 --rows 3 --columns 3",
+    "--fx-px 600": "--fx-px 200",
     "--sweep-mm 400:800:17": "--sweep-mm 400:800:3",
-    "--size-px 160 120 --rows 5 --columns 5": "--size-px 64 48 --rows 3 --columns 3",
+    "--size-px 160 120 --rows 5 --columns 5": "--size-px 48 36 --rows 3 --columns 3",
 }
 
 

@@ -49,7 +49,7 @@ check = {drift}
 
 [[step]]
 kind = "dark_scene"
-exposure_s = {bright_s}
+exposure_s = 0.01
 
 [[step]]
 kind = "dark"
@@ -69,7 +69,6 @@ ARAVIS = {
     "origin_mm": [-350.0, -350.0],
     "drift": "true",
     "measure": "true",  # which a simulated stage leaves no real camera to do
-    "bright_s": 0.01,
     "dark_s": [0.0012, 0.0013],
     "flat_s": [0.005, 0.009],
 }
@@ -89,7 +88,6 @@ properties = {{ Mode = "Noise", OnCameraCCDXSize = "64", OnCameraCCDYSize = "48"
     "origin_mm": [1.0, 1.0],
     "drift": "false",
     "measure": "false",
-    "bright_s": 0.01,
     "dark_s": [0.001, 0.02],
     "flat_s": [0.01, 0.02],
 }
@@ -97,8 +95,7 @@ FRAMES = 9 + 2 * 8 + 2 * 4
 
 
 def faintfield(*arguments: object) -> None:
-    """Run a command that must end well."""
-    assert cli.run([str(it) for it in arguments]) == 0
+    assert cli.run([str(argument) for argument in arguments]) == 0
 
 
 def captured(folder: Path, changes: dict[str, Any]) -> Path:
@@ -161,7 +158,7 @@ def record_exposures(monkeypatch: pytest.MonkeyPatch, camera: type[Any]) -> dict
     return sent
 
 
-def test_a_genicam_camera_on_a_simulated_grbl_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_genicam_camera_on_simulated_grbl_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         AravisLibrary()
     except MissingExtra as failure:
@@ -182,7 +179,7 @@ def test_a_genicam_camera_on_a_simulated_grbl_stage(tmp_path: Path, monkeypatch:
     check_session(session, sent, fx_px=300.0, depth_mm=500.0)
 
 
-def test_micro_manager_s_camera_on_its_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_micromanager_camera_on_its_stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     why = "pymmcore-plus and mm-test-adapters are not installed here: their devices are not tried"
     pytest.importorskip("pymmcore_plus", reason=why)
     adapters = pytest.importorskip("mm_test_adapters", reason=why).device_adapter_path()

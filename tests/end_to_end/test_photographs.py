@@ -58,7 +58,7 @@ def _electrons_of_white(results: Path) -> float:
     return float(scale_e * 65535 / gain)
 
 
-def test_penalised_planes_beat_the_mean_of_the_views(results: Path) -> None:
+def test_penalised_planes_beat_mean_of_views(results: Path) -> None:
     white_e, bright = _electrons_of_white(results), _plane(results / "of-bright")
     assert bright.shape == (200, 340, 3)
     psnr_db = {
@@ -69,7 +69,7 @@ def test_penalised_planes_beat_the_mean_of_the_views(results: Path) -> None:
     assert psnr_db["pmlem"] >= psnr_db["backprojection"] + 17
 
 
-def test_nothing_can_be_seen_in_any_dark_view(results: Path) -> None:
+def test_dark_view_shows_nothing(results: Path) -> None:
     """A dark view says next to nothing of the bright one, pixel for pixel; the penalised plane says most of it.
 
     The light of photographs, their curve undone, is mostly that of a few bright places: the rest has 0.07 electrons.
@@ -91,7 +91,7 @@ def test_colours_come_back(results: Path) -> None:
     np.testing.assert_allclose(penalised, expected_e, atol=3 * standard_error_e)
 
 
-def test_the_plane_is_where_the_disparity_puts_it(results: Path) -> None:
+def test_plane_lies_at_disparity(results: Path) -> None:
     record = json.loads((results / "of-dark" / "pmlem-osl" / "reconstruction.json").read_text())
     assert [plane["disparity_px"] for plane in record["planes"]] == pytest.approx([_DISPARITY_PX] * 3, rel=1e-9)
     assert [plane["channel"] for plane in record["planes"]] == ["red", "green", "blue"]

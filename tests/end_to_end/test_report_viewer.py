@@ -1,12 +1,10 @@
 """The viewer of a report in a real headless browser, from disk: hands, keys, and whether its numbers are true."""
 
-import base64
 import json
 import re
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -14,27 +12,24 @@ from numpy.typing import NDArray
 
 from faintfield.pipelines import pages
 from faintfield.pipelines.pages.page import smaller_uri
-from faintfield.pipelines.pages.report_viewer import Viewer, pack
-from tests.end_to_end.browser import Tab
+from faintfield.pipelines.pages.report_viewer import pack
+from tests.end_to_end.browser import Tab, decoded
 
 FOLDERS = {"back-projection": "backprojection", "PMLEM (one-step-late, TV)": "pmlem-osl"}
-DEPTHS_MM = (500, 600, 700)
-VIRTUAL_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowUp": 38, "ArrowDown": 40, "Backspace": 8}
+VIRTUAL_KEYS = {"ArrowRight": 39, "ArrowLeft": 37, "ArrowUp": 38, "ArrowDown": 40}
 
 
 def _state(tab: Tab, name: str) -> float:
     return float(tab.evaluate(f"document.querySelector('.v-stage').dataset.{name}"))
 
 
-def _box(tab: Tab, selector: str = ".v-stage") -> tuple[float, float, float, float]:
-    """Return left, top, width and height of an element on the screen, in pixels."""
-    box = f"document.querySelector('{selector}').getBoundingClientRect()"
-    left, top, width, height = tab.evaluate(f"(box => [box.left, box.top, box.width, box.height])({box})")
-    return left, top, width, height
-
-
 def _mouse(tab: Tab, kind: str, x: float, y: float, **more: Any) -> None:
     tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
+
+
+def _point(tab: Tab, x: float, y: float) -> None:
+    _mouse(tab, "mouseMoved", x, y)
+    tab.draw()
 
 
 def _drag(tab: Tab, start: tuple[float, float], by: tuple[float, float]) -> None:
@@ -58,16 +53,6 @@ def _press(tab: Tab, *keys: str, shift: bool = False) -> None:
     tab.draw()
 
 
-def _choose(tab: Tab, side: str, words: str) -> None:
-    """Choose a picture by its name."""
-    tab.evaluate(
-        f"(() => {{ const one = document.getElementById('v-{side}'); "
-        f"one.value = [...one.options].find(it => it.text === {json.dumps(words)}).value; "
-        "one.dispatchEvent(new Event('change')); })()"
-    )
-    tab.draw()
-
-
 def _chosen(tab: Tab, side: str) -> str:
     return str(tab.evaluate(f"document.getElementById('v-{side}').selectedOptions[0].text"))
 
@@ -79,145 +64,102 @@ def _click(tab: Tab, words: str) -> None:
     tab.draw()
 
 
-def _set_wipe(tab: Tab, share: float) -> None:
-    tab.evaluate(
-        f"(it => {{ it.value = {share}; it.dispatchEvent(new Event('input')); }})(document.getElementById('v-wipe'))"
-    )
-    tab.draw()
-
-
-def _told(tab: Tab, side: str = "B") -> str:
+def _reading(tab: Tab, side: str = "B") -> str:
     return str(tab.evaluate(f"document.getElementById('v-out-{side}').innerText")).replace("−", "-")
 
 
 def _canvas(tab: Tab) -> NDArray[Any]:
     """Return the pixels of the viewer's canvas (row, column, BGR)."""
-    uri = tab.evaluate("document.querySelector('.v-stage canvas').toDataURL()")
-    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return np.asarray(decoded)
-
-
-def _bar_px(tab: Tab) -> int:
-    """Return the length of the bar at the lower left, counted on the canvas."""
-    pixels = _canvas(tab)
-    white = (pixels[-14, 16:] == 255).all(axis=-1)  # the bar is 4 px high, 16 px from the left and from below
-    assert white[0]
-    return int(np.argmin(white))
+    return decoded(tab.evaluate("document.querySelector('.v-stage canvas').toDataURL()").split(",")[1])
 
 
 def _plane(report: Path, title: str, depth_mm: int) -> tuple[NDArray[np.float32], dict[str, Any]]:
     """Return a plane's numbers as its file has them, and its record."""
     record = json.loads((report.parent / FOLDERS[title] / "reconstruction.json").read_text())
     name = f"plane_{depth_mm:07.1f}.tiff"
-    found = next(one for one in record["planes"] if one["file"] == name)
-    return tifffile.imread(report.parent / FOLDERS[title] / name), found
+    plane_record = next(plane for plane in record["planes"] if plane["file"] == name)
+    return tifffile.imread(report.parent / FOLDERS[title] / name), plane_record
 
 
-def test_the_numbers_under_the_cross_are_those_of_the_files(page: Tab, report: Path) -> None:
-    left, top, width, height = _box(page)
+def test_numbers_under_cross_are_those_of_files(page: Tab, report: Path) -> None:
+    left, top, width, height = page.box(".v-stage")
     size = _state(page, "size")
     rng = np.random.default_rng(1)
-    for title in FOLDERS:
-        for depth_mm in DEPTHS_MM:
-            _choose(page, "B", f"{title}, {depth_mm} mm")
-            plane, record = _plane(report, title, depth_mm)
-            row, column = (int(rng.integers(1, count - 1)) for count in plane.shape)
-            u0, v0 = width / 2 - 0.5 * size, height / 2 - _state(page, "v") * size
-            sample_px = size / plane.shape[1]
-            _mouse(page, "mouseMoved", left + u0 + (column + 0.5) * sample_px, top + v0 + (row + 0.5) * sample_px)
-            page.draw()
-            told = re.search(
-                r"(-?[\d.]+) e⁻ per pixel \(± (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)", _told(page)
-            )
-            assert told is not None, _told(page)
-            value, off, x_mm, y_mm = (float(word) for word in told.groups()[:4])
-            assert (int(told[5]), int(told[6])) == (column, row)
-            assert off < 1e-3
-            decimals = len(told[1].partition(".")[2])
-            assert value == pytest.approx(float(plane[row, column]), abs=1.05 * off + 0.5 * 10**-decimals)
-            x0_mm, y0_mm = record["origin_mm"]
-            assert x_mm == pytest.approx(x0_mm + column * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
-            assert y_mm == pytest.approx(y0_mm + row * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
+    for title, depth_mm in (("back-projection", 500), ("PMLEM (one-step-late, TV)", 700)):
+        page.choose("v-B", f"{title}, {depth_mm} mm")
+        plane, record = _plane(report, title, depth_mm)
+        row, column = (int(rng.integers(1, count - 1)) for count in plane.shape)
+        u0, v0 = width / 2 - 0.5 * size, height / 2 - _state(page, "v") * size
+        sample_px = size / plane.shape[1]
+        _point(page, left + u0 + (column + 0.5) * sample_px, top + v0 + (row + 0.5) * sample_px)
+        reading = re.search(
+            r"(-?[\d.]+) e⁻ per pixel \(± (\S+)\)\s+x (\S+), y (\S+) mm; column (\d+), row (\d+)", _reading(page)
+        )
+        assert reading is not None, _reading(page)
+        value, off, x_mm, y_mm = (float(word) for word in reading.groups()[:4])
+        assert (int(reading[5]), int(reading[6])) == (column, row)
+        assert off < 1e-3
+        decimals = len(reading[1].partition(".")[2])
+        assert value == pytest.approx(float(plane[row, column]), abs=1.05 * off + 0.5 * 10**-decimals)
+        x0_mm, y0_mm = record["origin_mm"]
+        assert x_mm == pytest.approx(x0_mm + column * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
+        assert y_mm == pytest.approx(y0_mm + row * record["pitch_mm"], abs=0.06 * record["pitch_mm"] + 1e-6)
+    # Both pictures are read at the same place
+    columns = [re.search(r"column \d+, row \d+", _reading(page, side)) for side in "AB"]
+    assert columns[0] is not None
+    assert columns[1] is not None
+    assert columns[0][0] == columns[1][0]
+    assert " DN" in _reading(page, "A")
 
 
-def test_both_pictures_are_read_at_one_place(page: Tab) -> None:
-    left, top, width, height = _box(page)
-    _mouse(page, "mouseMoved", left + 0.3 * width, top + 0.6 * height)
-    page.draw()
-    places = [re.search(r"column (\d+), row (\d+)", _told(page, side)) for side in "AB"]
-    assert places[0] is not None
-    assert places[1] is not None
-    assert places[0].groups() == places[1].groups()
-    assert " DN" in _told(page, "A")
-    assert "e⁻ per pixel" in _told(page, "B")
-
-
-def test_keys_zoom_about_the_middle_and_0_shows_all(page: Tab) -> None:
+def test_keys_and_drag_zoom_and_pan(page: Tab, report: Path) -> None:
     middle = _state(page, "u"), _state(page, "v")
     _press(page, "+", "+")
     assert _state(page, "zoom") == pytest.approx(2.25)
     assert (_state(page, "u"), _state(page, "v")) == pytest.approx(middle)
+    size = _state(page, "size")
+    left, top, width, height = page.box(".v-stage")
+    _drag(page, (left + 0.75 * width, top + 0.5 * height), (-80, 40))
+    assert (_state(page, "u") - middle[0]) * size == pytest.approx(80, abs=0.1)
+    assert (_state(page, "v") - middle[1]) * size == pytest.approx(-40, abs=0.1)
+    _press(page, "ArrowLeft")
+    assert (_state(page, "u") - middle[0]) * size == pytest.approx(80 - 60, abs=0.1)
     _press(page, "-")
     assert _state(page, "zoom") == pytest.approx(1.5)
-    _press(page, "0")
+    _press(page, "0")  # all
     assert _state(page, "zoom") == 1
-
-
-def test_1_shows_one_sample_per_pixel(page: Tab, report: Path) -> None:
     page.resize(60 + 40)  # narrower than the plane
-    _press(page, "1")
+    _press(page, "1")  # one sample per pixel
     assert _state(page, "size") == pytest.approx(_plane(report, "back-projection", 500)[0].shape[1])
 
 
-def test_the_wheel_zooms_about_the_cursor_once_the_pictures_are_clicked(page: Tab) -> None:
-    left, top, width, height = _box(page)
+def test_wheel_and_fingers_zoom_at_their_place(page: Tab) -> None:
+    left, top, width, height = page.box(".v-stage")
     x, y = left + 0.255 * width, top + 0.5 * height
     _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-1)
     page.draw()
-    assert _state(page, "zoom") == 1
+    assert _state(page, "zoom") == 1  # before a click the wheel moves the page
     _drag(page, (x, y), (0, 0))
-    before = _told(page)
+    before = _reading(page)
     _mouse(page, "mouseWheel", x, y, deltaX=0, deltaY=-600)
     page.wait_until("Number(document.querySelector('.v-stage').dataset.zoom) > 2")
-    _mouse(page, "mouseMoved", x, y)
-    page.draw()
-    assert _told(page) == before
-
-
-def test_a_drag_pans_as_far_as_the_hand_moves(page: Tab) -> None:
-    _press(page, "+", "+", "+")
-    u, v, size = (_state(page, name) for name in ("u", "v", "size"))
-    left, top, width, height = _box(page)
-    _drag(page, (left + 0.75 * width, top + 0.5 * height), (-80, 40))
-    assert (_state(page, "u") - u) * size == pytest.approx(80, abs=0.1)
-    assert (_state(page, "v") - v) * size == pytest.approx(-40, abs=0.1)
-    _press(page, "ArrowLeft")
-    assert (_state(page, "u") - u) * size == pytest.approx(80 - 60, abs=0.1)
-
-
-def test_two_fingers_zoom(page: Tab) -> None:
-    left, top, width, height = _box(page)
-    x, y = left + 0.7 * width, top + 0.5 * height
-
-    def fingers(kind: str, apart: float) -> None:
-        points = [{"x": x - apart / 2, "y": y, "id": 0}, {"x": x + apart / 2, "y": y, "id": 1}]
-        page.call("Input.dispatchTouchEvent", type=kind, touchPoints=points if kind != "touchEnd" else [])
-
+    _point(page, x, y)
+    assert _reading(page) == before
+    _press(page, "0")
     page.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
     try:
-        fingers("touchStart", 50)
-        for apart in (60, 80, 100):
-            fingers("touchMove", apart)
-        fingers("touchEnd", 100)
+        for kind, apart in (("touchStart", 50), ("touchMove", 60), ("touchMove", 80), ("touchMove", 100)):
+            points = [{"x": x - apart / 2, "y": y, "id": 0}, {"x": x + apart / 2, "y": y, "id": 1}]
+            page.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
+        page.call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
         page.wait_until("Math.abs(document.querySelector('.v-stage').dataset.zoom - 2) < 0.05")
     finally:
         page.call("Emulation.setTouchEmulationEnabled", enabled=False)
 
 
-def test_panels_side_by_side_are_zoomed_and_panned_together(page: Tab) -> None:
-    _choose(page, "A", "PMLEM (one-step-late, TV), 600 mm")
-    _choose(page, "B", "PMLEM (one-step-late, TV), 600 mm")
+def test_panels_zoom_and_pan_together(page: Tab) -> None:
+    for side in "AB":
+        page.choose(f"v-{side}", "PMLEM (one-step-late, TV), 600 mm")
     _click(page, "Side by side")
     _press(page, "+", "+", "ArrowRight", "ArrowDown")
     pixels = _canvas(page)
@@ -232,10 +174,11 @@ def test_panels_side_by_side_are_zoomed_and_panned_together(page: Tab) -> None:
     assert _canvas(page)[-60:, : pixels.shape[1] // 3].std() > 10
 
 
-def test_the_wipe_moves_by_drag_and_by_key(page: Tab) -> None:
-    left, top, width, height = _box(page)
-    _choose(page, "A", "back-projection, 500 mm")
-    _set_wipe(page, 0.5)
+def test_wipe_moves_by_drag_and_key(page: Tab) -> None:
+    left, top, width, height = page.box(".v-stage")
+    page.choose("v-A", "back-projection, 500 mm")
+    page.set_slider("v-wipe", 0.5)
+    page.draw()
     whole = _canvas(page)
     _drag(page, (left + width / 2, top + height / 2), (-0.25 * width, 0))
     assert _state(page, "wipe") == pytest.approx(0.25, abs=0.002)
@@ -250,86 +193,84 @@ def test_the_wipe_moves_by_drag_and_by_key(page: Tab) -> None:
     assert float(page.evaluate("document.getElementById('v-wipe').value")) == pytest.approx(0.27, abs=0.006)
 
 
-def test_minimum_and_maximum_set_the_grey_levels(page: Tab, report: Path) -> None:
+def test_minimum_and_maximum_set_grey_levels(page: Tab, report: Path) -> None:
     title, depth_mm = "PMLEM (one-step-late, TV)", 700
-    _choose(page, "B", f"{title}, {depth_mm} mm")
+    page.choose("v-B", f"{title}, {depth_mm} mm")
     plane, _ = _plane(report, title, depth_mm)
-    _set_wipe(page, 0)
+    page.set_slider("v-wipe", 0)
     black, white = float(np.quantile(plane, 0.2)), float(np.quantile(plane, 0.9))
     for end, value in (("black", black), ("white", white)):
         page.evaluate(
-            f"(() => {{ const one = document.getElementById('v-{end}-number-light'); one.value = {value}; "
-            "one.dispatchEvent(new Event('change')); })()"
+            f"(box => {{ box.value = {value}; box.dispatchEvent(new Event('change')); }})"
+            f"(document.getElementById('v-{end}-number-light'))"
         )
     _press(page, "+", "+", "+", "+", "+", "+")  # samples are squares then
     size, u, v = (_state(page, name) for name in ("size", "u", "v"))
-    _, _, width, height = _box(page)
+    _, _, width, height = page.box(".v-stage")
     pixels = _canvas(page)
     rng = np.random.default_rng(2)
+    compared = 0
     for x, y in zip(rng.uniform(150, width - 150, 40), rng.uniform(100, height - 100, 40), strict=True):
-        place = ((u + (x - width / 2) / size) * plane.shape[1], (v + (y - height / 2) / size) * plane.shape[1])
-        if min(*(one % 1 for one in place), *(1 - one % 1 for one in place)) < 0.15:
-            continue  # at the edge of a sample
-        value = float(plane[int(place[1]), int(place[0])])
-        expected = 255 * np.clip((value - black) / (white - black), 0, 1)
-        assert pixels[int(y), int(x)] == pytest.approx(expected, abs=2)
+        column, row = ((u + (x - width / 2) / size) * plane.shape[1], (v + (y - height / 2) / size) * plane.shape[1])
+        if max(abs(column % 1 - 0.5), abs(row % 1 - 0.5)) < 0.35:  # else at the edge of a sample
+            expected = 255 * np.clip((float(plane[int(row), int(column)]) - black) / (white - black), 0, 1)
+            assert pixels[int(y), int(x)] == pytest.approx(expected, abs=2)
+            compared += 1
+    assert compared >= 10
 
 
-def test_the_scale_bar_is_as_long_as_it_says_at_any_zoom(page: Tab, report: Path) -> None:
+def test_scale_bar_is_true_at_any_zoom(page: Tab, report: Path) -> None:
     lengths = set()
-    for depth_mm in DEPTHS_MM:
-        _choose(page, "A", f"back-projection, {depth_mm} mm")
+    for depth_mm in (500, 700):
+        page.choose("v-A", f"back-projection, {depth_mm} mm")
         plane, record = _plane(report, "back-projection", depth_mm)
         for _ in range(3):
             per_mm = _state(page, "size") / (plane.shape[1] * record["pitch_mm"])
-            said = page.evaluate("document.querySelector('.v-stage').dataset.barA")
-            length_mm = float(said.split(" mm")[0])
-            assert _bar_px(page) == pytest.approx(length_mm * per_mm, abs=1.5)
+            stated = page.evaluate("document.querySelector('.v-stage').dataset.barA")
+            length_mm = float(stated.split(" mm")[0])
+            white = (_canvas(page)[-14, 16:] == 255).all(axis=-1)  # 4 px high, 16 px from the left and from below
+            assert white[0]
+            assert int(np.argmin(white)) == pytest.approx(length_mm * per_mm, abs=1.5)
             lengths.add(length_mm)
             _press(page, "+", "+")
         _press(page, "0")
     assert len(lengths) >= 3
 
 
-def test_the_film_goes_through_the_depths_until_it_is_stopped(page: Tab) -> None:
-    words = "document.getElementById('v-depth-words').value"
+def test_depth_moves_by_slider_key_and_film(page: Tab) -> None:
     page.evaluate("window.due = null; window.setInterval = step => { due = step; return 7; };")
     page.evaluate("window.clearInterval = number => { if (number === 7) due = null; };")
-    _choose(page, "B", "back-projection, 600 mm")
-    _press(page, " ")
-    seen = []
-    for _ in range(5):
-        page.evaluate("due()")
-        seen.append(page.evaluate(words))
-    assert seen == ["700 mm", "600 mm", "500 mm", "600 mm", "700 mm"]
-    assert _chosen(page, "B") == "back-projection, 700 mm"
-    _click(page, "■ Stop")
-    assert page.evaluate("due") is None
-    assert page.evaluate("[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '▶ Film')")
-
-
-def test_the_depth_moves_by_slider_and_by_key(page: Tab) -> None:
-    page.evaluate("(it => { it.value = 0; it.dispatchEvent(new Event('input')); })(document.getElementById('v-depth'))")
+    page.set_slider("v-depth", 0)
     page.draw()
     assert "500 mm" in _chosen(page, "B")
     _press(page, "]")
     assert "600 mm" in _chosen(page, "B")
-    assert _chosen(page, "A") == "One view, as recorded"
-    _choose(page, "A", "back-projection, 600 mm")
-    _press(page, "]")
-    assert "700 mm" in _chosen(page, "A")
+    _press(page, " ")
+    depths = []
+    for _ in range(5):
+        page.evaluate("due()")
+        depths.append(page.evaluate("document.getElementById('v-depth-words').value"))
+    assert depths == ["700 mm", "600 mm", "500 mm", "600 mm", "700 mm"]
     assert "700 mm" in _chosen(page, "B")
+    _click(page, "■ Stop")
+    assert page.evaluate("due") is None
+    assert page.evaluate("[...document.querySelectorAll('#viewer button')].some(it => it.textContent === '▶ Film')")
+    assert _chosen(page, "A") == "One view, as recorded"
+    page.choose("v-A", "back-projection, 700 mm")
+    _press(page, "[")
+    assert "600 mm" in _chosen(page, "A")
+    assert "600 mm" in _chosen(page, "B")
 
 
-def test_the_keyboard_reads_a_sample_aloud(page: Tab, report: Path) -> None:
-    _choose(page, "B", "back-projection, 600 mm")
+def test_keyboard_reads_sample_aloud(page: Tab, report: Path) -> None:
+    page.choose("v-B", "back-projection, 600 mm")
     _press(page, "ArrowRight", "ArrowDown", shift=True)
     status = "document.querySelector('#viewer [role=status]').textContent"
     assert page.evaluate(status) == ""
     _press(page, "r")
-    said = page.evaluate(status)
-    place = re.search(r"B: back-projection, 600 mm\s+(\S+) e⁻ per pixel .*column (\d+), row (\d+)", said)
-    assert place is not None, said
+    words = page.evaluate(status)
+    place = re.search(r"B: back-projection, 600 mm\s+(\S+) e⁻ per pixel .*column (\d+), row (\d+)", words)
+    assert place is not None, words
     plane, _ = _plane(report, "back-projection", 600)
     assert float(place[1].replace("−", "-")) == pytest.approx(float(plane[int(place[3]), int(place[2])]), abs=2e-3)
 
@@ -337,29 +278,15 @@ def test_the_keyboard_reads_a_sample_aloud(page: Tab, report: Path) -> None:
 def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
     """Return the address of a page with the viewer alone, of one plane (row, column, colour)."""
     packed = pack(numbers, 1e-3)
-    shown: Viewer = {
-        "pictures": [
-            {
-                "kind": "light",
-                "title": "PMLEM",
-                "words": "500 mm",
-                "place": 0,
-                "unit": "e⁻ per pixel",
-                "low": packed.low,
-                "step": packed.step,
-                "bins": 1,
-                "pitch": 0.5,
-                "origin": (-10.0, 20.0),
-                "src": smaller_uri(packed.png),
-            }
-        ],
-        "scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}},
+    picture: dict[str, Any] = {"kind": "light", "title": "PMLEM", "words": "500 mm", "place": 0, "unit": "e⁻ per pixel"}
+    picture |= {"low": packed.low, "step": packed.step, "bins": 1, "pitch": 0.5, "origin": (-10.0, 20.0)}
+    shown: dict[str, Any] = {
+        "pictures": [{**picture, "src": smaller_uri(packed.png)}],
         "places": ["500 mm"],
         "quantity": "depth",
-        "length": "mm",
-        "binned": False,
-        "first": (0, 0),
     }
+    shown |= {"scales": {"light": {"black": 0.0, "white": 2.0, "name": "planes"}}}
+    shown |= {"quantity": "depth", "length": "mm", "binned": False, "first": (0, 0)}
     templates = Path(pages.__path__[0]) / "templates"
     script, style = ((templates / name).read_text() for name in ("viewer.js", "viewer.css"))
     (folder / "alone.html").write_text(
@@ -369,23 +296,22 @@ def _page_of(numbers: NDArray[np.float32], folder: Path) -> str:
     return (folder / "alone.html").as_uri()
 
 
-def test_colours_and_samples_without_numbers_are_read_out(browser: Tab, tmp_path: Path) -> None:
+def test_colours_and_missing_samples_are_read(browser: Tab, tmp_path: Path) -> None:
     numbers = np.random.default_rng(3).normal(1.0, 0.5, (30, 40, 3)).astype(np.float32)
     numbers[5, 6] = np.nan
     browser.resize(1200)
     browser.open("about:blank")
     browser.open(_page_of(numbers, tmp_path))
     browser.wait_until("document.querySelector('.v-stage').dataset.ready === 'all'")
-    left, top, width, height = _box(browser)
+    left, top, width, height = browser.box(".v-stage")
     size, v = _state(browser, "size"), _state(browser, "v")
     for row, column in ((10, 20), (29, 39), (5, 6)):
         x = left + width / 2 + ((column + 0.5) / 40 - 0.5) * size
-        _mouse(browser, "mouseMoved", x, top + height / 2 + ((row + 0.5) / 40 - v) * size)
-        browser.draw()
-        told = re.search(r"R (.+), G (.+), B (.+) e⁻ per pixel", _told(browser))
-        assert told is not None, _told(browser)
+        _point(browser, x, top + height / 2 + ((row + 0.5) / 40 - v) * size)
+        reading = re.search(r"R (.+), G (.+), B (.+) e⁻ per pixel", _reading(browser))
+        assert reading is not None, _reading(browser)
         if (row, column) == (5, 6):
-            assert told.groups() == ("not known",) * 3
+            assert reading.groups() == ("not known",) * 3
         else:
-            np.testing.assert_allclose([float(word) for word in told.groups()], numbers[row, column], atol=1.1e-3)
+            np.testing.assert_allclose([float(word) for word in reading.groups()], numbers[row, column], atol=1.1e-3)
     assert browser.complaints == []

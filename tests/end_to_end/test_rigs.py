@@ -36,7 +36,7 @@ RIGS = {
 
 @pytest.mark.deep
 @pytest.mark.parametrize("name", RIGS)
-def test_a_session_of_any_rig_ends_in_the_right_picture(name: str, tmp_path: Path) -> None:
+def test_unusual_rig_gives_right_picture(name: str, tmp_path: Path) -> None:
     camera, checks = RIGS[name]
     session = captured(tmp_path, rig_toml(camera=f"{camera}\n{_BRIGHT_ENOUGH}", checks=checks))
     run_steps(session, session_steps(session, select_planes(Options(depth_mm=[_DEPTH_MM], prior="tv"))))

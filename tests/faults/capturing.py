@@ -1,5 +1,6 @@
 """Run small captures in processes of their own, which can be killed."""
 
+import ctypes
 import multiprocessing
 import os
 import signal
@@ -110,6 +111,13 @@ def kill_at(owner: Any, name: str, *, after: bool, countdown: int) -> Iterator[N
         yield
         for patch in patches:
             patch.stop()
+
+
+def drop_rights() -> None:
+    """Give up all privileges, so that permissions hold for the superuser too (capset, Linux)."""
+    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
+    if ctypes.CDLL(None, use_errno=True).capset(header, (ctypes.c_uint32 * 6)()) != 0:
+        raise OSError(ctypes.get_errno(), "capset")
 
 
 def in_process(target: Callable[..., None], *arguments: Any, **named: Any) -> ForkServerProcess:

@@ -26,24 +26,19 @@ from tests.patience import HANG_S
 _RIG = """
 [stage]
 protocol = "simulated"
-
 [camera]
 backend = "simulated"
 size_px = [{size_px}]
-
 [grid]
 rows = {rows}
 columns = 2
 pitch_mm = 100.0
 origin_mm = [-350.0, -350.0]
-
 [settle]
 measure = false
 wait_s = 3.0
-
 [drift]
 check = false
-
 [[board]]
 name = "large"
 columns = 9
@@ -108,17 +103,17 @@ def prepare_inputs(folder: Path, names: Iterable[str]) -> None:
 
 def results(folder: Path) -> dict[str, bytes]:
     """Return the content of all files within a folder by name, without what may differ between two runs."""
-    found = {}
+    present = {}
     for path in sorted(folder.rglob("*")):
         name = str(path.relative_to(folder))
         if path.is_file() and path.name != CACHE_FILE:
             content = path.read_bytes()
-            found[name] = _TIMES.sub(b"", content) if path.suffix in (".json", ".html") else content
-    return found
+            present[name] = _TIMES.sub(b"", content) if path.suffix in (".json", ".html") else content
+    return present
 
 
-def _frames(found: dict[str, bytes]) -> set[str]:
-    return {_EXPOSURE.sub("", name) for name in found if name.startswith("out/frames/")}
+def _frames(present: dict[str, bytes]) -> set[str]:
+    return {_EXPOSURE.sub("", name) for name in present if name.startswith("out/frames/")}
 
 
 class Bench:
@@ -162,31 +157,30 @@ class Bench:
 
     def assert_finished(self, name: str) -> None:
         """Assert that inputs and results are those of an undisturbed run, and that nothing else is left."""
-        wanted, found = self.undisturbed(name), results(self.folder(name))
-        if name != "capture":
-            assert found.keys() == wanted.keys(), f"not both there: {found.keys() ^ wanted.keys()}"
-            self._assert_none_differs(name, found)
-            return
-        verdict = verify(self.folder(name) / "out")
-        assert (verdict.problems, verdict.missing, verdict.superseded, verdict.sealed) == ((), (), 0, True), verdict
-        assert _frames(found) == _frames(wanted), f"not both there: {_frames(found) ^ _frames(wanted)}"
-        self._assert_none_differs(name, found)
+        wanted, present = self.undisturbed(name), results(self.folder(name))
+        names, wanted_names = set(present), set(wanted)
+        if name == "capture":
+            verdict = verify(self.folder(name) / "out")
+            assert (verdict.problems, verdict.missing, verdict.superseded, verdict.sealed) == ((), (), 0, True), verdict
+            names, wanted_names = _frames(present), _frames(wanted)
+        assert names == wanted_names, f"not both there: {names ^ wanted_names}"
+        self._assert_none_differs(name, present)
 
     def assert_nothing_half_written(self, name: str, *, leftovers: bool) -> None:
         """Assert that each file is as an undisturbed run leaves it; `leftovers`: or has a temporary name."""
-        found = results(self.folder(name))
+        present = results(self.folder(name))
         if not leftovers:
-            temporary = [file for file in found if _is_temporary(file)]
+            temporary = [file for file in present if _is_temporary(file)]
             assert temporary == [], f"left: {temporary}"
-        finished = {file: content for file, content in found.items() if not (_is_temporary(file) or PARTS in file)}
+        finished = {file: content for file, content in present.items() if not (_is_temporary(file) or PARTS in file)}
         self._assert_none_differs(name, finished)
 
-    def _assert_none_differs(self, name: str, found: dict[str, bytes]) -> None:
+    def _assert_none_differs(self, name: str, present: dict[str, bytes]) -> None:
         wanted = self.undisturbed(name)
         changing = {
             f"out/{file}" for file in ("lock", SUMS, JOURNAL, f"{JOURNAL}-wal", f"{JOURNAL}-shm", f"{JOURNAL}-journal")
         }
-        for file, content in found.items():
+        for file, content in present.items():
             if name == "capture" and (file in changing or file not in wanted):
                 assert file in changing or _EXPOSURE.search(file), f"unknown file: {file}"
                 continue
@@ -211,22 +205,21 @@ def bench_in(folder: Path, names: Sequence[str]) -> Iterator[Bench]:
 
 
 # What each kind of call may meet: an error once, as of a cable or a signal, or from then on, as of a full disk
+_ONCE: Action = "fail once"
+_ON: Action = "fail from then on"
 FAULTS: dict[str, tuple[tuple[Action, str], ...]] = {
-    "open": (("fail once", "EACCES"), ("fail once", "EIO"), ("fail once", "EINTR")),
-    "create": (("fail from then on", "ENOSPC"), ("fail once", "EACCES"), ("fail once", "EINTR")),
-    "list": (("fail once", "EACCES"), ("fail once", "EIO")),
-    "status": (("fail once", "EACCES"), ("fail once", "EIO")),
-    "read": (("fail once", "EIO"), ("fail once", "EINTR"), ("cut short", "EIO")),
-    "write": (
-        *(("fail from then on", "ENOSPC"), ("fail once", "EIO")),
-        *(("fail once", "EINTR"), ("cut short", "ENOSPC")),
-    ),
-    "sync": (("fail once", "EIO"), ("fail from then on", "ENOSPC"), ("fail once", "EINTR")),
-    "rename": (("fail once", "EIO"), ("fail once", "EACCES"), ("fail from then on", "ENOSPC")),
-    "remove": (("fail once", "EACCES"), ("fail once", "EIO")),
-    "make": (("fail from then on", "ENOSPC"), ("fail once", "EACCES")),
-    "lock": (("fail from then on", "ENOLCK"), ("fail once", "EIO"), ("fail once", "EINTR")),
-    "allocate": (("fail from then on", "ENOSPC"), ("fail once", "EIO"), ("fail once", "EINTR")),
+    "open": ((_ONCE, "EACCES"), (_ONCE, "EIO"), (_ONCE, "EINTR")),
+    "create": ((_ON, "ENOSPC"), (_ONCE, "EACCES"), (_ONCE, "EINTR")),
+    "list": ((_ONCE, "EACCES"), (_ONCE, "EIO")),
+    "status": ((_ONCE, "EACCES"), (_ONCE, "EIO")),
+    "read": ((_ONCE, "EIO"), (_ONCE, "EINTR"), ("cut short", "EIO")),
+    "write": ((_ON, "ENOSPC"), (_ONCE, "EIO"), (_ONCE, "EINTR"), ("cut short", "ENOSPC")),
+    "sync": ((_ONCE, "EIO"), (_ON, "ENOSPC"), (_ONCE, "EINTR")),
+    "rename": ((_ONCE, "EIO"), (_ONCE, "EACCES"), (_ON, "ENOSPC")),
+    "remove": ((_ONCE, "EACCES"), (_ONCE, "EIO")),
+    "make": ((_ON, "ENOSPC"), (_ONCE, "EACCES")),
+    "lock": ((_ON, "ENOLCK"), (_ONCE, "EIO"), (_ONCE, "EINTR")),
+    "allocate": ((_ON, "ENOSPC"), (_ONCE, "EIO"), (_ONCE, "EINTR")),
 }
 
 _FAILURE = re.compile(r"^faintfield: [A-Z]\w+: .+; .+")

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from hashlib import blake2b
 from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 
 # What a child may use beyond the memory that this process has already when it is forked.
 MAX_EXTRA_BYTES = 2 << 30
@@ -64,18 +65,22 @@ def contained(
 
     The child may compute for `seconds`, and wait for as long.
     """
-    out, err = (os.memfd_create(name) for name in ("out", "err"))
+    files = os.memfd_create("out"), os.memfd_create("err")
     limit = _data_bytes() + extra_bytes
     begun = time.monotonic()
     child = os.fork()
     if child == 0:
-        _be_child(call, place, (out, err), seconds, limit)
+        _be_child(call, place, files, seconds, limit)
     status = _wait(child, seconds)
-    alone = _group_is_gone(child)
-    texts = [_content(file).decode(errors="replace") for file in (out, err)]
+    try:
+        os.killpg(child, signal.SIGKILL)
+        alone = False
+    except ProcessLookupError:
+        alone = True
+    out, err = (_content(file) for file in files)
     killed = os.WTERMSIG(status) if os.WIFSIGNALED(status) else None
     code = os.WEXITSTATUS(status) if os.WIFEXITED(status) else None
-    return Ended(code, killed, texts[0], texts[1], alone, time.monotonic() - begun)
+    return Ended(code, killed, out, err, alone, time.monotonic() - begun)
 
 
 def _wait(child: int, seconds: float) -> int:
@@ -83,21 +88,15 @@ def _wait(child: int, seconds: float) -> int:
 
     On a busy machine it may take long, but it then still runs now and then.
     """
-    ended = select.poll()
     watched = os.pidfd_open(child)
-    ended.register(watched, select.POLLIN)
     used = 0.0
-    while not ended.poll(1000 * seconds):
-        before, used = used, _cpu_seconds(child)
+    while not select.select([watched], [], [], seconds)[0]:
+        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
+        before, used = used, (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
         if used - before < _LEAST_RUNNING * seconds:
             os.kill(child, signal.SIGALRM)
     os.close(watched)
     return os.waitpid(child, 0)[1]
-
-
-def _cpu_seconds(process: int) -> float:
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seconds: float, limit: int) -> None:
@@ -134,48 +133,32 @@ def _be_child(call: Callable[[], int], place: Path, files: tuple[int, int], seco
         os._exit(code)
 
 
-def _group_is_gone(leader: int) -> bool:
-    """Return whether nothing is left of the session of a child that has ended; end what is."""
-    try:
-        os.killpg(leader, signal.SIGKILL)
-    except ProcessLookupError:
-        return True
-    return False
-
-
-def _content(file: int) -> bytes:
+def _content(file: int) -> str:
     os.lseek(file, 0, os.SEEK_SET)
     with open(file, "rb") as opened:
-        return opened.read(1 << 20)
+        return opened.read(1 << 20).decode(errors="replace")
 
 
 def _data_bytes() -> int:
     """Return the private memory that this process has mapped, as RLIMIT_DATA counts it."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmData:"):
-            return int(line.split()[1]) * 1024
-    raise OSError("/proc/self/status has no VmData")
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines["VmData"].split()[0]) * 1024
 
 
 def state_of(folder: Path) -> State:
-    """Return what all files below a folder are like: kind, size, times, and the content of small ones."""
-    found: dict[str, tuple[object, ...]] = {}
-    waiting = [str(folder)]
-    while waiting:
-        inside = waiting.pop()
-        with os.scandir(inside) as entries:
-            for entry in entries:
-                stat = entry.stat(follow_symlinks=False)
-                name = os.path.relpath(entry.path, folder)
-                if entry.is_dir(follow_symlinks=False):
-                    waiting.append(entry.path)
-                    found[name] = (stat.st_mode,)
-                    continue
-                digest = b""
-                if entry.is_file(follow_symlinks=False) and stat.st_size <= _MAX_DIGESTED:
-                    digest = blake2b(Path(entry.path).read_bytes(), digest_size=16).digest()
-                found[name] = (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns, digest)
-    return found
+    """Return kind, size, times, and the content of small files, of everything below a folder."""
+    state: dict[str, tuple[object, ...]] = {}
+    for inside, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(inside, name)
+            stat = path.lstat()
+            own: tuple[object, ...] = (stat.st_mode,)
+            if not S_ISDIR(stat.st_mode):
+                small = S_ISREG(stat.st_mode) and stat.st_size <= _MAX_DIGESTED
+                content = blake2b(path.read_bytes()).digest() if small else b""
+                own = (stat.st_mode, stat.st_ino, stat.st_size, stat.st_mtime_ns, content)
+            state[os.path.relpath(path, folder)] = own
+    return state
 
 
 def faults_of(
@@ -188,10 +171,11 @@ def faults_of(
     """
     after = state_of(folder)
     changed = {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
-    faults = [*_ended_badly(ended)]
+    faults = _faults_of_end(ended)
     for name in sorted(changed):
         if not any(fnmatchcase(name, pattern) for pattern in may_change):
-            faults.append(f"outside its folder: {name!r} was {_what_became(name, before, after)}")
+            what = "made" if name not in before else "removed" if name not in after else "changed"
+            faults.append(f"outside its folder: {name!r} was {what}")
         elif name not in after:
             continue
         elif any(fnmatchcase(os.path.basename(name), pattern) for pattern in _UNFINISHED):
@@ -201,7 +185,7 @@ def faults_of(
     return faults
 
 
-def _ended_badly(ended: Ended) -> list[str]:
+def _faults_of_end(ended: Ended) -> list[str]:
     faults = []
     lines = ended.err.splitlines()
     said = [line for line in lines if _FAILURE.match(line)]
@@ -230,30 +214,25 @@ def _ended_badly(ended: Ended) -> list[str]:
     return faults
 
 
-def _what_became(name: str, before: State, after: State) -> str:
-    return "made" if name not in before else "removed" if name not in after else "changed"
-
-
 def _flaw(path: Path) -> str | None:
     """Return why a written file is not whole, None if it is."""
     if path.is_symlink() or not path.is_file():
         return None
+    content = path.read_bytes()
     match path.suffix:
         case ".json":
             try:
-                json.loads(path.read_bytes())
+                json.loads(content)
             except ValueError as failure:
                 return f"is no JSON ({failure})"
         case ".npz" if not zipfile.is_zipfile(path):
             return "is no archive"
-        case ".html":
-            text = path.read_text(errors="replace")
-            if SCRIPT in text:
-                return "holds a script that came in a name"
-            if not text.rstrip().endswith("</html>"):
-                return "has no end"
-        case ".png" if b"IEND\xaeB`\x82" not in path.read_bytes():  # a copied one may have more after it
+        case ".html" if SCRIPT.encode() in content:
+            return "holds a script that came in a name"
+        case ".html" if not content.rstrip().endswith(b"</html>"):
             return "has no end"
-        case ".tiff" if path.read_bytes()[:4] not in (b"II*\0", b"II+\0"):
+        case ".png" if b"IEND\xaeB`\x82" not in content:  # a copied one may have more after it
+            return "has no end"
+        case ".tiff" if content[:4] not in (b"II*\0", b"II+\0"):
             return "is no TIFF"
     return None

@@ -64,10 +64,10 @@ static void *next(const char *name)
     return found;
 }
 
-#define NEXT(name, result, ...)                                     \
-    static result (*original)(__VA_ARGS__);                         \
-    if (!original)                                                  \
-        original = (result(*)(__VA_ARGS__))next(#name)
+#define NEXT(name) \
+    static __typeof(name) *original; \
+    if (!original) \
+        original = next(#name)
 
 static int within(const char *path, const char *place)
 {
@@ -156,89 +156,80 @@ static ssize_t halved(ssize_t done)
 
 static size_t half(size_t count) { return count > 1 ? count / 2 : count; }
 
-#define OPENING(name, parameters, arguments, directory)                                              \
-    int name parameters                                                                              \
-    {                                                                                                \
-        NEXT(name, int, OPENING_TYPES);                                                              \
-        mode_t mode = 0;                                                                             \
-        if (flags & (O_CREAT | __O_TMPFILE)) {                                                       \
-            va_list rest;                                                                            \
-            va_start(rest, flags);                                                                   \
-            mode = va_arg(rest, mode_t);                                                             \
-            va_end(rest);                                                                            \
-        }                                                                                            \
-        int changes = (flags & O_ACCMODE) != O_RDONLY || flags & (O_CREAT | O_TRUNC);                \
-        if (judge_at(flags & O_CREAT ? CREATE : OPEN, changes, directory, path, "open") == FAILED)   \
-            return -1;                                                                               \
-        return original arguments;                                                                   \
+/* On 64-bit systems these are the same functions */
+#define ALSO(name, other) extern __typeof(other) other __attribute__((alias(#name)));
+
+#define OPENING(name, parameters, arguments, directory) \
+    int name parameters \
+    { \
+        NEXT(name); \
+        mode_t mode = 0; \
+        if (flags & (O_CREAT | __O_TMPFILE)) { \
+            va_list rest; \
+            va_start(rest, flags); \
+            mode = va_arg(rest, mode_t); \
+            va_end(rest); \
+        } \
+        int changes = (flags & O_ACCMODE) != O_RDONLY || flags & (O_CREAT | O_TRUNC); \
+        if (judge_at(flags & O_CREAT ? CREATE : OPEN, changes, directory, path, "open") == FAILED) \
+            return -1; \
+        return original arguments; \
     }
 
-#define OPENING_TYPES const char *, int, ...
 OPENING(open, (const char *path, int flags, ...), (path, flags, mode), AT_FDCWD)
-OPENING(open64, (const char *path, int flags, ...), (path, flags, mode), AT_FDCWD)
-#undef OPENING_TYPES
-#define OPENING_TYPES int, const char *, int, ...
+ALSO(open, open64)
 OPENING(openat, (int directory, const char *path, int flags, ...), (directory, path, flags, mode), directory)
-OPENING(openat64, (int directory, const char *path, int flags, ...), (directory, path, flags, mode), directory)
+ALSO(openat, openat64)
 
-#define STREAM(name)                                                                        \
-    FILE *name(const char *path, const char *how)                                           \
-    {                                                                                       \
-        NEXT(name, FILE *, const char *, const char *);                                     \
-        int changes = how[0] != 'r' || strchr(how, '+');                                    \
-        if (judge_at(how[0] == 'r' ? OPEN : CREATE, changes, AT_FDCWD, path, #name) == FAILED) \
-            return NULL;                                                                    \
-        return original(path, how);                                                         \
-    }
-STREAM(fopen)
-STREAM(fopen64)
+FILE *fopen(const char *path, const char *how)
+{
+    NEXT(fopen);
+    int changes = how[0] != 'r' || strchr(how, '+');
+    if (judge_at(how[0] == 'r' ? OPEN : CREATE, changes, AT_FDCWD, path, "fopen") == FAILED)
+        return NULL;
+    return original(path, how);
+}
+ALSO(fopen, fopen64)
 
-#define READING(name, parameters, fd, arguments, halved_arguments, ...)   \
-    ssize_t name parameters                                               \
-    {                                                                     \
-        NEXT(name, ssize_t, __VA_ARGS__);                                 \
-        switch (judge_fd(READ, 0, fd, #name)) {                           \
-        case FAILED: return -1;                                           \
-        case HALF: return original halved_arguments;                      \
-        default: return original arguments;                               \
-        }                                                                 \
+#define READING(name, parameters, fd, arguments, halved_arguments) \
+    ssize_t name parameters \
+    { \
+        NEXT(name); \
+        switch (judge_fd(READ, 0, fd, #name)) { \
+        case FAILED: return -1; \
+        case HALF: return original halved_arguments; \
+        default: return original arguments; \
+        } \
     }
-READING(read, (int fd, void *to, size_t count), fd, (fd, to, count), (fd, to, half(count)), int, void *, size_t)
-READING(pread, (int fd, void *to, size_t count, off_t at), fd, (fd, to, count, at), (fd, to, half(count), at), int, void *,
-        size_t, off_t)
-READING(pread64, (int fd, void *to, size_t count, off64_t at), fd, (fd, to, count, at), (fd, to, half(count), at), int,
-        void *, size_t, off64_t)
-READING(sendfile, (int to, int from, off_t *at, size_t count), from, (to, from, at, count), (to, from, at, half(count)),
-        int, int, off_t *, size_t)
-READING(sendfile64, (int to, int from, off64_t *at, size_t count), from, (to, from, at, count),
-        (to, from, at, half(count)), int, int, off64_t *, size_t)
+READING(read, (int fd, void *to, size_t count), fd, (fd, to, count), (fd, to, half(count)))
+READING(pread, (int fd, void *to, size_t count, off_t at), fd, (fd, to, count, at), (fd, to, half(count), at))
+ALSO(pread, pread64)
+READING(sendfile, (int to, int from, off_t *at, size_t count), from, (to, from, at, count),
+        (to, from, at, half(count)))
+ALSO(sendfile, sendfile64)
 READING(copy_file_range, (int from, off64_t *at, int to, off64_t *to_at, size_t count, unsigned flags), from,
-        (from, at, to, to_at, count, flags), (from, at, to, to_at, half(count), flags), int, off64_t *, int, off64_t *,
-        size_t, unsigned)
+    (from, at, to, to_at, count, flags), (from, at, to, to_at, half(count), flags))
 
-#define WRITING(name, parameters, arguments, halved_arguments, ...)       \
-    ssize_t name parameters                                               \
-    {                                                                     \
-        NEXT(name, ssize_t, __VA_ARGS__);                                 \
-        switch (judge_fd(WRITE, 1, fd, #name)) {                          \
-        case FAILED: return -1;                                           \
-        case HALF: return halved(original halved_arguments);              \
-        default: return original arguments;                               \
-        }                                                                 \
+#define WRITING(name, parameters, arguments, halved_arguments) \
+    ssize_t name parameters \
+    { \
+        NEXT(name); \
+        switch (judge_fd(WRITE, 1, fd, #name)) { \
+        case FAILED: return -1; \
+        case HALF: return halved(original halved_arguments); \
+        default: return original arguments; \
+        } \
     }
-WRITING(write, (int fd, const void *from, size_t count), (fd, from, count), (fd, from, half(count)), int, const void *,
-        size_t)
-WRITING(pwrite, (int fd, const void *from, size_t count, off_t at), (fd, from, count, at), (fd, from, half(count), at),
-        int, const void *, size_t, off_t)
-WRITING(pwrite64, (int fd, const void *from, size_t count, off64_t at), (fd, from, count, at),
-        (fd, from, half(count), at), int, const void *, size_t, off64_t)
-WRITING(writev, (int fd, const struct iovec *parts, int count), (fd, parts, count), (fd, parts, (int)half(count)), int,
-        const struct iovec *, int)
+WRITING(write, (int fd, const void *from, size_t count), (fd, from, count), (fd, from, half(count)))
+WRITING(pwrite, (int fd, const void *from, size_t count, off_t at), (fd, from, count, at),
+        (fd, from, half(count), at))
+ALSO(pwrite, pwrite64)
+WRITING(writev, (int fd, const struct iovec *parts, int count), (fd, parts, count), (fd, parts, (int)half(count)))
 
 /* numpy writes arrays through streams of the C library, whose own calls nothing can stand before */
 size_t fwrite(const void *from, size_t size, size_t count, FILE *stream)
 {
-    NEXT(fwrite, size_t, const void *, size_t, size_t, FILE *);
+    NEXT(fwrite);
     if (stream == diary)
         return original(from, size, count, stream);
     switch (judge_fd(WRITE, 1, fileno(stream), "fwrite")) {
@@ -256,103 +247,87 @@ size_t fwrite(const void *from, size_t size, size_t count, FILE *stream)
 
 size_t fread(void *to, size_t size, size_t count, FILE *stream)
 {
-    NEXT(fread, size_t, void *, size_t, size_t, FILE *);
+    NEXT(fread);
     return judge_fd(READ, 0, fileno(stream), "fread") == GO_ON ? original(to, size, count, stream) : 0;
 }
 
 /* Calls that succeed with 0 */
-#define CALL(name, parameters, verdict, arguments, ...)     \
-    int name parameters                                     \
-    {                                                       \
-        NEXT(name, int, __VA_ARGS__);                       \
-        if (verdict == FAILED)                              \
-            return -1;                                      \
-        return original arguments;                          \
+#define CALL(name, parameters, verdict, arguments) \
+    int name parameters \
+    { \
+        NEXT(name); \
+        if (verdict == FAILED) \
+            return -1; \
+        return original arguments; \
     }
-CALL(rename, (const char *from, const char *to), judge_at(RENAME, 1, AT_FDCWD, to, "rename"), (from, to), const char *,
-     const char *)
-CALL(renameat, (int from_in, const char *from, int to_in, const char *to), judge_at(RENAME, 1, to_in, to, "renameat"),
-     (from_in, from, to_in, to), int, const char *, int, const char *)
-CALL(renameat2, (int from_in, const char *from, int to_in, const char *to, unsigned flags),
-     judge_at(RENAME, 1, to_in, to, "renameat2"), (from_in, from, to_in, to, flags), int, const char *, int, const char *,
-     unsigned)
-CALL(unlink, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "unlink"), (path), const char *)
-CALL(unlinkat, (int in, const char *path, int flags), judge_at(REMOVE, 1, in, path, "unlinkat"), (in, path, flags), int,
-     const char *, int)
-CALL(rmdir, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "rmdir"), (path), const char *)
-CALL(mkdir, (const char *path, mode_t mode), judge_at(MAKE, 1, AT_FDCWD, path, "mkdir"), (path, mode), const char *,
-     mode_t)
-CALL(mkdirat, (int in, const char *path, mode_t mode), judge_at(MAKE, 1, in, path, "mkdirat"), (in, path, mode), int,
-     const char *, mode_t)
-CALL(flock, (int fd, int operation), operation &LOCK_UN ? GO_ON : judge_fd(LOCK, 0, fd, "flock"), (fd, operation), int,
-     int)
-CALL(ftruncate, (int fd, off_t length), judge_fd(ALLOCATE, 1, fd, "ftruncate"), (fd, length), int, off_t)
-CALL(ftruncate64, (int fd, off64_t length), judge_fd(ALLOCATE, 1, fd, "ftruncate"), (fd, length), int, off64_t)
-CALL(fallocate, (int fd, int mode, off_t at, off_t length), judge_fd(ALLOCATE, 1, fd, "fallocate"),
-     (fd, mode, at, length), int, int, off_t, off_t)
-CALL(fallocate64, (int fd, int mode, off64_t at, off64_t length), judge_fd(ALLOCATE, 1, fd, "fallocate"),
-     (fd, mode, at, length), int, int, off64_t, off64_t)
-CALL(stat, (const char *restrict path, struct stat *restrict to), judge_at(STATUS, 0, AT_FDCWD, path, "stat"), (path, to),
-     const char *restrict, struct stat *restrict)
-CALL(stat64, (const char *restrict path, struct stat64 *restrict to), judge_at(STATUS, 0, AT_FDCWD, path, "stat"),
-     (path, to), const char *restrict, struct stat64 *restrict)
-CALL(lstat, (const char *restrict path, struct stat *restrict to), judge_at(STATUS, 0, AT_FDCWD, path, "lstat"),
-     (path, to), const char *restrict, struct stat *restrict)
-CALL(lstat64, (const char *restrict path, struct stat64 *restrict to), judge_at(STATUS, 0, AT_FDCWD, path, "lstat"),
-     (path, to), const char *restrict, struct stat64 *restrict)
-CALL(fstatat, (int in, const char *restrict path, struct stat *restrict to, int flags),
-     judge_at(STATUS, 0, in, path, "fstatat"), (in, path, to, flags), int, const char *restrict, struct stat *restrict,
-     int)
-CALL(fstatat64, (int in, const char *restrict path, struct stat64 *restrict to, int flags),
-     judge_at(STATUS, 0, in, path, "fstatat"), (in, path, to, flags), int, const char *restrict,
-     struct stat64 *restrict, int)
+CALL(rename, (const char *from, const char *to), judge_at(RENAME, 1, AT_FDCWD, to, "rename"), (from, to))
+CALL(renameat, (int from_in, const char *from, int to_in, const char *to), judge_at(RENAME, 1, to_in, to,
+    "renameat"), (from_in, from, to_in, to))
+CALL(renameat2, (int from_in, const char *from, int to_in, const char *to, unsigned flags), judge_at(RENAME,
+    1, to_in, to, "renameat2"), (from_in, from, to_in, to, flags))
+CALL(unlink, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "unlink"), (path))
+CALL(unlinkat, (int in, const char *path, int flags), judge_at(REMOVE, 1, in, path, "unlinkat"), (in, path, flags))
+CALL(rmdir, (const char *path), judge_at(REMOVE, 1, AT_FDCWD, path, "rmdir"), (path))
+CALL(mkdir, (const char *path, mode_t mode), judge_at(MAKE, 1, AT_FDCWD, path, "mkdir"), (path, mode))
+CALL(mkdirat, (int in, const char *path, mode_t mode), judge_at(MAKE, 1, in, path, "mkdirat"), (in, path, mode))
+CALL(flock, (int fd, int operation), operation &LOCK_UN ? GO_ON : judge_fd(LOCK, 0, fd, "flock"), (fd, operation))
+CALL(ftruncate, (int fd, off_t length), judge_fd(ALLOCATE, 1, fd, "ftruncate"), (fd, length))
+ALSO(ftruncate, ftruncate64)
+CALL(fallocate, (int fd, int mode, off_t at, off_t length), judge_fd(ALLOCATE, 1, fd, "fallocate"), (fd,
+    mode, at, length))
+ALSO(fallocate, fallocate64)
+CALL(stat, (const char *restrict path, struct stat *restrict to), judge_at(STATUS, 0, AT_FDCWD, path,
+    "stat"), (path, to))
+ALSO(stat, stat64)
+CALL(lstat, (const char *restrict path, struct stat *restrict to), judge_at(STATUS, 0, AT_FDCWD, path,
+    "lstat"), (path, to))
+ALSO(lstat, lstat64)
+CALL(fstatat, (int in, const char *restrict path, struct stat *restrict to, int flags), judge_at(STATUS, 0,
+    in, path, "fstatat"), (in, path, to, flags))
+ALSO(fstatat, fstatat64)
 
 /* No power fails here: a flush is counted, but not done, which takes most of the time off a trial */
-#define FLUSHING(name)                                                            \
-    int name(int fd)                                                              \
-    {                                                                             \
-        NEXT(name, int, int);                                                     \
-        if (!folder[0])                                                           \
-            return original(fd);                                                  \
-        return judge_fd(SYNC, 0, fd, #name) == FAILED ? -1 : 0;                   \
+#define FLUSHING(name) \
+    int name(int fd) \
+    { \
+        NEXT(name); \
+        if (!folder[0]) \
+            return original(fd); \
+        return judge_fd(SYNC, 0, fd, #name) == FAILED ? -1 : 0; \
     }
 FLUSHING(fsync)
 FLUSHING(fdatasync)
 
-/* These return the error itself */
-#define ALLOCATING(name, type)                                              \
-    int name(int fd, type at, type length)                                  \
-    {                                                                       \
-        NEXT(name, int, int, type, type);                                   \
-        return judge_fd(ALLOCATE, 1, fd, #name) == FAILED ? error_number : original(fd, at, length); \
-    }
-ALLOCATING(posix_fallocate, off_t)
-ALLOCATING(posix_fallocate64, off64_t)
+/* This returns the error itself */
+int posix_fallocate(int fd, off_t at, off_t length)
+{
+    NEXT(posix_fallocate);
+    return judge_fd(ALLOCATE, 1, fd, "posix_fallocate") == FAILED ? error_number : original(fd, at, length);
+}
+ALSO(posix_fallocate, posix_fallocate64)
 
-#define CONTROL(name)                                                                                    \
-    int name(int fd, int command, ...)                                                                   \
-    {                                                                                                    \
-        NEXT(name, int, int, int, ...);                                                                  \
-        va_list rest;                                                                                    \
-        va_start(rest, command);                                                                         \
-        void *argument = va_arg(rest, void *);                                                           \
-        va_end(rest);                                                                                    \
-        int locks = command == F_SETLK || command == F_SETLKW;                                           \
-        if (locks && ((struct flock *)argument)->l_type != F_UNLCK && judge_fd(LOCK, 0, fd, #name) == FAILED) \
-            return -1;                                                                                   \
-        return original(fd, command, argument);                                                          \
-    }
-CONTROL(fcntl)
-CONTROL(fcntl64)
+int fcntl(int fd, int command, ...)
+{
+    NEXT(fcntl);
+    va_list rest;
+    va_start(rest, command);
+    void *argument = va_arg(rest, void *);
+    va_end(rest);
+    int locks = command == F_SETLK || command == F_SETLKW;
+    if (locks && ((struct flock *)argument)->l_type != F_UNLCK && judge_fd(LOCK, 0, fd, "fcntl") == FAILED)
+        return -1;
+    return original(fd, command, argument);
+}
+ALSO(fcntl, fcntl64)
 
 DIR *opendir(const char *path)
 {
-    NEXT(opendir, DIR *, const char *);
+    NEXT(opendir);
     return judge_at(LIST, 0, AT_FDCWD, path, "opendir") == FAILED ? NULL : original(path);
 }
 
 DIR *fdopendir(int fd)
 {
-    NEXT(fdopendir, DIR *, int);
+    NEXT(fdopendir);
     return judge_fd(LIST, 0, fd, "fdopendir") == FAILED ? NULL : original(fd);
 }

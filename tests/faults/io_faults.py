@@ -40,18 +40,9 @@ type Action = Literal["count", "fail once", "fail from then on", "cut short", "k
 
 
 class Fault(msgspec.Struct, frozen=True):
-    """What becomes of the `nth` call of a kind.
+    """The fate of the `nth` call of a kind, counted from 1, on files of the trial's folder.
 
-    Attributes
-    ----------
-    kind : str
-        One of `KINDS`.
-    action : str
-        One of `ACTIONS`. A write that kills has written half of its bytes; any other call that kills has done nothing.
-    nth : int
-        Counted from 1, among the calls of this kind on files of the trial's folder.
-    error : str
-        Name of the error number.
+    A write that kills has written half of its bytes; any other call that kills has done nothing.
     """
 
     kind: str = "open"
@@ -65,21 +56,7 @@ class Fault(msgspec.Struct, frozen=True):
 
 
 class Trial(msgspec.Struct, frozen=True):
-    """What is tried.
-
-    Attributes
-    ----------
-    words : list of str
-        The command.
-    folder : str
-        The files in it count; no other may be changed.
-    fault : Fault
-        What happens to one of the calls.
-    diary : str, optional
-        File in which all calls are listed.
-    limit_s : float
-        The command is killed after this time.
-    """
+    """A command that is tried on the files of a folder, all whose calls are listed in the file `diary`."""
 
     words: list[str]
     folder: str
@@ -100,18 +77,13 @@ class Ended(msgspec.Struct, frozen=True):
 
 # What takes long and touches no file. A trial takes its result from the commands that were run first, as long as the
 # arguments are the same to the byte.
+_CALIBRATION, _PAGES = "faintfield.pipelines.calibration", "faintfield.pipelines.pages"
 _COMPUTATIONS = (
     "faintfield.calib.detection.detect_boards",
-    "faintfield.pipelines.calibration.geometry.calibrate_geometry",
-    "faintfield.pipelines.calibration.geometry.stage_report",
-    "faintfield.pipelines.calibration.geometry.transfer_sigma_at",
-    "faintfield.pipelines.calibration.noise.calibrate",
-    "faintfield.pipelines.pages.emva_page.emva_page",
-    "faintfield.pipelines.pages.geometry_page.geometry_page",
-    "faintfield.pipelines.pages.noise_page.draw_page",
-    "faintfield.pipelines.pages.geometry_page.node_drawing",
-    "faintfield.pipelines.pages.geometry_page.sigma_maps",
     "faintfield.rig.simulation.lab.lab_experiment",
+    *(f"{_CALIBRATION}.geometry.{name}" for name in ("calibrate_geometry", "stage_report", "transfer_sigma_at")),
+    *(f"{_CALIBRATION}.noise.calibrate", f"{_PAGES}.emva_page.emva_page", f"{_PAGES}.noise_page.draw_page"),
+    *(f"{_PAGES}.geometry_page.{name}" for name in ("geometry_page", "node_drawing", "sigma_maps")),
 )
 
 
@@ -133,7 +105,6 @@ class Faults:
         self._process = process
 
     def run(self, trial: Trial) -> Ended:
-        """Run a command in a process of its own, and return how it ended."""
         to, answers = self._process.stdin, self._process.stdout
         assert to is not None
         assert answers is not None

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from unittest import mock
 
 import cv2
 import msgspec
@@ -21,14 +21,9 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.sets.ground_truth import read_truth
 from faintfield.pipelines.formats.toml_files import write_toml
 from faintfield.rig.cameras.settings import SimulatedSettings
-from faintfield.rig.capture.loop import Capture
-from faintfield.rig.capture.survey import survey
-from faintfield.rig.devices import open_rig
-from faintfield.rig.session.resume import open_session
-from faintfield.rig.session.session import FrozenPlan
 from faintfield.rig.simulation.experiment import SimulatedExperiment, paper_experiment
 from tests.calib.noise.darkroom import specimen
-from tests.faults.capturing import SMALL_RIG, Unattended
+from tests.faults.capturing import SMALL_RIG, Unattended, capture_small
 from tests.pipelines.noise_sets import take_set, write_frames
 from tests.pipelines.sessions import captured, rig_toml
 from tests.simulated_boards import simulate_board_set
@@ -40,11 +35,7 @@ _SMALL_RIG = msgspec.structs.replace(SMALL_RIG, camera=SimulatedSettings(size_px
 
 @dataclass(frozen=True)
 class Call:
-    """A command that reads a case's files, in words of which `IN` and `OUT` stand for folders.
-
-    `may_change` are patterns of the files that it may change, in the folder that holds IN and OUT; `then` is a command
-    that must end well after it; `copies` are patterns of the files that it copies as they are.
-    """
+    """A command on a case's files in `IN`: patterns of files it may change or copies, and what must end well after."""
 
     words: str
     may_change: tuple[str, ...] = ("OUT", "OUT/*")
@@ -182,21 +173,12 @@ def _sealed_session(folder: Path) -> None:
     _done("capture", folder / "rig.toml", folder / "session", "--yes")
 
 
-class _Leaving(Unattended):
-    shown = 0
-
-    def show_frame(self, *_: Any) -> None:
-        self.shown += 1
-        if self.shown == 10:
-            raise LookupError
-
-
 def _open_session(folder: Path) -> None:
-    """Capture a session, and let it be as it was before its last frames."""
+    """Capture ten frames of a session, and leave it."""
     write_toml(folder / "rig.toml", _SMALL_RIG)
-    frozen = FrozenPlan(survey(open_rig(_SMALL_RIG), _SMALL_RIG).plan, _SMALL_RIG)
-    with suppress(LookupError), open_session(folder / "session", frozen) as session:
-        Capture(session, open_rig(_SMALL_RIG, session.journal), _Leaving(), lambda _: None).run()
+    leave = mock.patch.object(Unattended, "show_frame", side_effect=[*(None,) * 9, LookupError])
+    with leave, suppress(LookupError):
+        capture_small(folder / "session", _SMALL_RIG)
 
 
 def _whole_session(folder: Path) -> None:
@@ -222,13 +204,8 @@ _IN_SESSION = ("IN/session", "IN/session/*")
 _RECONSTRUCT = "reconstruct IN --out OUT --depth-mm 500 --passes 2 --penalty-weight 0.1"
 _BACKPROJECT = "reconstruct IN --out OUT --depth-mm 500 --method backprojection"
 
-_READ_SET = (
-    Call(_RECONSTRUCT),
-    Call(_BACKPROJECT),
-    Call("darken IN OUT"),
-    Call("export colmap IN OUT"),
-    Call("export mrcal IN OUT"),
-)
+_OTHER_READERS = ("darken IN OUT", "export colmap IN OUT", "export mrcal IN OUT")
+_READ_SET = tuple(Call(words) for words in (_RECONSTRUCT, _BACKPROJECT, *_OTHER_READERS))
 _RESUME = Call("capture IN/rig.toml IN/session --yes", _IN_SESSION, then="verify IN/session")
 
 _JOURNAL = "session/journal.sqlite"

@@ -27,10 +27,10 @@ import cv2
 
 from faintfield.pipelines import registry
 from faintfield.pipelines.cli import run
-from faintfield.recon import compile_kernels
+from faintfield.recon import compile_kernels, threads
 from tests.faults import contained, mutation_operations
 from tests.faults.mutation_kinds import KINDS
-from tests.faults.mutation_text import VICTIM
+from tests.faults.mutation_operations import VICTIM
 
 # Threads would not survive the fork, and their stacks count as memory; libraries read these as they are loaded.
 ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
@@ -60,25 +60,12 @@ class Case:
     edits: tuple[tuple[str, str, list[Any]], ...]
 
     def __str__(self) -> str:
-        done = "; ".join(f"{file}: {name} {_short(arguments)}" for file, name, arguments in self.edits)
-        return f"{self.call}\n    {done}"
-
-
-def _short(arguments: Sequence[Any]) -> str:
-    words = json.dumps(arguments)
-    return words if len(words) < 300 else f"{words[:200]} … {words[-50:]}"
+        edits = "; ".join(f"{file}: {name} {json.dumps(arguments):.300}" for file, name, arguments in self.edits)
+        return f"{self.call}\n    {edits}"
 
 
 class Bench:
-    """Makes the valid files of a kind, copies and mutates them, and runs the commands.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the valid files are kept and the cases run.
-    kind : str
-        Name of the kind.
-    """
+    """The valid files of a kind, kept in a folder, where they are copied and mutated and the commands run."""
 
     def __init__(self, folder: Path, kind: str) -> None:
         self.ended: contained.Ended
@@ -155,6 +142,8 @@ def warm_up() -> None:
     for module in ("matplotlib.figure", "matplotlib.backends.backend_agg", "skimage.filters", "mrcal", "zarr", "rawpy"):
         import_module(module)
     compile_kernels()
+    threads._pool(1).shutdown()  # noqa: SLF001 - the search for surfaces takes two threads however few numba may take
+    threads._pool.cache_clear()  # noqa: SLF001
     if len(os.listdir("/proc/self/task")) > 1:
         raise RuntimeError("this process has threads, which would not survive a fork")
 

@@ -1,10 +1,8 @@
-"""Faults of stages, for tests: each makes one thing go wrong on a bench, at once.
-
-A fault strikes once and its effect remains: a byte is lost, a cable is unplugged, an axis is stuck.
-"""
+"""Faults of stages: each strikes a bench once and its effect remains: a byte is lost, a cable is unplugged."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from operator import methodcaller
 from typing import Literal
 
 from faintfield.rig.simulation.controller.bench import Bench
@@ -82,22 +80,10 @@ def _lose_ok(bench: Bench) -> None:
     _filter_once(bench.wire.filters_to_host, lambda data: b"", lambda data: data.strip() == b"ok")
 
 
-def _mute(bench: Bench) -> None:
-    bench.wire.filters_to_host.append(lambda data: b"")
-
-
-def _deaf(bench: Bench) -> None:
-    bench.wire.filters_to_controller.append(lambda data: b"")
-
-
 def _babble(bench: Bench) -> None:
     """Send nonsense a hundred times a second for a minute."""
     for line in range(6000):
         bench.clock.after(0.01 * line, lambda: bench.firmware.say("<Jog|MPos:0.0"))
-
-
-def _answer_late(bench: Bench) -> None:
-    bench.wire.hold_up(1.0)
 
 
 def _restart_unseen(bench: Bench) -> None:
@@ -105,15 +91,12 @@ def _restart_unseen(bench: Bench) -> None:
     _silence(bench, bench.wire.filters_to_host, bench.firmware.boot_s + 0.1)
 
 
-def _unplug_and_return(bench: Bench) -> None:
-    bench.unplug()
-    bench.clock.after(0.3, bench.plug)
+def _unplug_for(duration_s: float) -> Callable[[Bench], None]:
+    def strike(bench: Bench) -> None:
+        bench.unplug()
+        bench.clock.after(duration_s, bench.plug)
 
-
-def _vanish(bench: Bench) -> None:
-    """Unplug for three seconds, as when USB lists a port anew."""
-    bench.unplug()
-    bench.clock.after(3.0, bench.plug)
+    return strike
 
 
 def _keep_host_busy(bench: Bench) -> None:
@@ -148,14 +131,6 @@ def _lose_steps(axis: int, by_mm: float) -> Callable[[Bench], None]:
     return strike
 
 
-def _slow_homing(bench: Bench) -> None:
-    bench.firmware.homing_slowdown = 40.0
-
-
-def _never_end(bench: Bench) -> None:
-    bench.firmware.mechanics.endless = True
-
-
 def _push_by_pendant(bench: Bench) -> None:
     """Move the stage as if by a hand control."""
     x, y = bench.firmware.mechanics.commanded_mm()
@@ -173,10 +148,6 @@ def _on[Kind: SimulatedGrbl | SimulatedMarlin](
         act(bench.firmware)
 
     return strike
-
-
-def _alarm(code: int) -> Callable[[Bench], None]:
-    return _on(SimulatedGrbl, lambda firmware: firmware.alarm(code))
 
 
 def _early_idle(bench: Bench) -> None:
@@ -209,51 +180,48 @@ _COMMON = (
     Fault("ok lost", "wire", _lose_ok),
     Fault("ok too many", "wire", lambda bench: bench.firmware.say("ok")),
     Fault("noise", "wire", lambda bench: bench.wire.to_host(bytes(range(128, 256)) + b"\x00ok\x00\n")),
-    Fault("controller mute", "wire", _mute),
-    Fault("controller deaf", "wire", _deaf),
+    Fault("controller mute", "wire", lambda bench: bench.wire.filters_to_host.append(lambda data: b"")),
+    Fault("controller deaf", "wire", lambda bench: bench.wire.filters_to_controller.append(lambda data: b"")),
     Fault("silence for a moment", "wire", lambda bench: _silence(bench, bench.wire.filters_to_host, 0.5)),
-    Fault("answers late", "wire", _answer_late),
+    Fault("answers late", "wire", lambda bench: bench.wire.hold_up(1.0)),
     Fault("babble", "wire", _babble),
     Fault("every line damaged", "wire", _damage_every_line),
     Fault("unplugged", "wire", Bench.unplug),
-    Fault("unplugged and back", "wire", _unplug_and_return),
-    Fault("port gone for three seconds", "wire", _vanish),
+    Fault("unplugged and back", "wire", _unplug_for(0.3)),
+    Fault("port gone for three seconds", "wire", _unplug_for(3.0)),
     Fault("computer busy", "wire", _keep_host_busy),
     Fault("restart", "controller", lambda bench: bench.firmware.restart()),
     Fault("restart unseen", "controller", _restart_unseen),
-    Fault("busy for ever", "controller", _never_end),
-    Fault("slow homing", "controller", _slow_homing),
+    Fault("busy for ever", "controller", lambda bench: setattr(bench.firmware.mechanics, "endless", True)),
+    Fault("slow homing", "controller", lambda bench: setattr(bench.firmware, "homing_slowdown", 40.0)),
     Fault("moved by pendant", "controller", _push_by_pendant),
     Fault("axis stuck", "mechanics", _stick),
     Fault("axis stuck for a moment", "mechanics", _stick_briefly),
     Fault("steps lost towards the switch", "mechanics", _lose_steps(0, 0.8)),
     Fault("steps lost the other way", "mechanics", _lose_steps(1, -0.8)),
 )
+
+
+def _of[Kind: SimulatedGrbl | SimulatedMarlin](name: str, kind: type[Kind], act: Callable[[Kind], None]) -> Fault:
+    return Fault(name, "controller", _on(kind, act), kind)
+
+
 _GRBL = (
-    *(Fault(f"alarm {code}", "controller", _alarm(code), SimulatedGrbl) for code in range(1, 10)),
-    Fault("hold button", "controller", _on(SimulatedGrbl, SimulatedGrbl.pause), SimulatedGrbl),
-    Fault("door open", "controller", _on(SimulatedGrbl, lambda firmware: firmware.open_door()), SimulatedGrbl),
-    Fault("idle told too early", "wire", _early_idle, SimulatedGrbl),
-    Fault("settings lost", "controller", _on(SimulatedGrbl, _lose_settings), SimulatedGrbl),
-)
-_HAL = (
-    Fault(
-        "emergency stop", "controller", _on(SimulatedGrblHal, SimulatedGrblHal.press_emergency_stop), SimulatedGrblHal
-    ),
-    Fault("emergency stop for a moment", "controller", _on(SimulatedGrblHal, _stop_briefly), SimulatedGrblHal),
+    *(_of(f"alarm {code}", SimulatedGrbl, methodcaller("alarm", code)) for code in range(1, 10)),
+    _of("hold button", SimulatedGrbl, SimulatedGrbl.pause),
+    _of("door open", SimulatedGrbl, methodcaller("open_door")),
+    _of("settings lost", SimulatedGrbl, _lose_settings),
+    Fault("idle reported too early", "wire", _early_idle, SimulatedGrbl),
+    _of("emergency stop", SimulatedGrblHal, SimulatedGrblHal.press_emergency_stop),
+    _of("emergency stop for a moment", SimulatedGrblHal, _stop_briefly),
 )
 _MARLIN = (
-    Fault(
-        "killed",
-        "controller",
-        _on(SimulatedMarlin, lambda firmware: firmware.kill("MINTEMP triggered")),
-        SimulatedMarlin,
-    ),
-    Fault("button awaited for a moment", "controller", _on(SimulatedMarlin, _await_button), SimulatedMarlin),
+    _of("killed", SimulatedMarlin, methodcaller("kill", "MINTEMP triggered")),
+    _of("button awaited for a moment", SimulatedMarlin, _await_button),
     Fault("motors released", "mechanics", _on(SimulatedMarlin, SimulatedMarlin.release_motors), SimulatedMarlin),
 )
 
-FAULTS = (*_COMMON, *_GRBL, *_HAL, *_MARLIN)
+FAULTS = (*_COMMON, *_GRBL, *_MARLIN)
 
 
 def faults_of(controller: type[SimulatedFirmware]) -> tuple[Fault, ...]:

@@ -1,9 +1,8 @@
 """A lost cable or camera, a full disk, a read-only folder: a named failure or a recovery; the session stays whole."""
 
-import ctypes
 import resource
 import signal
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Iterable
 from pathlib import Path
 from unittest import mock
 
@@ -27,7 +26,7 @@ from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import DriftSettings, StepSettings
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
-from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, in_process
+from tests.faults.capturing import FRAMES, SMALL_RIG, Unattended, capture_small, drop_rights, in_process
 from tests.faults.laboratory import ON_TARGET_MM, Lab, TruthfulCamera, error_mm
 from tests.patience import HANG_S
 from tests.rig.stages.benches import CONTROLLERS, Controller
@@ -35,8 +34,10 @@ from tests.rig.stages.benches import CONTROLLERS, Controller
 DRIFTING = msgspec.structs.replace(SMALL_RIG, drift=DriftSettings())
 GRBL, _, MARLIN = CONTROLLERS
 
+type Prepare = Callable[[Bench, TruthfulCamera], None]
 
-def test_cause_of_a_failed_recovery_is_recorded(tmp_path: Path) -> None:
+
+def test_cause_of_failed_recovery_is_recorded(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL)
     told: list[str] = []
 
@@ -44,14 +45,11 @@ def test_cause_of_a_failed_recovery_is_recorded(tmp_path: Path) -> None:
         def show_status(self, status: Status) -> None:
             told.extend(status.warnings)
 
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        def vanish() -> None:
-            bench.unplug()
-            bench.clock.after(90.0, bench.plug)
+    def vanish(bench: Bench) -> None:
+        bench.unplug()
+        bench.clock.after(90.0, bench.plug)
 
-        camera.on_exposure = {3: vanish}
-
-    assert lab.run(prepare, Watching()) is None
+    assert lab.run(at_exposures([3], vanish), Watching()) is None
     lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         (failed,) = journal.events("recovery_failed")
@@ -60,6 +58,24 @@ def test_cause_of_a_failed_recovery_is_recorded(tmp_path: Path) -> None:
     assert failed.detail["error"] == "StageLost"
     assert "unplugged" in str(failed.detail["message"])
     assert any("the stage was not recovered: " in warning and "unplugged" in warning for warning in told)
+
+
+def at_exposures(numbers: Iterable[int], strike: Callable[[Bench], None]) -> Prepare:
+    """Return what lets a fault strike when some exposures begin."""
+
+    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
+        camera.on_exposure = dict.fromkeys(numbers, lambda: strike(bench))
+
+    return prepare
+
+
+def slip(bench: Bench, by_mm: float = -3.0) -> None:
+    """Let an axis lose steps."""
+    bench.firmware.mechanics.axes[0].slip_mm += by_mm
+
+
+def fail(bench: Bench) -> None:
+    raise CameraError("the camera failed at an exposure: I/O problem; check its cable")
 
 
 def busy_at_homing(bench: Bench, numbers: Container[int]) -> None:
@@ -76,27 +92,21 @@ def busy_at_homing(bench: Bench, numbers: Container[int]) -> None:
     bench.wire.filters_to_controller.append(count)
 
 
-@pytest.mark.parametrize("controller", CONTROLLERS)
+@pytest.mark.parametrize("controller", [GRBL, MARLIN])
 def test_busy_computer_ends_no_capture(tmp_path: Path, controller: Controller) -> None:
     lab = Lab(tmp_path / "session", controller, DRIFTING)
 
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        camera.on_exposure = {2: lambda: busy_at_homing(bench, (1, 3))}
-
-    assert lab.run(prepare) is None
+    assert lab.run(at_exposures([2], lambda bench: busy_at_homing(bench, (1, 3)))) is None
     lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("suspect")) == 2
         assert all("answers were delayed" in str(event.detail["message"]) for event in journal.events("suspect"))
 
 
-def test_always_busy_computer_ends_a_resumable_capture(tmp_path: Path) -> None:
+def test_always_busy_computer_ends_resumable_capture(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
 
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        camera.on_exposure = {2: lambda: busy_at_homing(bench, range(1, 1000))}
-
-    assert isinstance(lab.run(prepare), CaptureStopped)
+    assert isinstance(lab.run(at_exposures([2], lambda bench: busy_at_homing(bench, range(1, 1000)))), CaptureStopped)
     assert lab.run() is None
     # What was taken before the last check is kept, and stays marked
     assert verify(lab.folder).problems == ()
@@ -110,7 +120,7 @@ def test_homing_begins_a_group(tmp_path: Path) -> None:
         assert isinstance(bench.firmware, SimulatedGrbl)
         bench.firmware.alarm(3)
 
-    assert lab.run(lambda bench, camera: camera.on_exposure.update({5: lambda: alarm(bench)})) is None
+    assert lab.run(at_exposures([5], alarm)) is None
     groups = read_homing_groups(lab.folder)
     # The fifth exposure failed; the stage was homed before the sixth
     assert groups.groups == {intent: 1 if intent < 5 else 2 for intent in range(1, FRAMES + 2) if intent != 5}
@@ -122,10 +132,7 @@ def test_homing_begins_a_group(tmp_path: Path) -> None:
 def test_resumed_session_begins_a_homing_group(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL)
 
-    def fail() -> None:
-        raise CameraError("the camera failed at an exposure: I/O problem; check its cable")
-
-    assert lab.run(lambda bench, camera: camera.on_exposure.update(dict.fromkeys((4, 5, 6), fail))) is not None
+    assert lab.run(at_exposures((4, 5, 6), fail)) is not None
     assert lab.run() is None
     assert set(read_homing_groups(lab.folder).groups.values()) == {1, 2}
 
@@ -133,13 +140,7 @@ def test_resumed_session_begins_a_homing_group(tmp_path: Path) -> None:
 def test_spread_of_the_switches_is_that_of_checks(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", MARLIN, DRIFTING)
 
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        def shift() -> None:
-            bench.firmware.mechanics.axes[0].slip_mm -= 0.2
-
-        camera.on_exposure = {2: shift}
-
-    assert lab.run(prepare) is None
+    assert lab.run(at_exposures([2], lambda bench: slip(bench, -0.2))) is None
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         away_mm = np.array([check.away_mm for check in journal.details("drift_check", DriftCheck)])
         groups = homing_groups(journal)
@@ -155,10 +156,10 @@ def test_frames_without_a_confirming_check_are_suspect(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
 
     def slip_and_stop(bench: Bench) -> None:
-        bench.firmware.mechanics.axes[0].slip_mm -= 3.0
-        fault_later(bench, 5.0, lambda bench: bench.firmware.restart())
+        slip(bench)
+        bench.clock.after(5.0, bench.firmware.restart)
 
-    assert lab.run(lambda bench, camera: camera.on_exposure.update({8: lambda: slip_and_stop(bench)})) is None
+    assert lab.run(at_exposures([8], slip_and_stop)) is None
     verdict = verify(lab.folder)
     # The check after the first step confirms its frames; the next homing was not preceded by a check
     taken = taken_frames(lab.folder)
@@ -192,23 +193,12 @@ def test_check_waits_for_last_frame_of_node(tmp_path: Path) -> None:
     assert verify(lab.folder).suspect == ()
 
 
-def fault_later(bench: Bench, delay_s: float, strike: Callable[[Bench], None]) -> None:
-    """Let a fault strike some time from now."""
-    bench.clock.after(delay_s, lambda: strike(bench))
-
-
-def make_slip(bench: Bench, camera: TruthfulCamera) -> None:
-    """Let an axis lose steps in the second step of the plan."""
-
-    def slip() -> None:
-        bench.firmware.mechanics.axes[0].slip_mm -= 3.0
-
-    camera.on_exposure = {9: slip}
+SLIP = at_exposures([9], slip)  # in the second step of the plan
 
 
 def test_lost_steps_repeat_their_frames(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
-    assert lab.run(make_slip) is None
+    assert lab.run(SLIP) is None
     lab.assert_true_positions()
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         suspects = journal.events("suspect")
@@ -222,13 +212,7 @@ def test_lost_steps_repeat_their_frames(tmp_path: Path) -> None:
 def test_stage_that_keeps_losing_steps_is_given_up(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
 
-    def prepare(bench: Bench, camera: TruthfulCamera) -> None:
-        def slip() -> None:
-            bench.firmware.mechanics.axes[0].slip_mm -= 3.0
-
-        camera.on_exposure = dict.fromkeys(range(2, 100, 6), slip)
-
-    assert isinstance(lab.run(prepare), CaptureStopped)
+    assert isinstance(lab.run(at_exposures(range(2, 100, 6), slip)), CaptureStopped)
     with Journal(lab.folder / "journal.sqlite", read_only=True) as journal:
         assert len(journal.events("suspect")) == 3
     assert lab.run() is None
@@ -245,7 +229,7 @@ class Keeping(Unattended):
 
 def test_frames_kept_despite_lost_steps_stay_suspect(tmp_path: Path) -> None:
     lab = Lab(tmp_path / "session", GRBL, DRIFTING)
-    assert lab.run(make_slip, Keeping()) is None
+    assert lab.run(SLIP, Keeping()) is None
     verdict = verify(lab.folder)
     assert verdict.problems == ()
     assert verdict.suspect == tuple(committed.file for _, committed, _ in taken_frames(lab.folder)[6:12])
@@ -255,10 +239,7 @@ def test_frames_kept_despite_lost_steps_stay_suspect(tmp_path: Path) -> None:
 def test_failing_camera(tmp_path: Path, failures: int) -> None:
     lab = Lab(tmp_path / "session", GRBL)
 
-    def fail() -> None:
-        raise CameraError("the camera failed at an exposure: I/O problem; check its cable")
-
-    failure = lab.run(lambda bench, camera: camera.on_exposure.update(dict.fromkeys(range(4, 4 + failures), fail)))
+    failure = lab.run(at_exposures(range(4, 4 + failures), fail))
     if failures < 3:
         assert failure is None
     else:
@@ -291,13 +272,6 @@ def test_full_disk_then_resume(tmp_path: Path, room_bytes: int) -> None:
     verdict = verify(folder)
     assert verdict.problems == ()
     assert (verdict.present, verdict.sealed) == (FRAMES, True)
-
-
-def drop_rights() -> None:
-    """Give up all privileges, so that permissions hold for the superuser too (capset, Linux)."""
-    header = (ctypes.c_uint32 * 2)(0x20080522, 0)
-    if ctypes.CDLL(None, use_errno=True).capset(header, (ctypes.c_uint32 * 6)()) != 0:
-        raise OSError(ctypes.get_errno(), "capset")
 
 
 def capture_read_only(folder: Path, place: str) -> None:

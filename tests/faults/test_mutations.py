@@ -12,7 +12,7 @@ import pytest
 from faintfield.pipelines.cli import run
 from tests.faults import mutation_operations
 from tests.faults.mutation_kinds import KINDS, in_force
-from tests.faults.mutation_text import VICTIM
+from tests.faults.mutation_operations import VICTIM
 from tests.faults.mutations import ONE_THREAD
 
 _MAX_SECONDS = 3600  # for a machine that does much else
