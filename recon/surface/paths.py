@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from faintfield.recon.numba_tools import compiled
-from faintfield.recon.threads import run_in_threads
+from faintfield.recon.threads import map_in_threads
 
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 
@@ -32,7 +32,7 @@ def sum_over_paths(costs: NDArray[np.float32], one_step: float, any_step: float)
 
     total = np.zeros_like(costs)
     for first in range(0, len(_DIRECTIONS), 2):  # two sums at a time: each is as large as the costs
-        for part in run_in_threads(work, _DIRECTIONS[first : first + 2]):
+        for part in map_in_threads(work, _DIRECTIONS[first : first + 2]):
             total += part
     return total
 

@@ -27,7 +27,7 @@ import cv2
 
 from faintfield.pipelines import registry
 from faintfield.pipelines.cli import run
-from faintfield.recon import compile_kernels, threads
+from faintfield.recon import compile_kernels
 from tests.faults import contained, mutation_operations
 from tests.faults.mutation_kinds import KINDS
 from tests.faults.mutation_operations import VICTIM
@@ -142,8 +142,6 @@ def warm_up() -> None:
     for module in ("matplotlib.figure", "matplotlib.backends.backend_agg", "skimage.filters", "mrcal", "zarr", "rawpy"):
         import_module(module)
     compile_kernels()
-    threads._pool(1).shutdown()  # noqa: SLF001 - the search for surfaces takes two threads however few numba may take
-    threads._pool.cache_clear()  # noqa: SLF001
     if len(os.listdir("/proc/self/task")) > 1:
         raise RuntimeError("this process has threads, which would not survive a fork")
 

@@ -48,7 +48,7 @@ class Case:
 
 @st.composite
 def cases(draw: st.DrawFn, max_rows: int = 19, max_columns: int = 71) -> Case:
-    """Odd sizes, near and far planes, turned and displaced cameras that see some of the plane, mosaics, masks."""
+    """Draw odd sizes, near and far planes, turned and displaced cameras that see some of the plane, mosaics, masks."""
     generator = np.random.default_rng(draw(st.integers(0, 2**32 - 1), label="seed"))
     rows, columns = draw(st.tuples(st.integers(2, max_rows), st.integers(2, max_columns)), label="detector")
     views = draw(st.integers(1, 4), label="views")
@@ -56,10 +56,8 @@ def cases(draw: st.DrawFn, max_rows: int = 19, max_columns: int = 71) -> Case:
     turn_rad = draw(st.sampled_from([0.0, 0.02, 0.4]), label="turn_rad")
     tilt_rad = draw(st.sampled_from([0.0, 0.5]), label="tilt_rad")
     mosaic = draw(st.booleans(), label="mosaic")
-    axis = (
-        2 * (rows // 4),
-        2 * (columns // 4),
-    )  # the pixel, on the mosaic's first phase, that looks at the plane's centre
+    # The pixel, on the mosaic's first phase, that looks at the plane's centre
+    axis = (2 * (rows // 4), 2 * (columns // 4))
     lens = Lens((columns, rows), 90.0, 92.0, axis[1], axis[0], draw(st.sampled_from(DISTORTIONS)))
     rays = mosaic_rays(lens) if mosaic else lens.rays()[np.newaxis]
     shape = draw(st.tuples(st.integers(2, 11), st.integers(2, 45)), label="plane")
@@ -82,6 +80,6 @@ def cases(draw: st.DrawFn, max_rows: int = 19, max_columns: int = 71) -> Case:
 
 
 def mosaic_rays(lens: Lens) -> NDArray[np.float32]:
-    """The rays (lattice, row, column, 2) of the four phases of a mosaic, cut to a common size."""
+    """Return the rays (lattice, row, column, 2) of the four phases of a mosaic, cut to a common size."""
     rows, columns = lens.size_px[1] // 2, lens.size_px[0] // 2
     return np.stack([lens.rays(first, (2, 2))[:rows, :columns] for first in MOSAIC_PHASES])

@@ -3,7 +3,7 @@
 Nothing of the code under test is used.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,30 +17,21 @@ SHAPE, FOCAL_PX, AXIS = (60, 90), 80.0, (43.2, 28.7)  # rows and columns; column
 EDGES_PX = (24.5, 51.5, 12.5, 36.5)
 
 
-@dataclass(frozen=True)
-class Sight:
-    """What pixels (row, column) of a view see.
-
-    Attributes
-    ----------
-    what : int array
-        `NEAR`, `FAR`, or `NEITHER` where the reference view sees no such point.
-    light : array
-        Light of the point, zero for `NEITHER`.
-    """
+class Sight(NamedTuple):
+    """Surface that pixels (row, column) of a view see, and the light of its point; zero for `NEITHER`."""
 
     what: NDArray[np.int_]
     light: NDArray[np.float64]
 
 
 def rays(shift_px: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
-    """The rays (row, column, 2) of pixels, or of points this far beside them."""
+    """Return the rays (row, column, 2) of pixels, or of points this far beside them."""
     column, row = np.meshgrid(np.arange(SHAPE[1]) + shift_px[0], np.arange(SHAPE[0]) + shift_px[1])
     return np.stack([column - AXIS[0], row - AXIS[1]], axis=-1) / FOCAL_PX
 
 
 def cast(rt: NDArray[np.float64], shift_px: tuple[float, float] = (0.0, 0.0)) -> Sight:
-    """What each pixel of a view of pose (R, t) sees."""
+    """Return what each pixel of a view of pose (R, t) sees."""
     back = Rotation.from_rotvec(rt[:3]).as_matrix().T
     centre = -back @ rt[3:]
     directions = np.concatenate([rays(shift_px), np.ones((*SHAPE, 1))], axis=-1) @ back.T
@@ -53,32 +44,32 @@ def cast(rt: NDArray[np.float64], shift_px: tuple[float, float] = (0.0, 0.0)) ->
 
 
 def light(what: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Light of points (…, 3), linear in their direction: bilinear interpolation between samples keeps it."""
+    """Return the light of points (…, 3), linear in their direction: bilinear interpolation between samples keeps it."""
     x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
     return np.asarray(9 + 3 * x + 2 * y if what == NEAR else 3 + x - 2 * y)
 
 
 def picture() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The light and the 1/depth of each sample (row, column) of the reference view."""
+    """Return the light and the 1/depth of each sample (row, column) of the reference view."""
     sight = cast(np.zeros(6))
     return sight.light, np.where(sight.what == NEAR, 1 / NEAR_MM, 1 / FAR_MM)
 
 
 def _pixel(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Column and row at which the reference camera sees points."""
+    """Return the column and row at which the reference camera sees points."""
     column = FOCAL_PX * points[..., 0] / points[..., 2] + AXIS[0]
     return column, FOCAL_PX * points[..., 1] / points[..., 2] + AXIS[1]
 
 
 def _in_square(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether points are of the square, or hidden by it."""
+    """Return whether points are of the square, or hidden by it."""
     column, row = _pixel(points)
     left, right, top, bottom = EDGES_PX
     return (column > left) & (column < right) & (row > top) & (row < bottom)
 
 
 def _in_picture(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether the reference view has samples around points."""
+    """Return whether the reference view has samples around points."""
     column, row = _pixel(points)
     tiny = 1e-9
     return (column >= -tiny) & (column <= SHAPE[1] - 1 + tiny) & (row >= -tiny) & (row <= SHAPE[0] - 1 + tiny)

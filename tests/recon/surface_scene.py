@@ -29,27 +29,26 @@ FAR, NEAR, UNMOVED = 1 / 600, 1 / 500, 1 / 560
 
 # First and past-the-last column and row of the square in the reference view
 EDGES_PX = (17.5, 57.5, 12.5, 46.5)
-
 READ_VARIANCE_E2 = 2.0
 
 
 def matrices() -> NDArray[np.float64]:
-    """From (x, y, 1, 1/depth) to the ray of each view (view, 3, 4)."""
-    found = np.zeros((len(NODES), 3, 4))
-    found[:, :3, :3] = np.eye(3)
-    found[:, :2, 3], found[:, :2, 2] = -CENTRES_MM, UNMOVED * CENTRES_MM
-    return found
+    """Return matrices from (x, y, 1, 1/depth) to the ray of each view (view, 3, 4)."""
+    result = np.zeros((len(NODES), 3, 4))
+    result[:, :3, :3] = np.eye(3)
+    result[:, :2, 3], result[:, :2, 2] = -CENTRES_MM, UNMOVED * CENTRES_MM
+    return result
 
 
 def inverse_depth() -> NDArray[np.float64]:
-    """1/depth of each sample of the reference view."""
+    """Return the 1/depth of each sample of the reference view."""
     row, column = np.indices(SHAPE, float)
     return np.where(_in_square(column, row), NEAR, FAR)
 
 
 @cache
 def expected_light(level_e: float) -> NDArray[np.float64]:
-    """Light (view, row, column) of a mean of about `level_e`, without noise."""
+    """Return light (view, row, column) of a mean of about `level_e`, without noise."""
     row, column = np.indices(SHAPE, float)
     views = []
     for right, down in FOCAL_PX * CENTRES_MM:
@@ -59,7 +58,7 @@ def expected_light(level_e: float) -> NDArray[np.float64]:
 
 
 def drawn_views(level_e: float, seed: int = 5) -> PinholeViews:
-    """The views with Poisson light and read noise."""
+    """Return the views with Poisson light and read noise."""
     generator = np.random.default_rng(seed)
     light = expected_light(level_e)
     counted = generator.poisson(light) + generator.normal(0, READ_VARIANCE_E2**0.5, light.shape)
@@ -67,25 +66,25 @@ def drawn_views(level_e: float, seed: int = 5) -> PinholeViews:
 
 
 def views_of(light: NDArray[np.floating]) -> PinholeViews:
-    """Views that show the given light (view, row, column)."""
+    """Return views that show the given light (view, row, column)."""
     return PinholeViews(light.astype(np.float32), READ_VARIANCE_E2, matrices(), (FOCAL_PX, FOCAL_PX), AXIS, GRID)
 
 
 def away_from_edges(distance: int) -> NDArray[np.bool_]:
-    """Samples farther than this from the outline of the square and from the border of the picture."""
+    """Return samples farther than this from the outline of the square and from the border of the picture."""
     near = inverse_depth() == NEAR
-    found = np.zeros(SHAPE, bool)
+    result = np.zeros(SHAPE, bool)
     inner = np.s_[distance:-distance, distance:-distance]
-    found[inner] = True
+    result[inner] = True
     for down in range(-distance, distance + 1):
         for right in range(-distance, distance + 1):
-            found[inner] &= np.roll(near, (down, right), (0, 1))[inner] == near[inner]
-    return found
+            result[inner] &= np.roll(near, (down, right), (0, 1))[inner] == near[inner]
+    return result
 
 
 @cache
 def _waves(seed: int) -> NDArray[np.float64]:
-    """Noise without finer detail than the pixels can show, between about 0.2 and 1.8, beyond the picture as well."""
+    """Return noise without finer detail than the pixels show, between about 0.2 and 1.8, also beyond the picture."""
     blurred = gaussian_filter(np.random.default_rng(seed).normal(size=(SHAPE[0] + 80, SHAPE[1] + 80)), 1.4)
     return np.asarray(1 + 0.4 * np.clip(blurred / blurred.std(), -2, 2))
 

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from faintfield.recon.metrics import (
@@ -21,55 +19,43 @@ READ_NOISE_E = 12**0.5  # the paper's camera: n_r² = 12, η = 0.5, D = 0.2
 DARK_E = 0.2 * 0.1
 
 
-def test_the_papers_camera_sees_3_84_photons_at_snr_0_16_by_its_linear_formula() -> None:
+def test_linear_formula_gives_the_papers_photons() -> None:
     photons = photons_from_linear_snr(0.16, quantum_efficiency=0.5, read_noise_e=READ_NOISE_E)
     assert photons == pytest.approx(3.84, rel=1e-12)
     assert 0.5 * photons / READ_NOISE_E**2 == pytest.approx(0.16, rel=1e-12)
 
 
-def test_by_moments_it_sees_half_as_many_photons() -> None:
+def test_moments_give_half_as_many_photons() -> None:
     photons = photons_from_moments(0.16, quantum_efficiency=0.5, read_noise_e=READ_NOISE_E)
     mean_e = 0.5 * photons
     assert mean_e**2 + mean_e == pytest.approx(0.16 * 12, rel=1e-12)
     assert photons == pytest.approx(1.9, abs=0.05)
 
 
-def test_the_variance_of_eq_6_adds_light_dark_and_read_noise() -> None:
+def test_variance_adds_light_dark_and_read_noise() -> None:
     camera = {"quantum_efficiency": 0.5, "dark_current_e_per_s": 0.2, "read_noise_e": READ_NOISE_E}
     assert noise_variance_e2(38.4, 0.1, **camera) == pytest.approx(1.92 + 0.02 + 12)
     lit = noise_variance_e2(38.4, 0.1, background_photons_per_s=10.0, **camera)
     assert lit == pytest.approx(1.92 + 0.5 + 0.02 + 12)
 
 
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    snr=st.floats(1e-4, 1e3),
-    dark_e=st.sampled_from([0.0, 0.02, 5.0]),
-    read_noise_e=st.sampled_from([0.5, 3.46, 30.0]),
-)
-def test_the_scale_for_an_snr_gives_that_snr(seed: int, snr: float, dark_e: float, read_noise_e: float) -> None:
-    relative = np.random.default_rng(seed).uniform(0, 1, 50)
-    scale = signal_scale_for_snr(relative, snr, dark_e, read_noise_e)
-    assert expected_snr_from_powers(scale * relative, dark_e, read_noise_e) == pytest.approx(snr, rel=1e-9)
-
-
-def test_eq_4_of_drawn_frames_is_what_is_expected() -> None:
+def test_snr_of_drawn_frames_is_as_expected() -> None:
     dark_e = 1.5
     generator = np.random.default_rng(20110919)
     relative = np.linspace(0.2, 1.0, 1000)
     signal_e = signal_scale_for_snr(relative, 0.16, dark_e, READ_NOISE_E) * relative
 
     def frame(expected_e: NDArray[np.float64] | float) -> NDArray[np.float64]:
-        read_noise_e = generator.normal(0, READ_NOISE_E, (1000, 1000))
-        return generator.poisson(expected_e, (1000, 1000)) + read_noise_e
+        read_noise_e = generator.normal(0, READ_NOISE_E, (500, 1000))
+        return generator.poisson(expected_e, (500, 1000)) + read_noise_e
 
-    # A squared normal number has √2 times its mean as standard deviation; two means of a million enter a ratio near one
-    deviation = 1.16 * np.sqrt(2) * np.sqrt(2 / 1e6)
+    # A squared normal number has √2 times its mean as standard deviation; two means of 500 000 enter a ratio near one
+    deviation = 1.16 * np.sqrt(2) * np.sqrt(2 / 5e5)
     assert snr_from_powers(frame(signal_e + dark_e), frame(dark_e)) == pytest.approx(0.16, abs=4 * deviation)
     assert expected_snr_from_powers(signal_e, dark_e, READ_NOISE_E) == pytest.approx(0.16, rel=1e-12)
 
 
-def test_eq_4_is_the_excess_of_power_over_noise() -> None:
+def test_snr_is_excess_of_power_over_noise() -> None:
     assert snr_from_powers(np.array([3.0, -3.0, 1.0]), np.array([[2.0, -1.0]])) == pytest.approx((19 / 3 - 2.5) / 2.5)
     assert snr_from_powers(np.full(9, 40000, np.uint16), np.full(4, 20000, np.uint16)) == pytest.approx(3.0)
 
@@ -80,7 +66,7 @@ def test_no_signal_or_no_noise_has_no_scale(relative: NDArray[np.float64], snr: 
         signal_scale_for_snr(relative, snr, 0.0, read_noise_e)
 
 
-def test_the_mean_square_error_scales_the_object_to_one_and_counts_its_region_only() -> None:
+def test_mean_square_error_counts_its_region_only() -> None:
     truth, plane = np.array([[4.0, 2.0, 100.0]]), np.array([[5.0, 2.0, 0.0]])
     region = np.array([[True, True, False]])
     assert mean_square_error(plane, truth, region) == pytest.approx((0.25**2 + 0) / 2)

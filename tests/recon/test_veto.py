@@ -1,4 +1,4 @@
-"""What the data make of a false proposal: details that they contradict shrink, and those that they show come back.
+"""False proposals: the data shrink details that they contradict, and bring back those that they show.
 
 Scenes with a lit square, a thin line and a texture. The proposals are the truth, as blurred as a back-projection, with
 a line or a letter that is not there, or without one that is.
@@ -105,8 +105,8 @@ def share_left(snr: float, structure: Image, amplitude: float, seed: int, *, mis
     images = noisy_images(of.operator, truth, BACKGROUND_E, VARIANCE_E2, 100 + seed)
     blurred = as_blurred(of.operator, of.truth)
     proposal = blurred if missing else blurred + false
-    found = vetoed(of, images, proposal)
-    return along(found - truth, structure) / along(proposal - truth, structure)
+    result = vetoed(of, images, proposal)
+    return along(result - truth, structure) / along(proposal - truth, structure)
 
 
 SEEDS = range(3)
@@ -122,7 +122,7 @@ SEEDS = range(3)
         (1.0, letter, 3, 0.5, True),
     ],
 )
-def test_the_data_shrink_what_they_contradict(
+def test_data_shrink_false_structures(
     snr: float, structure: Callable[[], Image], amplitude: float, most: float, missing: bool
 ) -> None:
     """In units of the back-projection's noise; relative to the false part of the proposal."""
@@ -131,15 +131,15 @@ def test_the_data_shrink_what_they_contradict(
 
 
 @pytest.mark.parametrize(("snr", "most"), [(0.16, 0.2), (1.0, 0.4)])
-def test_a_true_proposal_hardly_moves(snr: float, most: float) -> None:
+def test_true_proposal_hardly_moves(snr: float, most: float) -> None:
     """At the higher signal it moves more, since the truth is not blurred as the proposal is."""
     of = scene(snr)
     proposal = as_blurred(of.operator, of.truth)
     for seed in SEEDS:
-        found = vetoed(of, noisy_images(of.operator, of.truth, BACKGROUND_E, VARIANCE_E2, 100 + seed), proposal)
-        assert np.sqrt(np.mean(np.square(found - proposal))) < most * of.sigma
+        result = vetoed(of, noisy_images(of.operator, of.truth, BACKGROUND_E, VARIANCE_E2, 100 + seed), proposal)
+        assert np.sqrt(np.mean(np.square(result - proposal))) < most * of.sigma
 
 
-def test_the_proposal_decides_what_the_data_do_not_show() -> None:
+def test_proposal_decides_invisible_structures() -> None:
     """A falsehood of a tenth of the noise stays: the record says that the data did not object, not that it is true."""
     assert share_left(0.16, line(), 0.1, 0) > 0.5

@@ -1,0 +1,166 @@
+"""Edges of a proposal, views that contradict a plane, and the mixture of candidates against a general solver."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import LinearConstraint, minimize
+
+from faintfield.pipelines.reconstruction.penalised import Objective
+from faintfield.pipelines.reconstruction.solutions import Settings
+from faintfield.recon.likelihood.images import Image
+from faintfield.recon.prior.evidence import Evidence, evidence_of_planes
+from faintfield.recon.prior.misfit import Misfit, misfits
+from faintfield.recon.prior.mixture import Scores, best_mixture, scores
+from faintfield.recon.prior.proposal import propose
+from faintfield.recon.solver.data_fit import SceneProblem
+from tests.recon.displaced import dark_views, pieces
+from tests.recon.operator_contract import dense_matrix
+
+
+def pilot_alone(evidence: Evidence) -> dict[str, Image]:
+    return {"tv": evidence.pilot}
+
+
+def mean_of_nine(picture: Image) -> Image:
+    """Return the mean of each sample and its neighbours, weighted by ¼, ½ and ¼ along both axes."""
+    wide = np.pad(picture.astype(float), 1, "edge")
+    result = np.zeros(picture.shape)
+    for row in range(picture.shape[0]):
+        for column in range(picture.shape[1]):
+            result[row, column] = np.sum(wide[row : row + 3, column : column + 3] * np.outer([1, 2, 1], [1, 2, 1])) / 16
+    return result
+
+
+@pytest.mark.parametrize("light", [1.0, 40.0])
+def test_edges_beyond_noise_are_those_of_the_plane(light: float) -> None:
+    plane = np.float32(light) * pieces(32)
+    operator, images = dark_views(pieces(32), 2)
+    problem = Objective.of(SceneProblem(operator, images), Settings()).posed
+    (evidence,) = evidence_of_planes(operator, images, plane)
+    unseen = np.zeros(plane.shape, bool)
+    unseen[:3] = True
+    variance = np.where(unseen, np.inf, evidence.noise.variance).astype(np.float32)
+    evidence = evidence._replace(noise=evidence.noise._replace(variance=variance))
+    (result,) = propose(problem, plane, [evidence], 1.0, pilot_alone)
+    edges = plane - evidence.pilot
+    share = mean_of_nine(edges**2) / (mean_of_nine(edges**2) + 0.1 * np.where(unseen, 1, variance))
+    expected = np.where(unseen, plane, np.maximum(evidence.pilot + share * edges, 0))
+    np.testing.assert_allclose(result.picture, expected, rtol=1e-3, atol=1e-4 * light)
+    np.testing.assert_array_equal(result.again(evidence, plane), result.picture)
+    blurred = np.abs(edges) > 0.05 * light
+    kept = np.abs((result.picture - evidence.pilot)[blurred & ~unseen]) / np.abs(edges[blurred & ~unseen])
+    assert np.median(kept) > 0.9 if light == 40 else np.median(kept) < 0.9
+
+
+@pytest.mark.parametrize(
+    ("detail", "smooth", "se", "contradicts"),
+    [
+        (1.03, 1.0, 0.002, True),
+        (1.03, 1.03, 0.002, False),  # the noise is 3 % off everywhere
+        (0.99, 0.95, 0.002, False),  # detail fits
+        (1.03, 1.0, 0.02, False),  # by chance
+    ],
+)
+def test_only_worse_fit_of_detail_contradicts(detail: float, smooth: float, se: float, contradicts: bool) -> None:
+    assert Misfit(detail, smooth, se).contradicts is contradicts
+
+
+def test_shifted_plane_contradicts_and_true_plane_does_not() -> None:
+    truth = pieces(64)
+    operator, images = dark_views(truth, 3)
+    steep = np.hypot(*np.gradient(truth.astype(float))) > 0.1
+    regions = {"light, detail": steep.astype(np.float32), "light, smooth": (~steep).astype(np.float32)}
+    (right,) = misfits(operator, images, truth, [regions])
+    assert right.detail == pytest.approx(1, abs=4 * right.se)
+    assert not right.contradicts
+    bright = replace(images, electrons=(images.electrons + operator.forward(50 * truth)).astype(np.float32))
+    (right,) = misfits(operator, bright, 51 * truth, [regions])
+    (shifted,) = misfits(operator, bright, 51 * np.roll(truth, 1, axis=1), [regions])
+    assert not right.contradicts
+    assert shifted.contradicts
+
+
+def test_squares_and_variances_are_those_of_dense_matrices() -> None:
+    operator, images = dark_views(pieces(20), 1)
+    images = replace(images, background_e=0.3)
+    plane = pieces(20) + np.float32(0.2)
+    matrix = dense_matrix(operator).T
+    expected = matrix.T @ plane.ravel() + 0.3
+    variance = expected + images.read_variance_e2
+    squares = np.square(images.electrons.ravel() - expected)
+    share = np.linspace(0, 1, plane.size).reshape(plane.shape)
+    (result,) = misfits(operator, images, plane, [{"light, detail": share, "light, smooth": 1 - share}])
+    weight = matrix.T @ share.ravel()
+    assert result.detail == pytest.approx(weight @ squares / (weight @ variance), rel=1e-4)
+    other = matrix.T @ (1 - share).ravel()
+    spread = 2 * variance**2 + expected
+    errors = [np.sqrt(w @ spread) / (w @ variance) for w in (weight, other)]
+    assert result.se == pytest.approx(np.hypot(*errors), rel=1e-4)
+
+
+def random_scores(seed: int, count: int, rank: int) -> Scores:
+    """Scores of candidates that span `rank` dimensions, of which a picture may be outside."""
+    generator = np.random.default_rng(seed)
+    pictures = generator.normal(size=(count, rank)) @ generator.normal(size=(rank, 30)) + generator.normal(2, 1, 30)
+    target = generator.normal(2, 2, 30)
+    return Scores(pictures @ pictures.T, pictures @ target)
+
+
+def test_loss_is_weighted_squared_error_less_a_constant() -> None:
+    generator = np.random.default_rng(1)
+    pictures, picture = list(generator.normal(size=(3, 6, 5))), generator.normal(size=(6, 5))
+    weight = generator.uniform(0, 2, (6, 5))
+    result = scores(pictures, picture, weight)
+    for j, k in product(range(3), repeat=2):
+        assert result.gram[j, k] == pytest.approx(np.sum(weight * pictures[j] * pictures[k]), rel=1e-12)
+    for k in range(3):
+        assert result.towards[k] == pytest.approx(np.sum(weight * pictures[k] * picture), rel=1e-12)
+    constant = np.sum(weight * picture**2)
+    for a in generator.dirichlet(np.ones(3), 5):
+        mixed = np.tensordot(a, pictures, 1)
+        assert result.loss(a) + constant == pytest.approx(np.sum(weight * (mixed - picture) ** 2), rel=1e-10)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 5), rank=st.integers(0, 5), twin=st.booleans())
+def test_mixture_is_as_good_as_a_general_solvers(seed: int, count: int, rank: int, twin: bool) -> None:
+    """Also with more candidates than dimensions, and with one candidate twice."""
+    result = random_scores(seed, count, rank)
+    if twin:
+        chosen = [*range(count), 0]
+        result = Scores(result.gram[np.ix_(chosen, chosen)], result.towards[chosen])
+    best = best_mixture(result)
+    assert (best >= 0).all()
+    assert best.sum() == pytest.approx(1, abs=1e-9)
+    size, scale = result.towards.size, float(np.trace(result.gram))
+    expected = minimize(  # type: ignore[call-overload]
+        lambda a: result.loss(a) / scale,
+        np.full(size, 1 / size),
+        jac=lambda a: 2 * (result.gram @ a - result.towards) / scale,
+        method="SLSQP",
+        bounds=[(0, 1)] * size,
+        constraints=LinearConstraint(np.ones((1, size)), 1, 1),
+        options={"ftol": 1e-12},
+    )
+    assert result.loss(best) / scale <= expected.fun + 1e-7
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e12])
+def test_weights_do_not_depend_on_scale_of_light(scale: float) -> None:
+    result = random_scores(4, 5, 4)
+    best = best_mixture(Scores(scale * result.gram, scale * result.towards))
+    assert best.sum() == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(best, best_mixture(result), atol=1e-6)
+
+
+def test_first_and_fewest_win_where_all_predict_alike() -> None:
+    for same in (Scores(np.ones((4, 4)), np.ones(4)), Scores(np.zeros((4, 4)), np.zeros(4))):
+        np.testing.assert_array_equal(best_mixture(same), [1, 0, 0, 0])
+    # The second is the picture; so is the mean of the first and the third
+    pictures = [np.array([[x, 1.0]]) for x in (0, 1, 2)]
+    result = scores(pictures, pictures[1], np.ones((1, 2)))
+    np.testing.assert_allclose(best_mixture(result), [0, 1, 0], atol=1e-9)
