@@ -43,7 +43,7 @@ def packed(depth: str, values: list[int]) -> bytes:
 
 @pytest.mark.parametrize("size", [(5, 1), (7, 3)])
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_values_whose_bits_were_placed_one_by_one(depth: str, size: tuple[int, int]) -> None:
+def test_values_are_unpacked_bit_by_bit(depth: str, size: tuple[int, int]) -> None:
     width, height = size
     bits = int(depth.rstrip("pacPked"))
     values = np.random.default_rng(7).integers(0, 1 << bits, (height, width))
@@ -59,16 +59,6 @@ def test_values_whose_bits_were_placed_one_by_one(depth: str, size: tuple[int, i
             form.values(content[:-1], width, height)
 
 
-def test_an_example_of_the_standard_by_hand() -> None:
-    """Mono12Packed: 0xABC and 0x123 are AB 3C 12; Mono12p: BC 3A 12; Mono10p of 1, 2, 3, 1023: 01 08 30 C0 FF."""
-    for name, content, values in (
-        ("Mono12Packed", "ab3c12", [0xABC, 0x123]),
-        ("Mono12p", "bc3a12", [0xABC, 0x123]),
-        ("Mono10p", "010830c0ff", [1, 2, 3, 1023]),
-    ):
-        assert PixelFormat.named(name).values(bytes.fromhex(content), len(values), 1).tolist() == [values]
-
-
 def test_mosaics() -> None:
     for first_row, mosaic in MOSAICS.items():
         assert PixelFormat.named(f"Bayer{first_row}12Packed").mosaic == mosaic
@@ -82,12 +72,12 @@ def test_other_formats_are_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("depth", ["10", "14"])
-def test_values_with_more_bits_than_the_format_are_refused(depth: str) -> None:
+def test_values_beyond_the_format_are_refused(depth: str) -> None:
     with pytest.raises(CameraError, match=r"a value of \d+ came in Mono1\d, which ends at"):
         PixelFormat.named(f"Mono{depth}").values((1 << int(depth)).to_bytes(2, "little"), 1, 1)
 
 
-def test_a_frame_without_pixels_is_refused() -> None:
+def test_frame_without_pixels_is_refused() -> None:
     for size in ((0, 4), (4, 0), (-2, -2)):
         with pytest.raises(CameraError, match="check its region"):
             PixelFormat.named("Mono8").values(bytes(100), *size)

@@ -32,13 +32,13 @@ class World:
 
 @pytest.mark.parametrize("stamps_end", [False, True])
 @pytest.mark.parametrize("rate", [-1e-4, 1e-4])
-def test_frames_that_began_after_their_request_are_accepted(rate: float, stamps_end: bool) -> None:
+def test_frames_begun_after_their_request_are_accepted(rate: float, stamps_end: bool) -> None:
     world = World(rate=rate, stamps_end=stamps_end)
     for requested_s, latency_s in ((10.0, 0.0), (12.0, 0.3), (14.0, 0.0), (5000.0, 0.0), (5002.0, 0.0)):
         world.check(requested_s, requested_s + latency_s, held_s=2.0 * latency_s)
 
 
-def test_a_frame_that_came_sooner_than_its_exposure_lasts_is_refused() -> None:
+def test_frame_sooner_than_its_exposure_is_refused() -> None:
     world = World()
     world.check(10.0, 9.95)  # within what exposures differ by
     with pytest.raises(CameraError, match=r"came 720\.0 ms after it was requested, sooner than its exposure of 1 s"):
@@ -46,7 +46,7 @@ def test_a_frame_that_came_sooner_than_its_exposure_lasts_is_refused() -> None:
 
 
 @pytest.mark.parametrize("stamps_end", [False, True])
-def test_a_frame_that_was_held_back_is_refused_by_the_camera_s_clock(stamps_end: bool) -> None:
+def test_frame_held_back_is_refused_by_its_clock(stamps_end: bool) -> None:
     world = World(stamps_end=stamps_end)
     world.check(10.0, 10.0)
     with pytest.raises(CameraError, match="too old by the camera's clock: its exposure began before the request"):
@@ -54,7 +54,7 @@ def test_a_frame_that_was_held_back_is_refused_by_the_camera_s_clock(stamps_end:
     world.check(21.0, 21.0)
 
 
-def test_a_frame_that_came_twice_is_refused() -> None:
+def test_frame_that_came_twice_is_refused() -> None:
     world = World()
     world.check(10.0, 10.0)
     with pytest.raises(CameraError, match="not newer by the camera's clock"):
@@ -65,13 +65,13 @@ def test_a_frame_that_came_twice_is_refused() -> None:
 
 
 @pytest.mark.parametrize("jump_s", [-1.0, 0.5])
-def test_a_date_that_jumps_makes_the_time_of_the_frame_unknown(jump_s: float) -> None:
+def test_jump_of_the_date_is_refused(jump_s: float) -> None:
     world = World()
     with pytest.raises(CameraError, match=r"date jumped by [+-]\d+\.\d+ s during the exposure"):
         world.check(10.0, 10.0, jump_s=jump_s)
 
 
-def test_a_date_that_is_corrected_slowly_or_between_two_frames_does_no_harm() -> None:
+def test_slow_or_earlier_correction_of_date_is_harmless() -> None:
     world = World(exposure_s=30.0)
     world.check(10.0, 10.0, jump_s=0.02)
     later = Moment(100 * S, DATE + 100 * S - 3600 * S)
@@ -79,7 +79,7 @@ def test_a_date_that_is_corrected_slowly_or_between_two_frames_does_no_harm() ->
     world.times.check(stamps, later, Moment(131 * S, later.date_ns + 31 * S), 30.0)
 
 
-def test_a_camera_without_a_clock_and_one_that_only_pretends_to_expose() -> None:
+def test_camera_without_a_clock() -> None:
     times = FrameTimes()
     for second in (10, 20):
         requested = Moment(second * S, DATE + second * S + 999)

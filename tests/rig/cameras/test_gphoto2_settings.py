@@ -1,6 +1,6 @@
 """Settings of a tethered camera, by a stand-in for python-gphoto2 with its calls and its kinds of settings."""
 
-import importlib
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -25,38 +25,28 @@ class Failure(Exception):
 class Widget:
     """A setting, or a group of them."""
 
-    def __init__(self, name: str, kind: int, value: Any = None, offered: Any = (), **more: Any) -> None:
-        self.name, self.kind, self.value, self.offered = name, kind, value, offered
-        self.children: list[Widget] = more.get("children", [])
-        self.read_only: bool = more.get("read_only", False)
+    def __init__(
+        self, name: str, kind: int, value: Any = None, offered: Any = (), *, readonly: bool = False, children: Any = ()
+    ) -> None:
+        self.name, self.type, self.value, self.offered = name, kind, value, offered
+        self.children, self.readonly = list(children), readonly
 
-    def get_name(self) -> str:
-        return self.name
-
-    def get_type(self) -> int:
-        return self.kind
-
-    def get_value(self) -> Any:
-        return self.value
-
-    def get_readonly(self) -> bool:
-        return self.read_only
-
-    def get_children(self) -> list["Widget"]:
-        return self.children
+    def __getattr__(self, name: str) -> Any:
+        """Return what `get_name` and the like would."""
+        return lambda: vars(self)[name.removeprefix("get_")]
 
     def get_choices(self) -> Any:
-        assert self.kind in (RADIO, MENU)  # the library raises for the other kinds
+        assert self.type in (RADIO, MENU)  # the library raises for the other kinds
         return iter(self.offered)
 
     def get_range(self) -> Any:
-        assert self.kind == RANGE
+        assert self.type == RANGE
         return self.offered
 
     def set_value(self, value: Any) -> None:
-        wanted = {TOGGLE: int, RANGE: float}.get(self.kind, str)
-        if type(value) is not wanted:  # as the library does
-            raise TypeError(f"{wanted} is wanted")
+        expected = {TOGGLE: int, RANGE: float}.get(self.type, str)
+        if type(value) is not expected:  # as the library does
+            raise TypeError(f"{expected} is expected")
         self.value = value
 
 
@@ -72,15 +62,13 @@ class Body:
             Widget("reviewtime", RANGE, 2.0, (0.0, 10.0, 0.5)),
             Widget("autopoweroff", TOGGLE, 1),
             Widget("artist", TEXT, ""),
-            Widget("batterylevel", TEXT, "80%", read_only=True),
+            Widget("batterylevel", TEXT, "80%", readonly=True),
             Widget("format", BUTTON),
         ]
 
-    def init(self) -> None:
-        pass
+    def init(self) -> None: ...
 
-    def exit(self) -> None:
-        pass
+    def exit(self) -> None: ...
 
     def get_config(self) -> Widget:
         return Widget("main", WINDOW, children=[Widget("all", SECTION, children=self.settings)])
@@ -109,7 +97,7 @@ def body(monkeypatch: pytest.MonkeyPatch) -> Body:
         GP_ERROR_BAD_PARAMETERS=-2,
         **{f"GP_WIDGET_{name}": number for number, name in enumerate(kinds)},
     )
-    monkeypatch.setitem(importlib.import_module("sys").modules, "gphoto2", library)
+    monkeypatch.setitem(sys.modules, "gphoto2", library)
     return body
 
 
@@ -117,7 +105,7 @@ def open_with(**settings: str) -> None:
     GPhoto2Camera(GPhoto2Settings(settings=settings)).open()
 
 
-def test_each_kind_of_setting_is_sent_in_its_type(body: Body) -> None:
+def test_settings_are_sent_in_their_types(body: Body) -> None:
     open_with(iso="200", imageformat="RAW", reviewtime="2.5", autopoweroff="0", artist="none")
     assert body.sent == {"iso": "200", "imageformat": "RAW", "reviewtime": 2.5, "autopoweroff": 0, "artist": "none"}
     assert [type(value) for value in body.sent.values()] == [str, str, float, int, str]
@@ -130,21 +118,16 @@ def test_each_kind_of_setting_is_sent_in_its_type(body: Body) -> None:
         ("reviewtime", "11", r"settings\.reviewtime = '11' is not offered .* offers: 0 to 10 in steps of 0\.5; "),
         ("reviewtime", "nan", r"settings\.reviewtime = 'nan' is not offered"),
         ("batterylevel", "90%", r"settings\.batterylevel = '90%': the camera lets no program set this, it is '80%'; "),
-        (
-            "isospeed",
-            "100",
-            r"settings\.isospeed = '100': the camera has no setting isospeed, it has: artist, autopoweroff, "
-            r"batterylevel, format, imageformat, iso, reviewtime; correct the name",
-        ),
+        ("isospeed", "100", r"isospeed = '100': the camera has no setting isospeed, it has: artist, .*, reviewtime; "),
     ],
 )
-def test_a_setting_that_the_camera_does_not_offer_is_named(body: Body, name: str, value: str, words: str) -> None:
+def test_setting_not_offered_is_named(body: Body, name: str, value: str, words: str) -> None:
     with pytest.raises(CameraError, match=words):
         open_with(**{name: value})
     assert body.sent == {}
 
 
-def test_a_camera_that_fails_is_not_said_to_lack_a_setting(body: Body) -> None:
+def test_failing_camera_does_not_lack_a_setting(body: Body) -> None:
     body.broken = True
     with pytest.raises(CameraError, match=r"failed at setting iso = 200: error -2 \(-2\); "):
         open_with(iso="200")

@@ -51,18 +51,11 @@ def module() -> types.ModuleType:
     return module
 
 
-def camera(module: types.ModuleType, **settings: Any) -> Any:
+def test_documented_camera_meets_the_contract(module: types.ModuleType, port: int) -> None:
     plugin = module.PLUGIN
-    return plugin.make(plugin.settings(**settings), WallClock())
-
-
-def test_the_document_s_camera_meets_the_contract(module: types.ModuleType, port: int) -> None:
-    camera_contract(camera(module, host="127.0.0.1", port=port), 0.01)
-
-
-def test_its_frames_are_those_of_the_server(module: types.ModuleType, port: int) -> None:
-    sky = camera(module, host="127.0.0.1", port=port)
-    sky.open()
-    assert sky.report().name == "Sky-1"
-    np.testing.assert_array_equal(sky.expose(0.01, 1).pixels, _PICTURE)
-    sky.close()
+    camera: Any = plugin.make(plugin.settings(host="127.0.0.1", port=port), WallClock())
+    camera_contract(camera, 0.01)
+    camera.open()
+    assert camera.report().name == "Sky-1"
+    np.testing.assert_array_equal(camera.expose(0.01, 1).pixels, _PICTURE)
+    camera.close()

@@ -1,6 +1,7 @@
-"""Edit journals as somebody might who means harm."""
+"""Edit sessions as somebody might who means harm."""
 
 import hashlib
+import os
 import sqlite3
 import tarfile
 from contextlib import closing
@@ -9,8 +10,24 @@ from pathlib import Path
 
 import msgspec
 
-JOURNAL = "journal.sqlite"
 TABLES = ("event", "intent", "commit", "void", "traffic")
+
+
+def frame_files(folder: Path) -> list[Path]:
+    return sorted((folder / "frames").iterdir())
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def put_pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def put_link_out(path: Path) -> None:
+    """Link to `victim` beside the session of the file or folder."""
+    path.symlink_to(path.parent.parent / "victim")
 
 
 def edit(journal: Path, *statements: str) -> None:

@@ -18,7 +18,7 @@ from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import CheckSettings, RigSettings
 from faintfield.rig.stages.protocol import StageSettings
 from tests.faults.capturing import SMALL_RIG
-from tests.rig.capture.test_layout import Stopping, capture
+from tests.rig.capture.captures import Operator, capture
 
 replace = msgspec.structs.replace
 
@@ -35,7 +35,7 @@ def with_checks(**values: float) -> RigSettings:
 def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of which four frames are taken."""
     folder = tmp_path_factory.mktemp("begun") / "session"
-    capture(folder, Stopping(4))
+    capture(folder, Operator({}, {4: "stop"}))
     return folder
 
 
@@ -61,11 +61,10 @@ def session(begun: Path, tmp_path: Path) -> Path:
         ),
     ],
 )  # fmt: skip
-def test_what_a_session_keeps_is_named_with_both_values(now: RigSettings, words: list[str]) -> None:
+def test_refused_change_names_both_values(now: RigSettings, words: list[str]) -> None:
     with pytest.raises(PlanRefused, match=r"; set it back, or begin a new session") as refused:
         check_same_rig(frozen(), now)
-    for each in words:
-        assert each in str(refused.value)
+    assert all(text in str(refused.value) for text in words)
     assert "checks" not in str(refused.value)
 
 
@@ -91,7 +90,7 @@ def test_what_a_session_keeps_is_named_with_both_values(now: RigSettings, words:
         (SMALL_RIG, SMALL_RIG, []),
     ],
 )
-def test_what_no_frame_depends_on_may_change(then: RigSettings, now: RigSettings, keys: list[str]) -> None:
+def test_settings_that_no_frame_needs_may_change(then: RigSettings, now: RigSettings, keys: list[str]) -> None:
     check_same_rig(frozen(then), now)
     changes = find_changes(then, now)
     assert [change.key for change in changes] == keys
@@ -99,27 +98,31 @@ def test_what_no_frame_depends_on_may_change(then: RigSettings, now: RigSettings
 
 
 @pytest.mark.parametrize(("then", "now"), [("/dev/ttyUSB0", "simulated:grbl"), ("simulated:grbl", "/dev/ttyUSB0")])
-def test_a_port_does_not_turn_a_real_stage_into_a_simulated_one_or_back(then: str, now: str) -> None:
-    """Protocol grbl takes either port."""
+def test_port_keeps_a_stage_real_or_simulated(then: str, now: str) -> None:
     before, after = (replace(SMALL_RIG, stage=StageSettings("grbl", port)) for port in (then, now))
     with pytest.raises(PlanRefused, match=r"stage\.port \(simulated\) was \w+ and is \w+; set it back"):
         check_same_rig(frozen(before), after)
     check_same_rig(frozen(before), replace(before, stage=replace(before.stage, port=f"{then}2")))
 
 
-def test_changes_are_recorded_together_or_not_at_all(session: Path) -> None:
-    """One without the others may be a combination that no rig.toml can have."""
+def test_changes_are_recorded_all_or_none(session: Path) -> None:
     times = ["2030-01-01T00:00:00.000+00:00", KeyboardInterrupt]  # killed at the second change
     with open_session(session, None) as opened:
         with mock.patch("faintfield.rig.session.journal._now", side_effect=times), pytest.raises(KeyboardInterrupt):
             adopt_settings(opened, with_checks(leak_dn=9.0, saturation_dn=4000.0))
     assert present_settings(session) == SMALL_RIG
     with open_session(session, None) as opened:
+        with pytest.raises(PlanRefused):
+            adopt_settings(
+                opened, replace(with_checks(leak_dn=9.0), camera=SimulatedSettings(size_px=(16, 12), seed=2))
+            )
+        assert opened.rig == SMALL_RIG
+        assert opened.journal.events("setting_changed") == []
         adopt_settings(opened, with_checks(leak_dn=9.0, saturation_dn=4000.0))
     assert present_settings(session) == with_checks(leak_dn=9.0, saturation_dn=4000.0)
 
 
-def test_changes_are_recorded_and_apply_from_then_on(session: Path) -> None:
+def test_changes_are_recorded_and_apply(session: Path) -> None:
     assert isinstance(SMALL_RIG.camera, SimulatedSettings)
     # Every pixel is above this: the offset is 100 DN
     strict = with_checks(saturation_dn=1.0)
@@ -127,19 +130,18 @@ def test_changes_are_recorded_and_apply_from_then_on(session: Path) -> None:
         assert opened.rig == SMALL_RIG
         adopt_settings(opened, strict)
         assert opened.rig == strict
-    capture(session, Stopping(2))
+    capture(session, Operator({}, {2: "stop"}))
     assert present_settings(session) == strict
     with Journal(session / "journal.sqlite", read_only=True) as journal:
         events = [event.detail for event in journal.events("setting_changed")]
     assert events == [{"key": "checks.saturation_dn", "old": None, "new": 1.0}]
-    warned = [bool(it.record.warnings) for _, it, _ in taken_frames(session)]
-    shares = [it.record.checks["saturated_share"] for _, it, _ in taken_frames(session)]
-    assert shares == [0.0] * 4 + [1.0] * 2
-    assert warned[4:] == [True, True]
+    records = [committed.record for _, committed, _ in taken_frames(session)]
+    assert [record.checks["saturated_share"] for record in records] == [0.0] * 4 + [1.0] * 2
+    assert all(record.warnings for record in records[4:])
     assert verify(session).problems == ()
 
 
-def test_a_change_back_is_recorded_too_and_no_change_is_not(session: Path) -> None:
+def test_change_back_is_recorded_but_no_repetition(session: Path) -> None:
     for now in (with_checks(leak_dn=9.0), with_checks(leak_dn=9.0), SMALL_RIG):
         with open_session(session, None) as opened:
             adopt_settings(opened, now)
@@ -147,12 +149,3 @@ def test_a_change_back_is_recorded_too_and_no_change_is_not(session: Path) -> No
         events = [(event.detail["old"], event.detail["new"]) for event in journal.events("setting_changed")]
     assert events == [(8.0, 9.0), (9.0, 8.0)]
     assert present_settings(session) == SMALL_RIG
-
-
-def test_what_is_refused_changes_nothing(session: Path) -> None:
-    wrong = replace(with_checks(leak_dn=9.0), camera=SimulatedSettings(size_px=(16, 12), seed=2))
-    with open_session(session, None) as opened:
-        with pytest.raises(PlanRefused):
-            adopt_settings(opened, wrong)
-        assert opened.rig == SMALL_RIG
-        assert opened.journal.events("setting_changed") == []

@@ -1,19 +1,113 @@
-"""The power fails at any moment of a capture: what the journal calls committed is on disk, and the capture resumes."""
+"""Power cuts at any moment of a capture: what the journal calls committed is on disk, and the capture resumes.
+
+The model is the strictest that POSIX allows: a file has the bytes that it had when it was last flushed, and a folder
+the entries that it had when it was last flushed; all else is lost. SQLite flushes by itself, below Python: of its files
+the bytes at the cut are taken to be on disk, and their entries as soon as the folder holds the journal.
+"""
 
 import itertools
 import os
+import shutil
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
 import pytest
 from msgspec.structs import replace
 
-from faintfield.rig.session.disk import set_aside, write_new
-from faintfield.rig.session.durable import make_folder, sync_folder
+from faintfield.rig.session.durable import sync_folder
 from faintfield.rig.session.resume import open_session
 from faintfield.rig.session.verify import verify
 from faintfield.rig.settings import StepSettings
 from tests.faults.capturing import SMALL_RIG, capture_small
-from tests.rig.session.power_cuts import Disk, record
+
+
+class Disk:
+    """What is on disk below a folder, as far as it is flushed.
+
+    Parameters
+    ----------
+    root : Path
+        An existing folder, itself on disk.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._content: dict[int, bytes] = {}
+        self._entries: dict[int, dict[str, int]] = {}
+        self._kept: list[int] = []  # descriptors, so that no inode is given to another file
+
+    def flush(self, descriptor: int) -> None:
+        """Note that a file or folder is flushed now."""
+        self._kept.append(os.dup(descriptor))
+        state = os.fstat(descriptor)
+        if stat.S_ISDIR(state.st_mode):
+            entries = {entry.name: entry.inode() for entry in os.scandir(descriptor)}
+            self._entries[state.st_ino] = entries
+        else:
+            self._content[state.st_ino] = Path(f"/proc/self/fd/{descriptor}").read_bytes()
+
+    def lay_out(self, target: Path, *, all_entries: bool = False) -> None:
+        """Copy to `target` what a power cut would leave now.
+
+        With `all_entries`, folders have their present entries: a file system may write a new name early, and the bytes
+        of its file late.
+        """
+        self._lay_out(self.root, self.root.stat().st_ino, target, all_entries)
+
+    def close(self) -> None:
+        for descriptor in self._kept:
+            os.close(descriptor)
+
+    def _lay_out(self, folder: Path, inode: int, target: Path, all_entries: bool) -> None:
+        target.mkdir()
+        present = {entry.name: entry.inode() for entry in os.scandir(folder)} if all_entries else {}
+        for name, entry in (present or self._entries.get(inode, {})).items():
+            there = folder / name
+            if entry in self._entries or (there.is_dir() and there.stat().st_ino == entry):
+                self._lay_out(there, entry, target / name, all_entries)
+            else:
+                (target / name).write_bytes(self._content.get(entry, b""))
+        if (target / "journal.sqlite").exists():
+            for suffix in ("", "-wal"):
+                if (database := folder / f"journal.sqlite{suffix}").exists():
+                    shutil.copyfile(database, target / database.name)
+
+
+@contextmanager
+def record(root: Path, on_change: Callable[[Disk], None]) -> Iterator[Disk]:
+    """Record all that is flushed below `root`; call `on_change` before and after each flush, rename and new folder."""
+    disk = Disk(root)
+    at_work = False
+
+    def notify() -> None:
+        nonlocal at_work
+        if not at_work:  # what is laid out is not recorded
+            at_work = True
+            on_change(disk)
+            at_work = False
+
+    def watch(name: str, note: Callable[..., None] = lambda *_: None) -> Any:
+        original = getattr(os, name)
+
+        def watched(*arguments: Any, **named: Any) -> Any:
+            notify()
+            result = original(*arguments, **named)
+            note(*arguments)
+            notify()
+            return result
+
+        return mock.patch.object(os, name, watched)
+
+    try:
+        with watch("fsync", disk.flush), watch("rename"), watch("mkdir"), watch("unlink"):
+            yield disk
+    finally:
+        disk.close()
+
 
 FRAMES = 3
 THREE_FRAMES = replace(
@@ -45,16 +139,15 @@ def cuts(tmp_path: Path) -> Cuts:
     return Cuts(tmp_path / "cuts")
 
 
-def live(tmp_path: Path) -> Path:
-    folder = tmp_path / "live"
-    folder.mkdir()
-    return folder
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    (tmp_path / "live").mkdir()
+    return tmp_path / "live"
 
 
 @pytest.mark.parametrize("all_entries", [False, True])
-def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cuts: Cuts, all_entries: bool) -> None:
+def test_committed_frames_survive_a_power_cut(root: Path, cuts: Cuts, all_entries: bool) -> None:
     cuts.all_entries = all_entries
-    root = live(tmp_path)
     with record(root, cuts):
         capture_small(root / "new" / "session", THREE_FRAMES)
     assert len(cuts.remains) > 6 * FRAMES
@@ -74,8 +167,7 @@ def test_what_is_committed_survives_a_power_cut_at_any_moment(tmp_path: Path, cu
 
 
 @pytest.mark.parametrize("each", [12, pytest.param(1, marks=pytest.mark.deep)])
-def test_a_capture_resumes_after_a_power_cut(tmp_path: Path, cuts: Cuts, each: int) -> None:
-    root = live(tmp_path)
+def test_capture_resumes_after_a_power_cut(root: Path, cuts: Cuts, each: int) -> None:
     with record(root, cuts):
         capture_small(root / "session", THREE_FRAMES)
     for remains in cuts.remains[::each]:
@@ -86,23 +178,7 @@ def test_a_capture_resumes_after_a_power_cut(tmp_path: Path, cuts: Cuts, each: i
         assert (verdict.problems, verdict.present, verdict.sealed) == ((), FRAMES, True)
 
 
-def test_what_is_set_aside_is_on_disk_in_one_of_the_two_places(tmp_path: Path, cuts: Cuts) -> None:
-    root = live(tmp_path)
-    with record(root, cuts) as disk:
-        make_folder(root / "frames")
-        write_new(root / "frames" / "orphan", b"orphan")
-        cuts.remains.clear()
-        set_aside(root / "frames" / "orphan", root / "set_aside")
-        disk.lay_out(cuts.folder / "end")
-    for remains in cuts.remains:
-        assert any(path.read_bytes() == b"orphan" for path in remains.rglob("orphan*"))
-    assert [it.relative_to(cuts.folder / "end") for it in (cuts.folder / "end").rglob("orphan*")] == [
-        Path("set_aside/orphan.0")
-    ]
-
-
-def test_orphans_survive_a_power_cut_at_any_moment_of_a_resumed_capture(tmp_path: Path, cuts: Cuts) -> None:
-    root = live(tmp_path)
+def test_orphans_survive_a_power_cut_while_resuming(root: Path, cuts: Cuts) -> None:
     with record(root, cuts):
         capture_small(root / "session", THREE_FRAMES)
         (root / "session" / "SHA256SUMS").unlink()

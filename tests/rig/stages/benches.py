@@ -43,3 +43,8 @@ def hal(bench: Bench) -> SimulatedGrblHal:
 def grbl(bench: Bench) -> SimulatedGrbl:
     assert isinstance(bench.firmware, SimulatedGrbl)
     return bench.firmware
+
+
+def marlin(bench: Bench) -> SimulatedMarlin:
+    assert isinstance(bench.firmware, SimulatedMarlin)
+    return bench.firmware

@@ -2,18 +2,17 @@
 
 from collections.abc import Iterator
 from functools import partial
-from unittest import mock
 
 import pytest
 
 from faintfield.rig.devices import open_stage
-from faintfield.rig.errors import StageLost
 from faintfield.rig.simulation.controller.bench import Bench, DirectLink, Link, PtyLink
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.stages.conformance import check_conformance
+from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Point, StageSettings
 from faintfield.testing import stage_contract
-from tests.rig.stages.benches import CONTROLLERS, Controller, grbl
+from tests.rig.stages.benches import CONTROLLERS, Controller, grbl, homed
 from tests.rig.stages.socket_link import SocketLink
 
 LINKS = [DirectLink, PtyLink, SocketLink]
@@ -21,10 +20,10 @@ LINKS = [DirectLink, PtyLink, SocketLink]
 
 @pytest.fixture(params=LINKS)
 def link(request: pytest.FixtureRequest) -> Iterator[Link]:
-    made: Link = request.param()
-    yield made
-    if isinstance(made, PtyLink | SocketLink):
-        made.close()
+    link: Link = request.param()
+    yield link
+    if isinstance(link, PtyLink | SocketLink):
+        link.close()
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
@@ -33,9 +32,7 @@ def test_contract(controller: Controller, link: Link) -> None:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_contract_with_a_board_that_keeps_running(
-    controller: Controller,
-) -> None:
+def test_contract_with_board_that_keeps_running(controller: Controller) -> None:
     stage_contract(Bench(controller, resets_on_open=False).stage())
 
 
@@ -45,11 +42,9 @@ def test_contract_of_what_open_stage_returns(port: str) -> None:
 
 
 @pytest.mark.parametrize("controller", CONTROLLERS)
-def test_a_grid_of_7_by_7_within_a_minute_of_simulated_time(controller: Controller) -> None:
+def test_grid_of_49_nodes_takes_a_minute(controller: Controller) -> None:
     bench = Bench(controller)
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
+    stage = homed(bench)
     travel = stage.travel()
     first = Point(travel.x_mm[0] + 50.0, travel.y_mm[0] + 50.0)
     stage.move_to(*first)
@@ -71,7 +66,7 @@ def test_conformance(controller: Controller) -> None:
     assert all(check.passed for check in checks), checks
 
 
-def test_a_setting_that_should_be_changed_fails_the_first_check() -> None:
+def test_wrong_setting_fails_the_first_check() -> None:
     bench = Bench(partial(SimulatedGrbl, settings={20: "0"}))
     stage = bench.stage()
     stage.connect()
@@ -80,21 +75,15 @@ def test_a_setting_that_should_be_changed_fails_the_first_check() -> None:
     assert failed.measured.startswith("$20=0")
 
 
-def test_a_stage_slower_than_its_settings_say_fails_the_check_of_speed() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = bench.stage()
-    stage.connect()
+def test_slow_stage_fails_the_check_of_speed(bench: Bench, unhomed: Gantry) -> None:
     for number in (110, 111):
         grbl(bench).settings[number] = f"{0.5 * float(grbl(bench).settings[number]):.3f}"
-    assert [check.name for check in check_conformance(stage) if not check.passed] == ["speed"]
+    assert [check.name for check in check_conformance(unhomed) if not check.passed] == ["speed"]
 
 
-def test_lost_steps_fail_the_check_of_repeatability() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = bench.stage()
-    stage.connect()
-    checks = check_conformance(stage)
-    done = [next(checks) for _ in range(6)]
+def test_lost_steps_fail_the_check_of_repeatability(bench: Bench, unhomed: Gantry) -> None:
+    checks = check_conformance(unhomed)
+    earlier = [next(checks) for _ in range(6)]
     homings: list[bool] = []
 
     def slip_after_the_timing(data: bytes) -> bytes:
@@ -106,27 +95,6 @@ def test_lost_steps_fail_the_check_of_repeatability() -> None:
 
     bench.wire.filters_to_controller.append(slip_after_the_timing)
     last = next(checks)
-    assert all(check.passed for check in done)
+    assert all(check.passed for check in earlier)
     assert (last.name, last.passed) == ("repeatability", False)
     assert "lost its scale" in last.measured
-
-
-def test_the_port_is_closed_even_if_a_stage_cannot_be_told_to_stop() -> None:
-    """A plug-in may raise what no controller should."""
-    stage = Bench(SimulatedGrbl).stage()
-    stage.connect()
-    controller = stage._controller  # noqa: SLF001 - what a plug-in would be
-    with (
-        mock.patch.object(controller, "read_position", side_effect=StageLost("unplugged; plug it in")),
-        pytest.raises(StageLost),
-    ):
-        stage.position()
-    with (
-        mock.patch.object(controller, "abort", side_effect=ZeroDivisionError),
-        mock.patch.object(controller, "close", wraps=controller.close) as close,
-        pytest.raises(ZeroDivisionError),
-    ):
-        stage.close()
-    assert close.called
-    stage.connect()
-    stage.close()

@@ -5,15 +5,16 @@ from itertools import pairwise
 
 import pytest
 
-from faintfield.rig.errors import OutsideTravel, StageAlarm, StageLost, StageRejected, WrongFirmware
+from faintfield.rig.errors import KeepOutCrossed, OutsideTravel, StageAlarm, StageLost, StageRejected, WrongFirmware
 from faintfield.rig.simulation.controller.bench import Bench
 from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
+from faintfield.rig.simulation.controller.marlin import SimulatedMarlin
 from faintfield.rig.stages.gantry import Gantry
 from faintfield.rig.stages.protocol import Box, Point, StageSettings
-from tests.rig.stages.benches import Traffic, grbl, homed
+from tests.rig.stages.benches import Controller, Traffic, grbl, homed
 
 
-def test_positions_are_machine_positions_whatever_the_work_offset_and_report() -> None:
+def test_positions_are_independent_of_offset_and_report() -> None:
     for report in ("0", "1", "3"):
         bench = Bench(partial(SimulatedGrbl, settings={10: report}))
         stage = homed(bench)
@@ -27,89 +28,98 @@ def test_positions_are_machine_positions_whatever_the_work_offset_and_report() -
         assert stage.position().is_at(Point(-150.0, -120.0))
 
 
-def test_status_is_asked_for_at_most_five_times_a_second() -> None:
+def test_stage_jogs_polls_rarely_and_never_unlocks(bench: Bench) -> None:
     traffic = Traffic()
-    stage = homed(Bench(SimulatedGrbl), traffic)
-    stage.move_to(-200.0, -200.0)
-    for _ in range(5):
-        stage.position()
-    polls = [at_s for at_s, _, data in traffic.entries if data == b"?"]
-    assert len(polls) > 8
-    assert min(b - a for a, b in pairwise(polls)) >= 0.2 - 1e-9
-
-
-def test_motion_is_by_jogs_and_never_by_unlocking() -> None:
-    traffic = Traffic()
-    stage = homed(Bench(SimulatedGrbl), traffic)
+    stage = homed(bench, traffic)
     stage.move_to(-200.0, -200.0)
     moves = [data for data in traffic.chunks("sent") if b"X" in data]
     assert moves
     assert all(data.startswith(b"$J=G90 G21 G53 ") and len(data) < 80 for data in moves)
     assert b"$X\n" not in traffic.chunks("sent")
+    for _ in range(5):
+        stage.position()
+    polls_s = [at_s for at_s, _, data in traffic.entries if data == b"?"]
+    assert len(polls_s) > 8
+    assert min(later - sooner for sooner, later in pairwise(polls_s)) >= 0.2 - 1e-9
 
 
-def test_one_idle_report_does_not_end_a_wait() -> None:
-    bench = Bench(SimulatedGrbl)
-    stage = homed(bench)
-    told: list[bytes] = []
+def test_one_idle_report_does_not_end_a_wait(bench: Bench, stage: Gantry) -> None:
+    replaced: list[bytes] = []
 
     def idle_while_it_moves(data: bytes) -> bytes:
-        if b"<Jog" in data and not told:
-            told.append(data)
+        if b"<Jog" in data and not replaced:
+            replaced.append(data)
             return data.replace(b"<Jog", b"<Idle")
         return data
 
     bench.wire.filters_to_host.append(idle_while_it_moves)
     grbl(bench).settings[110] = "3000.000"  # slower than the driver was told, so that it polls too soon
     assert stage.move_to(-350.0, -350.0).is_at(Point(-350.0, -350.0))
-    assert told
+    assert replaced
 
 
-def test_the_wrong_firmware_is_refused() -> None:
-    bench = Bench(SimulatedGrbl)
+def with_version(version: bytes, data: bytes) -> bytes:
+    return data.replace(b"[VER:1.1h.20190830:]", version)
+
+
+def test_wrong_firmware_is_refused(bench: Bench) -> None:
     for version in (b"[VER:0.9j.20160316:]", b"[VER:3.7 FluidNC v3.7.8:]"):
-        bench.wire.filters_to_host[:] = [partial(_replace, b"[VER:1.1h.20190830:]", version)]
+        bench.wire.filters_to_host[:] = [partial(with_version, version)]
         with pytest.raises(WrongFirmware, match=r"1\.1 or grblHAL is needed"):
             bench.stage().connect()
     bench.wire.filters_to_host.clear()
-    marlin = bench.stage(StageSettings(protocol="marlin", port="simulated"))
     with pytest.raises(WrongFirmware, match="use protocol 'grbl'"):
-        marlin.connect()
+        bench.stage(StageSettings(protocol="marlin", port="simulated")).connect()
 
 
-def test_configured_limits_narrow_the_travel() -> None:
+@pytest.mark.parametrize(
+    ("settings", "axes", "old", "new", "words"),
+    [
+        ({}, ("X", "Z"), b",0.000|F", b"|F", r"reports 2 axes, not .*set stage\.axes"),
+        ({10: "0"}, ("X", "Y"), b"|WCO:0.000,0.000,0.000", b"", r"without their offset; set \$10=1"),
+    ],
+)
+def test_incomplete_reports_are_refused(
+    settings: dict[int, str], axes: tuple[str, str], old: bytes, new: bytes, words: str
+) -> None:
+    bench = Bench(partial(SimulatedGrbl, settings=settings))
+    bench.wire.filters_to_host.append(lambda data: data.replace(old, new))
+    with pytest.raises(WrongFirmware, match=words):
+        homed(bench, settings=StageSettings(protocol="grbl", port="simulated", axes=axes))
+
+
+def test_configured_limits_narrow_the_travel(bench: Bench) -> None:
     def stage_within(box: Box) -> Gantry:
-        return Bench(SimulatedGrbl).stage(StageSettings(protocol="grbl", port="simulated", travel_mm=box))
+        return bench.stage(StageSettings(protocol="grbl", port="simulated", travel_mm=box))
 
     narrow = stage_within(Box((-300.0, 50.0), (-200.0, -100.0)))
     narrow.connect()
     assert narrow.travel() == Box((-300.0, 0.0), (-200.0, -100.0))
+    narrow.close()
     with pytest.raises(OutsideTravel, match=r"correct stage\.travel_mm"):
         stage_within(Box((10.0, 20.0), (10.0, 20.0))).connect()
 
 
-def test_a_keep_out_on_the_way_is_refused_before_motion() -> None:
-    bench = Bench(SimulatedGrbl)
+def test_path_through_a_keep_out_moves_nothing(bench: Bench) -> None:
     box = Box((-120.0, -100.0), (-120.0, -100.0))
     stage = homed(bench, settings=StageSettings(protocol="grbl", port="simulated", keep_out=(box,)))
     before = bench.true_position()
-    with pytest.raises(Exception, match="meets the keep-out box"):
+    with pytest.raises(KeepOutCrossed, match="meets the keep-out box"):
         stage.move_to(-200.0, -200.0)
     assert bench.true_position() == before
     stage.move_to(-200.0, -50.0)
     stage.move_to(-200.0, -200.0)
 
 
-def test_a_locked_stage_jogs_only_when_asked_to_unlock() -> None:
-    bench = Bench(SimulatedGrbl)
+def test_locked_stage_jogs_only_if_unlocked(bench: Bench) -> None:
     stage = bench.stage()
     stage.connect()
     with pytest.raises(StageAlarm, match="locked"):
         stage.jog(-1.0, 0.0)
     before = bench.true_position()
     assert not stage.jog(-1.0, -2.0, unlock=True).trusted
-    moved = bench.true_position()
-    assert (moved.x_mm - before.x_mm, moved.y_mm - before.y_mm) == pytest.approx((-1.0, -2.0), abs=0.01)
+    after = bench.true_position()
+    assert (after.x_mm - before.x_mm, after.y_mm - before.y_mm) == pytest.approx((-1.0, -2.0), abs=0.01)
     with pytest.raises(OutsideTravel, match="longer than 10 mm"):
         stage.jog(-11.0, 0.0)
     with pytest.raises(StageRejected, match="error:15"):
@@ -118,21 +128,6 @@ def test_a_locked_stage_jogs_only_when_asked_to_unlock() -> None:
     assert stage.jog(-50.0, -50.0).is_at(Point(-51.0, -51.0))
     with pytest.raises(OutsideTravel):
         stage.jog(60.0, 0.0)
-
-
-def test_settings_that_change_while_read_are_not_believed() -> None:
-    bench = Bench(SimulatedGrbl)
-    seen: list[bytes] = []
-
-    def double_a_digit_once(data: bytes) -> bytes:
-        if data.startswith(b"$130=400") and not seen:
-            seen.append(data)
-            return b"$130=4400.000\r\n"
-        return data
-
-    bench.wire.filters_to_host.append(double_a_digit_once)
-    with pytest.raises(StageLost, match=r"\$130 read differently"):
-        bench.stage().connect()
 
 
 def test_play_in_the_drive_does_not_matter() -> None:
@@ -150,5 +145,22 @@ def test_play_in_the_drive_does_not_matter() -> None:
     assert bench.true_position().x_mm == pytest.approx(places[0].x_mm + 0.3), "the play is really there"
 
 
-def _replace(old: bytes, new: bytes, data: bytes) -> bytes:
-    return data.replace(old, new)
+@pytest.mark.parametrize(
+    ("controller", "start", "old", "new"),
+    [(SimulatedGrbl, b"$130=400", b"400", b"4400"), (SimulatedMarlin, b"echo: M92", b"X80", b"X8")],
+)
+def test_settings_that_change_while_read_are_refused(
+    controller: Controller, start: bytes, old: bytes, new: bytes
+) -> None:
+    bench = Bench(controller)
+    changed: list[bytes] = []
+
+    def change_once(data: bytes) -> bytes:
+        if data.startswith(start) and not changed:
+            changed.append(data)
+            return data.replace(old, new)
+        return data
+
+    bench.wire.filters_to_host.append(change_once)
+    with pytest.raises(StageLost, match="read differently"):
+        bench.stage().connect()

@@ -11,14 +11,7 @@ from msgspec.structs import replace
 from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.settings import MicroManagerSettings, SimulatedSettings
 from faintfield.rig.devices import open_rig
-from faintfield.rig.errors import (
-    NotHomed,
-    PlanRefused,
-    PositionLost,
-    StageLost,
-    StageTimeout,
-    StageUnfit,
-)
+from faintfield.rig.errors import NotHomed, PlanRefused, PositionLost, StageLost, StageTimeout, StageUnfit
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.plan import Grid
 from faintfield.rig.settings import DriftSettings, RigSettings, StepSettings
@@ -33,6 +26,18 @@ TRAVEL = Box((0.0, 12.0), (0.0, 12.0))
 REST_S = 0.05
 
 
+ANSWERS = {
+    "getXYStageDevice": "XY",
+    "getAllowedPropertyValues": ["1", "5"],
+    "getDevicePropertyNames": ["Speed", "Position"],
+    "getProperty": "5",
+    "getDeviceLibrary": "Rehearsed",
+    "getDeviceName": "XYStage",
+    "getVersionInfo": "MMCore 0",
+    "unloadAllDevices": None,
+}
+
+
 class Core:
     """As much of a core as a stage uses, on a simulated clock: axes of 5 mm/s that answer in micrometres."""
 
@@ -45,25 +50,18 @@ class Core:
         self.calls: list[str] = []
         self.fails: dict[str, Callable[[], object]] = {}
         self.creep_um_per_s = 0.0
-        self.off_um = 0.0
 
     def __getattr__(self, name: str) -> Any:
         def call(*arguments: Any) -> Any:
             self.calls.append(name)
             if name in self.fails:
                 self.fails[name]()
-            return getattr(self, f"on_{name}")(*arguments)
+            return ANSWERS[name] if name in ANSWERS else getattr(self, f"on_{name}")(*arguments)
 
         return call
 
-    def on_getXYStageDevice(self) -> str:
-        return "XY"
-
     def on_getLoadedDevicesOfType(self, kind: int) -> list[str]:
         return ["XY"] if kind == 6 else ["Camera", "Z"]
-
-    def on_getAllowedPropertyValues(self, label: str, name: str) -> list[str]:
-        return ["1", "5"]
 
     def on_setProperty(self, label: str, name: str, value: str) -> None:
         assert (label, name) == ("XY", "Speed")
@@ -72,7 +70,7 @@ class Core:
         self.settle()
         far_um = max(abs(x_um - self.at_um[0]), abs(y_um - self.at_um[1]))
         self.arrives_s = self.clock.now_s() + far_um / 5000.0
-        self.target_um = [x_um + self.off_um, y_um]
+        self.target_um = [x_um, y_um]
 
     def on_setRelativeXYPosition(self, label: str, dx_um: float, dy_um: float) -> None:
         self.on_setXYPosition(label, self.at_um[0] + dx_um, self.at_um[1] + dy_um)
@@ -103,26 +101,8 @@ class Core:
         self.settle()
         return self.at_um[0] + self.creep_um_per_s * self.clock.now_s(), self.at_um[1]
 
-    def on_getDevicePropertyNames(self, label: str) -> list[str]:
-        return ["Speed", "Position"]
-
     def on_isPropertyReadOnly(self, label: str, name: str) -> bool:
         return name == "Position"
-
-    def on_getProperty(self, label: str, name: str) -> str:
-        return "5"
-
-    def on_getDeviceLibrary(self, label: str) -> str:
-        return "Rehearsed"
-
-    def on_getDeviceName(self, label: str) -> str:
-        return "XYStage"
-
-    def on_getVersionInfo(self) -> str:
-        return "MMCore 0"
-
-    def on_unloadAllDevices(self) -> None:
-        pass
 
     def settle(self) -> None:
         if self.clock.now_s() >= self.arrives_s:
@@ -149,25 +129,33 @@ class RehearsedCore(SharedCore):
         return self.cores[-1]
 
 
-def rehearsed(origin: Any = "home", **options: Any) -> tuple[RehearsedCore, Gantry]:
-    """Return a stage on a rehearsed core, connected."""
+def rehearsed(**options: Any) -> tuple[RehearsedCore, Gantry]:
+    """Return a stage on a rehearsed core."""
     shared = RehearsedCore()
-    settings = StageSettings("micromanager", travel_mm=TRAVEL)
-    controller = MicroManagerController(shared, MicroManagerStage(origin=origin, **options), TRAVEL, shared.clock)
-    stage = Gantry(controller, settings, shared.clock)
+    controller = MicroManagerController(shared, MicroManagerStage(**options), TRAVEL, shared.clock)
+    return shared, Gantry(controller, StageSettings("micromanager", travel_mm=TRAVEL), shared.clock)
+
+
+def homed(**options: Any) -> tuple[RehearsedCore, Gantry]:
+    shared, stage = rehearsed(**options)
     stage.connect()
+    stage.home()
     return shared, stage
 
 
+def hang(shared: RehearsedCore, name: str) -> threading.Event:
+    """Let a call of the core hang until the event is set."""
+    end = threading.Event()
+    shared.core.fails[name] = lambda: end.wait(30.0)
+    return end
+
+
 def test_contract_of_the_rehearsed_stage() -> None:
-    shared = RehearsedCore()
-    controller = MicroManagerController(shared, MicroManagerStage(), TRAVEL, shared.clock)
-    stage_contract(Gantry(controller, StageSettings("micromanager", travel_mm=TRAVEL), shared.clock))
+    stage_contract(rehearsed()[1])
 
 
 def test_positions_are_micrometres_of_the_adapter() -> None:
-    shared, stage = rehearsed()
-    stage.home()
+    shared, stage = homed()
     stage.move_to(7.25, 3.5)
     assert shared.core.at_um == [7250.0, 3500.0]
     assert stage.position().point == Point(7.25, 3.5)
@@ -181,18 +169,16 @@ def test_positions_are_micrometres_of_the_adapter() -> None:
         ({"properties": {"Speed": "2"}}, r"'Speed' of XY cannot be '2'; choose from 1, 5$"),
     ],
 )
-def test_what_the_configuration_does_not_offer_is_refused_with_what_it_does(options: Any, message: str) -> None:
-    shared = RehearsedCore()
-    controller = MicroManagerController(shared, MicroManagerStage(**options), TRAVEL, shared.clock)
+def test_missing_device_or_value_is_refused_with_choices(options: Any, message: str) -> None:
+    shared, stage = rehearsed(**options)
     with pytest.raises(PlanRefused, match=rf"^\[stage\]: .*{message}"):
-        controller.connect()
+        stage.connect()
     assert "setProperty" not in shared.core.calls
     assert "unloadAllDevices" in shared.core.calls
 
 
-def test_a_report_counts_only_when_the_next_is_equal() -> None:
-    shared, stage = rehearsed()
-    stage.home()
+def test_report_counts_once_the_next_is_equal() -> None:
+    shared, stage = homed()
     shared.core.creep_um_per_s = 0.4 / REST_S  # the limit is a tenth of 5 micrometres between two reports
     stage.position()
     shared.core.creep_um_per_s = 0.6 / REST_S
@@ -201,9 +187,8 @@ def test_a_report_counts_only_when_the_next_is_equal() -> None:
     assert not stage.trusted
 
 
-def test_a_report_counts_only_when_the_adapter_is_not_busy() -> None:
-    shared, stage = rehearsed()
-    stage.home()
+def test_report_counts_once_the_adapter_is_idle() -> None:
+    shared, stage = homed()
     shared.core.arrives_s = shared.clock.now_s() + 0.4  # it settles, and its reports do not show it
     stage.position()
     assert shared.clock.now_s() >= shared.core.arrives_s
@@ -212,21 +197,17 @@ def test_a_report_counts_only_when_the_adapter_is_not_busy() -> None:
         stage.position()
 
 
-def test_a_motion_that_takes_too_long_is_stopped_and_named() -> None:
-    shared, stage = rehearsed(rate_mm_per_s=100.0, acceleration_mm_per_s2=1000.0)
-    stage.home()
-    with pytest.raises(
-        StageTimeout, match=r"moving to \(11\.900, 0\.000\) mm within 2\.\d s .*lower stage.rate_mm_per_s"
-    ):
+def test_motion_that_takes_too_long_is_stopped() -> None:
+    shared, stage = homed(rate_mm_per_s=100.0, acceleration_mm_per_s2=1000.0)
+    with pytest.raises(StageTimeout, match=r"moving to \(11\.900, 0\.000\) mm within 2\.\d s .*lower stage.rate_"):
         stage.move_to(11.9, 0.0)
     assert "stop" in shared.core.calls
     assert not stage.trusted
     assert shared.core.timeout_s == 5.0  # which the camera may rely on
 
 
-def test_what_an_adapter_reports_loses_the_position() -> None:
-    shared, stage = rehearsed()
-    stage.home()
+def test_failure_of_the_adapter_loses_the_position() -> None:
+    shared, stage = homed()
 
     def unplugged() -> None:
         raise RuntimeError("Error in device XY:\n(serial port error)")
@@ -242,12 +223,11 @@ def test_what_an_adapter_reports_loses_the_position() -> None:
     assert stage.trusted
 
 
-def test_an_adapter_that_hangs_is_left_behind_and_loaded_anew() -> None:
-    shared, stage = rehearsed(answer_s=0.5)
-    stage.home()
-    end = threading.Event()
-    shared.core.fails["getXYPosition"] = lambda: end.wait(30.0)
-    with pytest.raises(StageTimeout, match=r"did not finish its report within 0\.5 s, and its adapter hangs"):
+@pytest.mark.parametrize("origin", ["home", "confirmed"])
+def test_hanging_adapter_is_loaded_anew(origin: str) -> None:
+    shared, stage = homed(origin=origin, answer_s=0.3)
+    end = hang(shared, "getXYPosition")
+    with pytest.raises(StageTimeout, match=r"did not finish its report within 0\.3 s, and its adapter hangs"):
         stage.position()
     end.set()
     with pytest.raises(StageLost, match="not connected"):
@@ -255,14 +235,17 @@ def test_an_adapter_that_hangs_is_left_behind_and_loaded_anew() -> None:
     stage.recover()
     assert len(shared.cores) == 2
     assert not stage.trusted
-    stage.home()
+    if origin == "home":
+        stage.home()
+        assert stage.trusted
+    else:
+        with pytest.raises(StageUnfit, match="the position is lost"):
+            stage.home()
 
 
-def test_a_motion_that_hangs_is_stopped_at_once_and_when_it_returns() -> None:
-    shared, stage = rehearsed(answer_s=0.1)
-    stage.home()
-    core, end = shared.core, threading.Event()
-    core.fails["setXYPosition"] = lambda: end.wait(30.0)
+def test_hanging_motion_is_stopped_and_again_on_return() -> None:
+    shared, stage = homed(answer_s=0.1)
+    core, end = shared.core, hang(shared, "setXYPosition")
     core.calls.clear()
     with pytest.raises(StageTimeout, match="its adapter hangs"):
         stage.move_to(1.0, 1.0)
@@ -275,8 +258,9 @@ def test_a_motion_that_hangs_is_stopped_at_once_and_when_it_returns() -> None:
     assert core.calls.count("stop") == 2  # the motion began only when the call returned
 
 
-def test_a_confirmed_origin_is_good_for_one_homing_of_a_connection() -> None:
+def test_confirmed_origin_serves_one_homing_per_connection() -> None:
     shared, stage = rehearsed(origin="confirmed")
+    stage.connect()
     with pytest.raises(NotHomed):
         stage.move_to(1.0, 1.0)
     stage.home()
@@ -304,59 +288,40 @@ def rig(**options: Any) -> RigSettings:
     )
 
 
-def test_a_confirmed_origin_is_not_confirmed_again_by_a_recovery() -> None:
-    shared, stage = rehearsed(origin="confirmed", answer_s=0.5)
-    stage.home()
-    end = threading.Event()
-    shared.core.fails["getXYPosition"] = lambda: end.wait(30.0)
-    with pytest.raises(StageTimeout, match="its adapter hangs"):
-        stage.position()
-    end.set()
-    stage.recover()
-    with pytest.raises(StageUnfit, match="the position is lost"):
-        stage.home()
-    assert not stage.trusted
-
-
 def test_camera_and_stage_share_one_core() -> None:
-    made = open_rig(rig())
-    camera, stage = made.camera, made.stage
+    devices = open_rig(rig())
+    camera, stage = devices.camera, devices.stage
     assert isinstance(camera, MicroManagerCamera)
     assert camera._shared is stage._controller._shared  # type: ignore[attr-defined]  # noqa: SLF001 - it is behind them
     with pytest.raises(PlanRefused, match=r"stage\.configuration = 'other\.cfg', or .*; Micro-Manager loads one"):
         open_rig(rig(configuration="other.cfg"))
 
 
-def test_a_drift_check_by_the_switches_is_refused() -> None:
+def test_drift_check_by_the_switches_is_refused() -> None:
     with pytest.raises(PlanRefused, match=r"drift\.check = true times homing .*; set it to false"):
         open_rig(replace(rig(), drift=DriftSettings()))
     with pytest.raises(PlanRefused, match=r"needs stage\.protocol = 'simulated'"):
         open_rig(replace(rig(), camera=SimulatedSettings()))
 
 
-def test_devices_are_loaded_once_and_unloaded_after_the_last_user() -> None:
+def test_devices_are_unloaded_after_their_last_user() -> None:
     shared = RehearsedCore()
-    first, second = shared.acquire("camera"), shared.acquire("stage")
-    assert first is second
+    core = shared.acquire("camera")
+    assert shared.acquire("stage") is core
     shared.release("camera")
     assert "unloadAllDevices" not in shared.core.calls
-    assert shared.acquire("camera") is first
-    shared.release("stage")
-    shared.release("camera")
-    assert shared.core.calls.count("unloadAllDevices") == 1
-    shared.release("camera")
-    assert shared.core.calls.count("unloadAllDevices") == 1
-    assert shared.acquire("stage") is not first
+    for _ in range(2):  # the second has no effect
+        shared.release("stage")
+        assert shared.core.calls.count("unloadAllDevices") == 1
+    assert shared.acquire("stage") is not core
 
 
-def test_a_camera_that_hangs_does_not_take_the_core_from_the_stage() -> None:
+def test_hanging_camera_leaves_the_core_to_the_stage() -> None:
     shared = RehearsedCore()
     core = shared.acquire("stage")
     shared.acquire("camera")
     shared.abandon("camera")
-    with pytest.raises(
-        RuntimeError, match="a call of the camera hangs in Micro-Manager, which stage uses as well; end"
-    ):
+    with pytest.raises(RuntimeError, match="a call of the camera hangs in Micro-Manager, which stage uses as well"):
         shared.acquire("camera")
     core.getXYPosition("XY")
     shared.release("stage")

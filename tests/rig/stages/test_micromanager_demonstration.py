@@ -1,7 +1,5 @@
 """Micro-Manager's demonstration stage, with the real library."""
 
-import time
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,11 +8,7 @@ from faintfield.rig.cameras.micromanager import MicroManagerCamera
 from faintfield.rig.cameras.settings import MicroManagerSettings
 from faintfield.rig.clock import WallClock
 from faintfield.rig.devices import open_stage
-from faintfield.rig.errors import (
-    CameraError,
-    PlanRefused,
-    StageTimeout,
-)
+from faintfield.rig.errors import CameraError
 from faintfield.rig.micromanager import SharedCore
 from faintfield.rig.stages.conformance import check_conformance
 from faintfield.rig.stages.gantry import Gantry
@@ -47,36 +41,16 @@ def test_contract_of_the_demonstration_stage(adapters: str) -> None:
 
 
 def test_conformance_of_the_demonstration_stage(adapters: str) -> None:
-    """All that a Micro-Manager stage can show; its drift cannot be timed."""
     stage = demo(adapters)
     stage.connect()
-    found = list(check_conformance(stage))
+    checks = list(check_conformance(stage))
     stage.close()
-    assert [(it.name, it.passed) for it in found] == [
+    assert [(check.name, check.passed) for check in checks] == [
         (name, True) for name in ("settings", "homing", "limits", "speed", "arrival", "report rate")
-    ], found
+    ], checks
 
 
-def test_faults_of_the_demonstration_stage(adapters: str, tmp_path: Path) -> None:
-    empty = tmp_path / "empty.cfg"
-    empty.write_text("Property,Core,Initialize,0\nProperty,Core,Initialize,1\n")
-    with pytest.raises(PlanRefused, match="the configuration has no XY stage; name another"):
-        demo(adapters, configuration=str(empty)).connect()
-    with pytest.raises(PlanRefused, match=r"no XY stage 'Camera'; choose from XY$"):
-        demo(adapters, device="Camera").connect()
-    with pytest.raises(PlanRefused, match=r"no property 'Speed'; choose from .*Velocity"):
-        demo(adapters, properties={"Speed": "1"}).connect()
-    stage = demo(adapters, properties={"Velocity": "0.5"}, rate_mm_per_s=50.0)
-    stage.connect()
-    stage.home()
-    begun_s = time.monotonic()
-    with pytest.raises(StageTimeout, match=r"did not finish moving to \(3\.000, 0\.000\) mm within 2\.\d s"):
-        stage.move_to(3.0, 0.0)
-    assert time.monotonic() - begun_s < 8.0
-    stage.close()
-
-
-def test_a_camera_of_the_same_core_works_beside_the_stage(adapters: str) -> None:
+def test_camera_and_stage_work_with_one_core(adapters: str) -> None:
     shared = SharedCore(adapters=adapters)
     camera = MicroManagerCamera(MicroManagerSettings(adapters=adapters), shared)
     options = MicroManagerStage(adapters=adapters, rate_mm_per_s=10.0)

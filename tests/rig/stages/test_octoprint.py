@@ -55,7 +55,7 @@ def test_contract(printer: tuple[Gantry, Command]) -> None:
 
 
 @pytest.mark.parametrize("printer", [{}, {"simulated_errors": ["20:resend", "30:checksum_mismatch"]}], indirect=True)
-def test_a_grid_of_7_by_7(printer: tuple[Gantry, Command]) -> None:
+def test_grid_of_7_by_7(printer: tuple[Gantry, Command]) -> None:
     stage, _ = printer
     stage.connect()
     stage.home()

@@ -37,25 +37,25 @@ def of_marlin(*changes: tuple[str, str], axes: tuple[str, str] = ("X", "Y"), tra
     return MarlinSettings(map(marlin.parse, lines.splitlines())).identity(axes, travel)
 
 
-def test_the_identity_of_grbl() -> None:
-    found = grbl()
-    assert found.firmware == "Grbl 1.1h.20190830"
-    assert found.travel_mm == Box((-400.0, 0.0), (-300.0, 0.0))
-    assert found.motion == MotionLimits((100.0, 50.0), (500.0, 250.0))
+def test_identity_of_grbl() -> None:
+    identity = grbl()
+    assert identity.firmware == "Grbl 1.1h.20190830"
+    assert identity.travel_mm == Box((-400.0, 0.0), (-300.0, 0.0))
+    assert identity.motion == MotionLimits((100.0, 50.0), (500.0, 250.0))
     # Half a step of 1/80 and 1/160 mm, and half a micrometre each for report and command
-    assert found.tolerance_mm == pytest.approx((0.00725, 0.004125), abs=1e-12)
-    assert found.homing_bound_s == 240.0
-    assert found.pull_off_mm == 3.0
-    assert found.homes_together
-    assert found.warnings == ()
-    assert found.settings == {f"${number}": value for number, value in GRBL.items()}
+    assert identity.tolerance_mm == pytest.approx((0.00725, 0.004125), abs=1e-12)
+    assert identity.homing_bound_s == 240.0
+    assert identity.pull_off_mm == 3.0
+    assert identity.homes_together
+    assert identity.warnings == ()
+    assert identity.settings == {f"${number}": value for number, value in GRBL.items()}
 
 
 def test_other_axes_of_grbl_have_their_own_settings() -> None:
-    found = grbl(axes=(2, 0))
-    assert found.travel_mm == Box((-100.0, 0.0), (-400.0, 0.0))
-    assert found.motion == MotionLimits((10.0, 100.0), (50.0, 500.0))
-    assert found.tolerance_mm == pytest.approx((0.00225, 0.00725), abs=1e-12)
+    identity = grbl(axes=(2, 0))
+    assert identity.travel_mm == Box((-100.0, 0.0), (-400.0, 0.0))
+    assert identity.motion == MotionLimits((10.0, 100.0), (50.0, 500.0))
+    assert identity.tolerance_mm == pytest.approx((0.00225, 0.00725), abs=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -67,17 +67,11 @@ def test_other_axes_of_grbl_have_their_own_settings() -> None:
         ("V,Z", "3", Box((-400.0, 0.0), (-300.0, 0.0))),  # only the letters before the comma are options
     ],
 )
-def test_the_travel_of_grbl_extends_from_the_switch_which_may_be_the_origin(
-    options: str, mask: str, travel: Box
-) -> None:
+def test_travel_of_grbl_extends_from_the_switch(options: str, mask: str, travel: Box) -> None:
     assert grbl({23: mask}, options=options).travel_mm == travel
 
 
-def test_grbl_with_single_axis_homing_homes_each_axis_alone() -> None:
-    assert not grbl(options="VH,15,128").homes_together
-
-
-def test_the_bound_of_grbls_homing_is_the_whole_travel_and_twice_the_slow_search() -> None:
+def test_bound_of_homing_is_travel_and_slow_search() -> None:
     # 400 mm at 100 mm/min are 240 s; four pull-offs of 3 mm at 10 mm/min are 72 s; half as much again, and 2 s
     assert grbl({24: "10.0", 25: "100.0"}).homing_bound_s == pytest.approx(1.5 * (240.0 + 72.0) + 2.0)
     # The longer axis counts
@@ -86,20 +80,21 @@ def test_the_bound_of_grbls_homing_is_the_whole_travel_and_twice_the_slow_search
 
 
 @pytest.mark.parametrize(("number", "value"), [(24, "0"), (27, "-1"), (101, "-5"), (110, "0"), (22, "0"), (13, "1")])
-def test_values_of_grbl_that_cannot_be_driven_are_refused_by_number(number: int, value: str) -> None:
+def test_impossible_values_of_grbl_are_refused_by_number(number: int, value: str) -> None:
     with pytest.raises(WrongFirmware, match=rf"^\${number}={value}: "):
         grbl({number: value})
 
 
 @pytest.mark.parametrize("number", [13, 22, 27, 110])
-def test_settings_that_grbl_does_not_report_are_refused_by_number(number: int) -> None:
+def test_missing_settings_of_grbl_are_refused_by_number(number: int) -> None:
     values = {key: value for key, value in GRBL.items() if key != number}
     with pytest.raises(WrongFirmware, match=rf"^\${number}=not reported: "):
         GrblSettings(values, BUILD).identity((0, 1))
 
 
-def test_settings_of_grbl_that_may_be_zero() -> None:
+def test_optional_settings_of_grbl() -> None:
     assert grbl({27: "0", 23: "0"}).pull_off_mm == 0.0
+    assert not grbl(options="VH,15,128").homes_together
     assert grbl({22: "3"}).homes_together, "bits beyond the first are grblHAL's"
 
 
@@ -113,31 +108,31 @@ def test_only_grbl_1_1_is_driven(version: str, accepted: bool) -> None:
             settings.identity((0, 1))
 
 
-def test_the_identity_of_marlin() -> None:
-    found = of_marlin()
-    assert found.firmware == "Marlin 2.1.2.4 (Jun  1 2024 12:00:00)"
-    assert found.travel_mm == Box((1.0, 401.0), (2.0, 302.0))
+def test_identity_of_marlin() -> None:
+    identity = of_marlin()
+    assert identity.firmware == "Marlin 2.1.2.4 (Jun  1 2024 12:00:00)"
+    assert identity.travel_mm == Box((1.0, 401.0), (2.0, 302.0))
     # Motions between exposures are travel moves: their acceleration is the least of T and the axis's own
-    assert found.motion == MotionLimits((100.0, 50.0), (300.0, 250.0))
-    assert found.tolerance_mm == pytest.approx((0.5 / 80 + 0.0055, 0.5 / 160 + 0.0055), abs=1e-12)
-    assert found.homing_bound_s == 240.0
-    assert not found.homes_together
-    assert found.pull_off_mm == 0.0
-    assert found.warnings == ()
-    assert found.settings["M92"] == "X80 Y160 Z400"
-    assert list(found.settings) == ["M201", "M203", "M204", "M92"]
+    assert identity.motion == MotionLimits((100.0, 50.0), (300.0, 250.0))
+    assert identity.tolerance_mm == pytest.approx((0.5 / 80 + 0.0055, 0.5 / 160 + 0.0055), abs=1e-12)
+    assert identity.homing_bound_s == 240.0
+    assert not identity.homes_together
+    assert identity.pull_off_mm == 0.0
+    assert identity.warnings == ()
+    assert identity.settings["M92"] == "X80 Y160 Z400"
+    assert list(identity.settings) == ["M201", "M203", "M204", "M92"]
 
 
-def test_other_axes_of_marlin_have_their_own_settings_and_a_configured_travel() -> None:
+def test_other_axes_of_marlin_have_own_settings() -> None:
     travel = Box((0.0, 50.0), (0.0, 60.0))
-    found = of_marlin(axes=("Z", "X"), travel=travel)
-    assert found.travel_mm == travel
-    assert found.motion == MotionLimits((5.0, 100.0), (100.0, 300.0))
+    identity = of_marlin(axes=("Z", "X"), travel=travel)
+    assert identity.travel_mm == travel
+    assert identity.motion == MotionLimits((5.0, 100.0), (100.0, 300.0))
     with pytest.raises(WrongFirmware, match=r"set stage\.travel_mm"):
         of_marlin(axes=("Z", "X"))
 
 
-def test_marlin_without_limits_or_emergency_parser_is_driven_with_a_warning() -> None:
+def test_marlin_without_limits_or_parser_gives_warning() -> None:
     travel = Box((0.0, 50.0), (0.0, 60.0))
     without_limits = of_marlin((MARLIN[-1], "ok"), travel=travel)
     assert [warning.split(":")[0] for warning in without_limits.warnings] == ["the controller reports no limits"]
@@ -153,12 +148,12 @@ def test_marlin_without_limits_or_emergency_parser_is_driven_with_a_warning() ->
         (("Marlin 2.1.2.4", "Repetier 1.0"), "'Repetier 1.0 .*'; Marlin is needed"),
     ],
 )
-def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], message: str) -> None:
+def test_impossible_values_of_marlin_are_refused_by_name(change: tuple[str, str], message: str) -> None:
     with pytest.raises(WrongFirmware, match=message):
         of_marlin(change)
 
 
-@pytest.mark.parametrize("told", [{"FIRMWARE": "grblHAL"}, {}])
+@pytest.mark.parametrize("named", [{"FIRMWARE": "grblHAL"}, {}])
 @pytest.mark.parametrize(
     ("options", "homes_low", "hard_limits", "travel_x_mm"),
     [
@@ -168,11 +163,11 @@ def test_what_marlin_must_report_is_refused_by_name(change: tuple[str, str], mes
         ("VZ", "1", "1", (0.0, 397.0)),
     ],
 )
-def test_the_travel_of_grblhal_is_shorter_by_the_pull_off_if_hard_limits_are_on(
-    told: dict[str, str], options: str, homes_low: str, hard_limits: str, travel_x_mm: tuple[float, float]
+def test_hard_limits_shorten_the_travel_of_grblhal(
+    named: dict[str, str], options: str, homes_low: str, hard_limits: str, travel_x_mm: tuple[float, float]
 ) -> None:
     # By limits_set_work_envelope() of grblHAL; without its name it is known by a setting that GRBL lacks
-    values = {**GRBL, 23: homes_low, 21: hard_limits, 27: "3.000", 130: "400.000", **({} if told else {40: "0"})}
-    found = GrblSettings(values, {**BUILD, **told, "OPT": f"{options},15,128"}).identity((0, 1))
-    assert found.travel_mm.x_mm == travel_x_mm
-    assert found.firmware.startswith("grblHAL ")
+    values = {**GRBL, 23: homes_low, 21: hard_limits, 27: "3.000", 130: "400.000", **({} if named else {40: "0"})}
+    identity = GrblSettings(values, {**BUILD, **named, "OPT": f"{options},15,128"}).identity((0, 1))
+    assert identity.travel_mm.x_mm == travel_x_mm
+    assert identity.firmware.startswith("grblHAL ")

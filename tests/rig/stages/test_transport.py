@@ -12,7 +12,7 @@ from faintfield.rig.simulation.controller.grbl import SimulatedGrbl
 from faintfield.rig.simulation.controller.wire import SimulatedClock
 from faintfield.rig.stages.protocol import StageSettings
 from faintfield.rig.stages.transport import LineTransport, SerialPort
-from tests.rig.stages.benches import Traffic
+from tests.rig.stages.benches import Traffic, homed
 from tests.rig.stages.socket_link import SocketLink
 
 
@@ -23,18 +23,21 @@ def pty() -> Iterator[PtyLink]:
     link.close()
 
 
-def line_over(link: DirectLink) -> LineTransport:
-    return LineTransport(link.open, SimulatedClock())
+def open_line() -> tuple[DirectLink, LineTransport]:
+    link = DirectLink()
+    line = LineTransport(link.open, SimulatedClock())
+    line.open()
+    return link, line
 
 
 @pytest.mark.parametrize("url", ["/dev/no-such-port", "socket://127.0.0.1:1", "nonsense://x"])
-def test_a_port_that_cannot_be_opened_is_named_in_one_line_with_those_that_exist(url: str) -> None:
+def test_port_that_cannot_be_opened_is_named(url: str) -> None:
     with pytest.raises(StageLost, match=r"cannot be opened .*; serial ports here: .*; check the cable") as caught:
         SerialPort(url, 115200)
     assert "\n" not in str(caught.value)
 
 
-def test_a_port_is_opened_exclusively(pty: PtyLink) -> None:
+def test_port_is_opened_exclusively(pty: PtyLink) -> None:
     first = pty.open()
     with pytest.raises(StageLost, match="no other program"):
         pty.open()
@@ -53,17 +56,14 @@ def test_bytes_pass_and_an_unplugged_port_is_lost(pty: PtyLink) -> None:
     assert data == b"ok\r\n"
     assert port.read(0.0) == b""
     pty.unplug()
-    with pytest.raises(StageLost, match="connection is lost"):
-        port.read(1.0)
-    with pytest.raises(StageLost, match="connection is lost"):
-        port.write(b"?")
+    for use in (lambda: port.read(1.0), lambda: port.write(b"?")):
+        with pytest.raises(StageLost, match="connection is lost"):
+            use()
     port.close()
 
 
-def test_lines_are_split_stripped_and_decoded_whatever_they_contain() -> None:
-    link = DirectLink()
-    line = line_over(link)
-    line.open()
+def test_lines_of_any_bytes_are_decoded() -> None:
+    link, line = open_line()
     link.send(b"\r\nok\r\n\n  <Idle|\xff\x00>  \nhalf")
     assert line.next_line(0.0) == "ok"
     assert line.next_line(0.0) == "<Idle|\ufffd\x00>"
@@ -72,10 +72,8 @@ def test_lines_are_split_stripped_and_decoded_whatever_they_contain() -> None:
     assert line.next_line(0.0) == "half a line"
 
 
-def test_noise_without_an_end_does_not_grow_for_ever() -> None:
-    link = DirectLink()
-    line = line_over(link)
-    line.open()
+def test_endless_noise_is_bounded() -> None:
+    link, line = open_line()
     for _ in range(100):
         link.send(b"x" * 1000)
         assert line.next_line(0.0) is None
@@ -86,53 +84,41 @@ def test_noise_without_an_end_does_not_grow_for_ever() -> None:
     assert line.next_line(0.0) == "ok"
 
 
-def test_a_closed_line_says_so_and_forgets_what_it_held() -> None:
-    link = DirectLink()
-    line = line_over(link)
-    with pytest.raises(StageLost, match="not connected"):
-        line.send(b"?")
-    line.open()
+def test_closed_line_forgets_what_it_held() -> None:
+    link, line = open_line()
     link.send(b"half")
     assert line.next_line(0.0) is None
     link.unplug()
     with pytest.raises(StageLost):
         line.next_line(0.0)
-    assert not line.is_open
+    with pytest.raises(StageLost, match="not connected"):
+        line.send(b"?")
     link.plug()
     line.open()
     link.send(b"ok\n")
     assert line.next_line(0.0) == "ok"
 
 
-def test_every_byte_and_its_time_is_in_the_log(pty: PtyLink) -> None:
+def test_every_byte_and_time_is_logged(pty: PtyLink) -> None:
     bench = Bench(SimulatedGrbl, pty)
     traffic = Traffic()
-    on_the_wire: dict[str, bytes] = {"sent": b"", "received": b""}
-
-    def watch(way: str, data: bytes) -> bytes:
-        on_the_wire[way] += data
-        return data
-
-    stage = bench.stage(traffic=traffic)
-    bench.wire.filters_to_controller.append(lambda data: watch("sent", data))
-    bench.wire.filters_to_host.append(lambda data: watch("received", data))
-    stage.connect()
-    stage.home()
+    sent, received = bytearray(), bytearray()
+    bench.wire.filters_to_controller.append(lambda data: sent.extend(data) or data)  # type: ignore[func-returns-value]
+    bench.wire.filters_to_host.append(lambda data: received.extend(data) or data)  # type: ignore[func-returns-value]
+    stage = homed(bench, traffic)
     stage.move_to(-100.0, -100.0)
-    assert traffic.all("sent") == on_the_wire["sent"]
-    assert traffic.all("received") == on_the_wire["received"]
+    assert traffic.all("sent") == sent
+    assert traffic.all("received") == received
     times = [at_s for at_s, _, _ in traffic.entries]
     assert times == sorted(times)
     assert times[-1] == bench.clock.now_s()
 
 
 @pytest.mark.parametrize("link", [PtyLink, SocketLink])
-def test_an_unplugged_stage_comes_back_by_the_same_name(link: type[PtyLink] | type[SocketLink]) -> None:
-    made = link()
-    bench = Bench(SimulatedGrbl, made)
-    stage = bench.stage()
-    stage.connect()
-    stage.home()
+def test_unplugged_stage_returns_by_the_same_name(link: type[PtyLink] | type[SocketLink]) -> None:
+    connection = link()
+    bench = Bench(SimulatedGrbl, connection)
+    stage = homed(bench)
     bench.unplug()
     with pytest.raises(StageLost):
         stage.move_to(-100.0, -100.0)
@@ -144,11 +130,10 @@ def test_an_unplugged_stage_comes_back_by_the_same_name(link: type[PtyLink] | ty
     stage.home()
     assert stage.move_to(-100.0, -100.0).trusted
     stage.close()
-    made.close()
+    connection.close()
 
 
-def test_a_mute_controller_does_not_hang_the_connection() -> None:
-    bench = Bench(SimulatedGrbl)
+def test_mute_controller_does_not_hang_the_connection(bench: Bench) -> None:
     bench.wire.filters_to_host.append(lambda data: b"")
     with pytest.raises(StageTimeout, match="no answer"):
         bench.stage().connect()
@@ -156,16 +141,15 @@ def test_a_mute_controller_does_not_hang_the_connection() -> None:
 
 
 def test_settings_are_checked() -> None:
-    with pytest.raises(ValueError, match=r"stage\.port is missing"):
-        StageSettings(protocol="grbl")
-    with pytest.raises(ValueError, match=r"stage\.axes"):
-        StageSettings(protocol="grbl", port="x", axes=("X", "X"))
+    for settings, words in (({}, r"stage\.port is missing"), ({"port": "x", "axes": ("X", "X")}, r"stage\.axes")):
+        with pytest.raises(ValueError, match=words):
+            StageSettings(protocol="grbl", **settings)  # type: ignore[arg-type]
     StageSettings(protocol="grbl", port="x", axes=("Z", "X"), approach_mm=0.0, feed_mm_per_min=0.1)
     assert open_stage(StageSettings(protocol="simulated")).settings.protocol == "grbl"
 
 
 @pytest.mark.parametrize("scheme", ["spy", "file"])
-def test_a_rig_file_opens_no_url_that_does_more_than_carry_bytes(scheme: str, tmp_path: Path) -> None:
+def test_url_that_writes_files_is_refused(scheme: str, tmp_path: Path) -> None:
     written = tmp_path / "written"
     with pytest.raises(ValueError, match=r"stage.port = .*; give a serial device, or a URL that begins with socket://"):
         StageSettings("grbl", port=f"{scheme}:///dev/null?file={written}")

@@ -6,28 +6,28 @@ from faintfield.rig.simulation.controller.kinematics import Axis, Mechanics
 from faintfield.rig.simulation.controller.wire import SimulatedClock
 
 
-def mechanics(clock: SimulatedClock, play_mm: float = 0.0) -> Mechanics:
-    axes = (Axis(-2.0, 405.0, 0.0, play_mm), Axis(-2.0, 405.0, 0.0, play_mm))
-    return Mechanics(clock, axes, 0.0125, (0.0, 0.0), switch_at_high_end=False)
-
-
-def test_the_clock_jumps_from_event_to_event() -> None:
+def mechanics(play_mm: float = 0.0) -> tuple[SimulatedClock, Mechanics]:
     clock = SimulatedClock()
-    seen: list[tuple[str, float]] = []
-    clock.after(2.0, lambda: seen.append(("late", clock.now_s())))
-    clock.after(1.0, lambda: seen.append(("early", clock.now_s())))
-    clock.after(1.5, lambda: seen.append(("never", clock.now_s()))).cancel()
+    axes = (Axis(-2.0, 405.0, 0.0, play_mm), Axis(-2.0, 405.0, 0.0, play_mm))
+    return clock, Mechanics(clock, axes, 0.0125, (0.0, 0.0), switch_at_high_end=False)
+
+
+def test_clock_jumps_from_event_to_event() -> None:
+    clock = SimulatedClock()
+    events: list[tuple[str, float]] = []
+    clock.after(2.0, lambda: events.append(("late", clock.now_s())))
+    clock.after(1.0, lambda: events.append(("early", clock.now_s())))
+    clock.after(1.5, lambda: events.append(("never", clock.now_s()))).cancel()
     assert clock.next_event_s() == 1.0
     clock.sleep_s(1.2)
     assert clock.now_s() == 1.2
     clock.sleep_s(5.0)
-    assert seen == [("early", 1.0), ("late", 2.0)]
+    assert events == [("early", 1.0), ("late", 2.0)]
     assert clock.next_event_s() is None
 
 
-def test_the_braking_distance_is_that_of_constant_deceleration() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
+def test_braking_distance_is_that_of_constant_deceleration() -> None:
+    clock, stage = mechanics()
     stage.queue((300.0, 0.0), 100.0, 500.0)
     clock.sleep_s(1.0)
     here = stage.commanded_mm()[0]
@@ -40,8 +40,7 @@ def test_the_braking_distance_is_that_of_constant_deceleration() -> None:
 
 
 def test_positions_are_whole_steps() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
+    clock, stage = mechanics()
     stage.queue((33.3333, 7.77), 100.0, 500.0)
     clock.sleep_s(5.0)
     x, y = stage.true_mm()
@@ -49,18 +48,16 @@ def test_positions_are_whole_steps() -> None:
     assert (x, y) == pytest.approx((33.3333, 7.77), abs=0.00626)
 
 
-def test_play_leaves_the_carriage_behind_on_the_way_down() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock, play_mm=0.3)
+def test_play_holds_the_carriage_back_downwards() -> None:
+    clock, stage = mechanics(play_mm=0.3)
     for target, true in ((50.0, 50.0), (30.0, 30.3), (30.2, 30.3), (31.0, 31.0)):
         stage.queue((target, 0.0), 100.0, 500.0)
         clock.sleep_s(5.0)
         assert stage.true_mm()[0] == pytest.approx(true, abs=0.0126)
 
 
-def test_a_carriage_cannot_leave_its_travel_and_loses_steps_instead() -> None:
-    clock = SimulatedClock()
-    stage = mechanics(clock)
+def test_carriage_at_the_end_loses_steps() -> None:
+    clock, stage = mechanics()
     stage.queue((410.0, 0.0), 100.0, 500.0)
     clock.sleep_s(10.0)
     assert stage.true_mm()[0] == 405.0
