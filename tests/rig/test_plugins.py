@@ -10,7 +10,13 @@ import pytest
 from faintfield.pipelines.formats.rig_file import read_rig
 from faintfield.rig import plugins
 from faintfield.rig.cameras.folder import FolderCamera
-from faintfield.rig.cameras.settings import AravisSettings, FolderSettings, PluginSettings
+from faintfield.rig.cameras.settings import (
+    BUILT_IN_BACKENDS,
+    AravisSettings,
+    CameraSettings,
+    FolderSettings,
+    PluginSettings,
+)
 from faintfield.rig.devices import open_rig, open_stage
 from faintfield.rig.errors import PlanRefused, PluginFailed, UnknownPlugin
 from faintfield.rig.settings import RigSettings
@@ -103,6 +109,11 @@ def rig_file(tmp_path: Path, old: str = "", new: str = "", camera: str = SKY_TAB
     path = tmp_path / "rig.toml"
     path.write_text((RIG.replace(old, new) if old else RIG).replace(SKY_TABLE, camera))
     return path
+
+
+def test_built_in_backends_are_those_with_settings() -> None:
+    tags = {settings.__struct_config__.tag for settings in CameraSettings.__value__.__args__}
+    assert tags == {*BUILT_IN_BACKENDS, "plugin"}
 
 
 def test_camera_of_another_package(packages: Path, tmp_path: Path) -> None:
