@@ -40,8 +40,8 @@ def faintfield(capfd: pytest.CaptureFixture[str]) -> Command:
         words = [str(argument) for argument in arguments]
         capfd.readouterr()
         code = run(words)
-        said = capfd.readouterr()
-        return CompletedProcess(words, code, said.out, said.err)
+        message = capfd.readouterr()
+        return CompletedProcess(words, code, message.out, message.err)
 
     return call
 

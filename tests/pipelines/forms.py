@@ -7,6 +7,12 @@ from typing import Any
 GOLDEN = Path(__file__).parent / "golden"
 
 
+def read_record(folder: Path, name: str = "reconstruction.json") -> dict[str, Any]:
+    """Return the record of results in a folder."""
+    record: dict[str, Any] = json.loads((folder / name).read_bytes())
+    return record
+
+
 def form(value: Any) -> Any:
     """Return a JSON value's keys, in their order, and the types of its values; a list has the forms of its elements."""
     if isinstance(value, dict):

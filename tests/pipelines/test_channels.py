@@ -24,15 +24,15 @@ BAYER = ["RG", "GB"]
 
 
 def _channels(folder: Path) -> dict[str, ElementalImages]:
-    loaded = load_set(folder)
-    return {layout.name: load_channel(loaded, layout) for layout in channel_layouts(loaded)}
+    elemental_set = load_set(folder)
+    return {layout.name: load_channel(elemental_set, layout) for layout in channel_layouts(elemental_set)}
 
 
 def _back_projected(folder: Path, depth_mm: float = 100.0) -> NDArray[np.floating]:
-    loaded = load_set(folder)
-    (layout,) = channel_layouts(loaded)
-    images = load_channel(loaded, layout)
-    operator = OperatorFactory(loaded, layout, images).at(depth_mm, plane_grid(loaded, depth_mm))
+    elemental_set = load_set(folder)
+    (layout,) = channel_layouts(elemental_set)
+    images = load_channel(elemental_set, layout)
+    operator = OperatorFactory(elemental_set, layout, images).at(depth_mm, plane_grid(elemental_set, depth_mm))
     return back_projection(operator, images)
 
 
@@ -58,17 +58,6 @@ def test_saturated_pixels_carry_no_number(make_set: SetMaker) -> None:
     assert valid.tolist() == [[[True] * 3] * 2, [[True, True, False], [False, True, True]]]
 
 
-@pytest.mark.parametrize("saturation_dn", [None, 255.0])
-def test_8_bit_images_with_own_noise_model(saturation_dn: float | None, make_set: SetMaker) -> None:
-    noise: dict[str, Any] = {"offset_dn": 5.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0}
-    folder = make_set([np.full((2, 3), 15, np.uint8)], noise=noise | _stated(saturation_dn=saturation_dn))
-    np.testing.assert_array_equal(_channels(folder)["grey"].electrons, 10.0)
-
-
-def _stated(**values: Any) -> dict[str, Any]:
-    return {key: value for key, value in values.items() if value is not None}
-
-
 SIXTEEN_BITS = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "saturation_dn": 65535.0}
 
 
@@ -76,16 +65,12 @@ SIXTEEN_BITS = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "sa
     ("image", "failure", "words"),
     [
         (np.zeros((16, 12), np.uint16), WrongSize, r"is 12 x 16 px"),
-        (
-            np.zeros((12, 16), np.uint8),
-            WrongBitDepth,
-            r"has 8 bits per pixel, but the noise model saturates at 65535 DN",
-        ),
+        (np.zeros((12, 16), np.uint8), WrongBitDepth, r"has 8 bits per pixel, but .* saturates at 65535 DN"),
         (np.zeros((12, 16), np.float32), WrongBitDepth, r"holds float32 pixels"),
         (np.zeros((12, 16, 3), np.uint16), UnreadableImage, r"is colour, unlike the set's first view"),
     ],
 )
-def test_view_unlike_what_set_says_is_refused_by_name(
+def test_view_unlike_its_set_is_refused_by_name(
     image: NDArray[Any],
     failure: type[InputError],
     words: str,
@@ -98,13 +83,6 @@ def test_view_unlike_what_set_says_is_refused_by_name(
         _channels(folder)
 
 
-def test_grey_view_among_colour_ones_is_refused(make_set: SetMaker, grey_images: Sequence[NDArray[Any]]) -> None:
-    folder = make_set([np.dstack([image] * 3) for image in grey_images])
-    tifffile.imwrite(folder / "view_1.tiff", grey_images[1])
-    with pytest.raises(UnreadableImage, match=r"view_1\.tiff: is grey"):
-        _channels(folder)
-
-
 def test_each_colour_of_rgb_frames_is_channel(make_set: SetMaker) -> None:
     views = list(np.random.default_rng(1).integers(100, 900, (2, 5, 6, 3)).astype(np.uint16))
     channels = _channels(make_set(views))
@@ -113,28 +91,29 @@ def test_each_colour_of_rgb_frames_is_channel(make_set: SetMaker) -> None:
         np.testing.assert_allclose(images.electrons, (np.stack(views)[..., index] - 100.0) / 2.0)
 
 
-def test_each_phase_of_mosaic_is_lattice_of_its_colour(make_set: SetMaker) -> None:
+def test_each_mosaic_phase_is_lattice_of_its_colour(make_set: SetMaker) -> None:
     first, second = np.random.default_rng(1).integers(100, 900, (2, 5, 7)).astype(np.uint16)  # incomplete periods
     folder = make_set([first, second], camera={"mosaic": BAYER})
-    loaded = load_set(folder)
-    layouts = {layout.name: layout for layout in channel_layouts(loaded)}
-    assert {name: [lattice.first for lattice in layout.lattices] for name, layout in layouts.items()} == {
-        "red": [(0, 0)],
-        "green": [(0, 1), (1, 0)],
-        "blue": [(1, 1)],
-    }
+    phases_of = {"red": [(0, 0)], "green": [(0, 1), (1, 0)], "blue": [(1, 1)]}
+    layouts = channel_layouts(load_set(folder))
+    assert {layout.name: [lattice.first for lattice in layout.lattices] for layout in layouts} == phases_of
     channels = _channels(folder)
-    of_a_view = {"red": [(0, 0)], "green": [(0, 1), (1, 0)], "blue": [(1, 1)]}
-    for name, phases in of_a_view.items():
+    for name, phases in phases_of.items():
         # View by view, and within a view phase by phase
         expected = [view[row:4:2, column:6:2] for view in (first, second) for row, column in phases]
         np.testing.assert_allclose(channels[name].electrons, (np.stack(expected) - 100.0) / 2.0)
 
 
+def _write_noise(folder: Path, *numbers: float, **others: Any) -> None:
+    """Write a fitted noise model of offset, gain, read noise and dark current."""
+    names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s")
+    fitted = {name: {"value": value} for name, value in zip(names, numbers, strict=True)}
+    (folder / "noise.json").write_text(json.dumps(fitted | others))
+
+
 def test_maps_of_noise_follow_lattices(make_set: SetMaker) -> None:
     folder = make_set([np.zeros((4, 6), np.uint16)], camera={"mosaic": BAYER}, noise="noise.json", exposure_s=2.0)
-    values = {"offset_dn": 0.0, "gain_dn_per_e": 1.0, "read_noise_e": 1.0, "dark_current_e_per_s": 1.0}
-    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    _write_noise(folder, 0.0, 1.0, 1.0, 1.0)
     offset_dn, dark_e_per_s = np.random.default_rng(1).uniform(1, 9, (2, 4, 6))
     np.savez(folder / "noise_maps.npz", offset_dn=offset_dn, dark_current_e_per_s=dark_e_per_s)
     green = _channels(folder)["green"]
@@ -147,8 +126,7 @@ def test_maps_of_noise_follow_lattices(make_set: SetMaker) -> None:
 def test_likelihood_has_gain_and_read_noise_per_pixel(make_set: SetMaker) -> None:
     frames_dn = np.random.default_rng(2).integers(90, 200, (2, 4, 6))
     folder = make_set([frame.astype(np.uint16) for frame in frames_dn], noise="noise.json", exposure_s=2.0)
-    values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 1.5, "dark_current_e_per_s": 0.0}
-    (folder / "noise.json").write_text(json.dumps({name: {"value": value} for name, value in values.items()}))
+    _write_noise(folder, 100.0, 2.0, 1.5, 0.0)
     gain, read_e = np.random.default_rng(3).uniform(1.5, 4.0, (2, 4, 6)).astype(np.float32)
     np.savez(folder / "noise_maps.npz", gain_dn_per_e=gain, read_noise_e=read_e)
     images = _channels(folder)["grey"]
@@ -163,9 +141,7 @@ def test_hot_pixels_do_not_reach_plane(make_set: SetMaker, grey_images: Sequence
         for image in images:
             image[5, 9] = level
         folder = make_set(images, name=name, noise="noise.json")
-        values = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "dark_current_e_per_s": 0.0}
-        fitted = {name: {"value": value} for name, value in values.items()} | {"hot_pixels": [[5, 9]]}
-        (folder / "noise.json").write_text(json.dumps(fitted))
+        _write_noise(folder, 100.0, 2.0, 3.0, 0.0, hot_pixels=[[5, 9]])
         planes.append(_back_projected(folder))
     np.testing.assert_array_equal(planes[0], planes[1])
     assert planes[0].max() > 100
@@ -191,16 +167,13 @@ def test_plane_overlays_reference_view_pixel_for_pixel(depth_mm: float, make_set
     np.testing.assert_allclose(plane[1:-1, 1:-1], (frame[1:-1, 1:-1] - 100.0) / 2.0 - 2.0, rtol=1e-3)
 
 
-@pytest.mark.parametrize("own_centre", [False, True])
-@pytest.mark.parametrize("depth_mm", [0.5, 1e6])
-def test_samples_lie_where_reference_views_undistorted_pixels_look(
-    depth_mm: float, own_centre: bool, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
-) -> None:
+@pytest.mark.parametrize(("depth_mm", "centre"), [(0.5, (6.2, 7.7)), (1e6, (9.5, 2.25))])
+def test_samples_overlay_undistorted_pixels_of_reference_view(
+    depth_mm: float, centre: tuple[float, float], make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]],
+    edit: Edit,
+) -> None:  # fmt: skip
     folder = make_set(grey_images, camera={"fx_px": 40.0, "fy_px": 40.0, "cx_px": 6.2, "cy_px": 7.7})
-    centre = (6.2, 7.7)
-    if own_centre:
-        centre = (9.5, 2.25)
-        edit(folder, lambda settings: settings["view"][0].update(cx_px=9.5, cy_px=2.25))
+    edit(folder, lambda settings: settings["view"][0].update(cx_px=centre[0], cy_px=centre[1]))
     grid = plane_grid(load_set(folder), depth_mm)
     assert grid.shape == (12, 16)
     assert grid.pitch_mm == pytest.approx(depth_mm / 40.0, rel=1e-12)
@@ -210,8 +183,8 @@ def test_samples_lie_where_reference_views_undistorted_pixels_look(
 
 
 def test_another_pitch_keeps_field_of_view(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
-    loaded = load_set(make_set(grey_images))
-    default, finer = plane_grid(loaded, 500.0), plane_grid(loaded, 500.0, pitch_mm=2.5)
+    elemental_set = load_set(make_set(grey_images))
+    default, finer = plane_grid(elemental_set, 500.0), plane_grid(elemental_set, 500.0, pitch_mm=2.5)
     assert default.pitch_mm == 10.0
     assert finer.shape == (48, 64)
     for axis in (0, 1):
@@ -221,24 +194,11 @@ def test_another_pitch_keeps_field_of_view(make_set: SetMaker, grey_images: Sequ
 
 @pytest.mark.parametrize(("views", "pitch_px"), [(1, 2), (3, 2), (4, 1)])
 def test_few_mosaic_views_have_samples_per_period(views: int, pitch_px: int, make_set: SetMaker) -> None:
-    loaded = load_set(make_set([np.zeros((4, 6), np.uint16)] * views, camera={"mosaic": BAYER}))
-    assert default_pitch_px(loaded, channel_layouts(loaded)) == pitch_px
+    elemental_set = load_set(make_set([np.zeros((4, 6), np.uint16)] * views, camera={"mosaic": BAYER}))
+    assert default_pitch_px(elemental_set, channel_layouts(elemental_set)) == pitch_px
 
 
-@pytest.mark.parametrize("depth_mm", [0.0, float("nan")])
-def test_planes_that_are_not_in_front_are_refused(
-    depth_mm: float, make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]
-) -> None:
-    with pytest.raises(GeometryMismatch, match="not in front of the camera; depth_mm must be positive"):
-        plane_grid(load_set(make_set(grey_images)), depth_mm)
-
-
-def test_pitch_that_leaves_no_samples_is_refused(make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]]) -> None:
-    with pytest.raises(GeometryMismatch, match=r"plane at 500 mm: .* at least 2 x 2 samples"):
-        plane_grid(load_set(make_set(grey_images)), 500.0, 200.0)
-
-
-def test_principal_point_per_view_and_distortion_exclude_each_other(
+def test_own_principal_point_excludes_distortion(
     make_set: SetMaker, grey_images: Sequence[NDArray[np.uint16]], edit: Edit
 ) -> None:
     folder = make_set(grey_images, camera={"distortion": [-0.1]})
@@ -262,15 +222,15 @@ def test_views_with_own_principal_points(make_set: SetMaker, edit: Edit) -> None
     np.testing.assert_allclose(moved[1:-1, 6:-1], expected, rtol=1e-3)
 
 
-def test_bin_with_pixel_that_never_counts_does_not_count(make_set: SetMaker) -> None:
+def test_bin_with_unusable_pixel_does_not_count(make_set: SetMaker) -> None:
     folder = make_set([np.full((12, 16), 500, np.uint16)] * 2)
     unusable = np.zeros((12, 16), bool)
     unusable[5, 9] = True
-    loaded = replace(load_set(folder), unusable=unusable)
-    (layout,) = channel_layouts(loaded)
-    images = load_channel(loaded, layout).binned(4)
-    factory = OperatorFactory(loaded, layout, images, bins=4)
-    grid = plane_grid(loaded, 100.0).binned(4)
+    elemental_set = replace(load_set(folder), unusable=unusable)
+    (layout,) = channel_layouts(elemental_set)
+    images = load_channel(elemental_set, layout).binned(4)
+    factory = OperatorFactory(elemental_set, layout, images, bins=4)
+    grid = plane_grid(elemental_set, 100.0).binned(4)
     seen = factory.at(100.0, grid).forward(np.ones(grid.shape, np.float32), [0])[0]
     assert seen[1, 2] == 0
     assert np.count_nonzero(seen) == seen.size - 1

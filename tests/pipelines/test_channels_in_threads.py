@@ -37,9 +37,9 @@ def _pictures(views: int, shape: tuple[int, int] = (150, 34)) -> list[NDArray[np
     return list(np.random.default_rng(20110919).integers(80, 1100, (views, *shape)).astype(np.uint16))
 
 
-def _with_maps(loaded: ElementalSet) -> ElementalSet:
+def _with_maps(elemental_set: ElementalSet) -> ElementalSet:
     """The set with a map for each number of the sensor, and a response that bends."""
-    rng, shape = np.random.default_rng(7), loaded.settings.camera.size_px[::-1]
+    rng, shape = np.random.default_rng(7), elemental_set.settings.camera.size_px[::-1]
     noise = NoiseModel(
         offset_dn=rng.normal(100, 5, shape),
         gain_dn_per_e=rng.uniform(1.9, 2.1, shape),
@@ -47,20 +47,20 @@ def _with_maps(loaded: ElementalSet) -> ElementalSet:
         saturation_dn=999.5,
         response=BentResponse((rng.uniform(1e-5, 2e-5, shape), -1e-9), rng.uniform(500, 600, shape)),
     )
-    return replace(loaded, noise=noise)
+    return replace(elemental_set, noise=noise)
 
 
-def _plain(loaded: ElementalSet, phase: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _plain(elemental_set: ElementalSet, phase: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """One phase of the mosaic of all views by whole arrays, one frame after the other."""
-    noise, electrons, valid = loaded.noise, [], []
+    noise, electrons, valid = elemental_set.noise, [], []
     assert noise.response is not None
 
     def of(pixels: Any) -> Any:
         return pixels[phase[0] :: 2, phase[1] :: 2]
 
-    for view in range(len(loaded.settings.view)):
+    for view in range(len(elemental_set.settings.view)):
         parts, over = [], []
-        for path in loaded.frame_paths(view):
+        for path in elemental_set.frame_paths(view):
             pixels = of(tifffile.imread(path))
             signal = (pixels.astype(np.float32) - of(noise.offset_dn).astype(np.float32)).astype(float)
             within = np.clip(signal, 0, of(noise.response.up_to_dn))
@@ -89,29 +89,28 @@ def test_colour_is_that_of_plain_arithmetic(
         ]
 
     edit(folder, add_up_in_twos)
-    loaded = _with_maps(load_set(folder))
-    green = next(layout for layout in channel_layouts(loaded) if layout.name == "green")
-    images = load_channel(loaded, green)
+    elemental_set = _with_maps(load_set(folder))
+    green = next(layout for layout in channel_layouts(elemental_set) if layout.name == "green")
+    images = load_channel(elemental_set, green)
     assert images.valid is not None
     for index, phase in enumerate([(0, 1), (1, 0)]):
-        electrons, valid = _plain(loaded, phase)
+        electrons, valid = _plain(elemental_set, phase)
         np.testing.assert_allclose(images.electrons[index::2], electrons, rtol=3e-7, atol=1e-5)
         np.testing.assert_array_equal(images.valid[index::2], valid)
     assert not images.valid.all()
 
 
-class _Counted:
+class _CountedReader:
     """Reads frames, counts those that are begun and at work, and does something with each by its number."""
 
-    def __init__(self, meanwhile: Callable[[int], object] = lambda _: None) -> None:
-        self.begun, self.at_work, self.most = 0, 0, 0
+    def __init__(self, meanwhile: Callable[[int], object]) -> None:
+        self.begun, self.at_work = 0, 0
         self._lock, self._meanwhile = threading.Lock(), meanwhile
 
     def __call__(self, path: Path, size_px: tuple[int, int]) -> Frame:
         with self._lock:
             self.begun += 1
             self.at_work += 1
-            self.most = max(self.most, self.at_work)
         try:
             self._meanwhile(int(path.stem.removeprefix("view_")))
             return read_frame(path, size_px)
@@ -121,31 +120,21 @@ class _Counted:
 
 
 def _grey(make_set: SetMaker, views: int) -> tuple[ElementalSet, Any]:
-    loaded = load_set(make_set(_pictures(views)))
-    (layout,) = channel_layouts(loaded)
-    return loaded, layout
-
-
-def test_each_thread_reads_one_frame(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
-    _threads(3, monkeypatch)
-    loaded, layout = _grey(make_set, 12)
-    together = threading.Barrier(3)
-    counted = _Counted(lambda _: together.wait(HANG_S))
-    images = load_channel(replace(loaded, read_frame=counted), layout)
-    assert (counted.begun, counted.most, counted.at_work) == (12, 3, 0)
-    np.testing.assert_array_equal(images.electrons, load_channel(loaded, layout).electrons)
+    elemental_set = load_set(make_set(_pictures(views)))
+    (layout,) = channel_layouts(elemental_set)
+    return elemental_set, layout
 
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_memory_is_that_of_frames_at_work(threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
     _threads(threads, monkeypatch)
     shape, views = (300, 400), 24
-    loaded = load_set(make_set(_pictures(views, shape)))
-    (layout,) = channel_layouts(loaded)
-    load_channel(loaded, layout)
+    elemental_set = load_set(make_set(_pictures(views, shape)))
+    (layout,) = channel_layouts(elemental_set)
+    load_channel(elemental_set, layout)
     tracemalloc.start()
     try:
-        images = load_channel(loaded, layout)
+        images = load_channel(elemental_set, layout)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -156,13 +145,13 @@ def test_memory_is_that_of_frames_at_work(threads: int, make_set: SetMaker, monk
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_first_damaged_frame_is_named_and_nothing_goes_on(
+def test_first_damaged_frame_ends_reading_by_name(
     threads: int, make_set: SetMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _threads(threads, monkeypatch)
-    loaded, layout = _grey(make_set, 40)
+    elemental_set, layout = _grey(make_set, 40)
     for view in (4, 5, 6):
-        os.truncate(loaded.image_paths[view], 3000)
+        os.truncate(elemental_set.image_paths[view], 3000)
     later = threading.Event()
 
     def fifth_fails_first(view: int) -> None:
@@ -171,16 +160,16 @@ def test_first_damaged_frame_is_named_and_nothing_goes_on(
         if view in (5, 6):
             later.set()
 
-    counted = _Counted(fifth_fails_first)
+    counted = _CountedReader(fifth_fails_first)
     with pytest.raises(UnreadableImage, match=r"view_4\.tiff: cannot be decoded"):
-        load_channel(replace(loaded, read_frame=counted), layout)
+        load_channel(replace(elemental_set, read_frame=counted), layout)
     assert counted.at_work == 0
     assert counted.begun <= 4 + threads
 
 
 def test_interrupt_ends_all_threads(make_set: SetMaker, monkeypatch: pytest.MonkeyPatch) -> None:
     _threads(3, monkeypatch)
-    loaded, layout = _grey(make_set, 40)
+    elemental_set, layout = _grey(make_set, 40)
     together = threading.Barrier(3)
 
     def interrupted(_: int) -> None:
@@ -189,60 +178,41 @@ def test_interrupt_ends_all_threads(make_set: SetMaker, monkeypatch: pytest.Monk
             together.abort()  # nobody waits for the main thread any longer
             raise KeyboardInterrupt
 
-    counted = _Counted(interrupted)
+    counted = _CountedReader(interrupted)
     with pytest.raises(KeyboardInterrupt):
-        load_channel(replace(loaded, read_frame=counted), layout)
+        load_channel(replace(elemental_set, read_frame=counted), layout)
     assert counted.at_work == 0
     assert counted.begun <= 6
 
 
-def _compressed(folder: Path) -> None:
-    for path in folder.glob("*.tiff"):
-        tifffile.imwrite(path, tifffile.imread(path), compression="zlib", predictor=True)
-
-
-def _decoded(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """The files that are decoded from now on."""
-    decoded = []
-
-    def counted(file: Any, path: Path, *arguments: Any) -> Any:
-        decoded.append(path)
-        return decode_tiff(file, path, *arguments)
-
-    monkeypatch.setattr(frames, "decode_tiff", counted)
-    return decoded
-
-
 @pytest.mark.parametrize(
-    ("free_bytes", "decoded_times"), [(10**9, 1), (0, 3)], ids=["with room", "without room on the disk"]
+    ("free_bytes", "most_kept", "decoded"),
+    [(10**9, None, 4), (0, None, 12), (10**9, 3, 4 + 2 * 1)],  # the first colour, and one frame for each of the others
+    ids=["with room", "without room on the disk", "few open files"],
 )
 def test_compressed_frames_are_decoded_once_for_all_colours(
-    free_bytes: int, decoded_times: int, make_set: SetMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder, out = make_set(_pictures(4), camera={"mosaic": BAYER}), tmp_path / "out"
-    _compressed(folder)
-    loaded = load_set(folder)
-    layouts = channel_layouts(loaded)
-    plain = [load_channel(loaded, layout).electrons for layout in layouts]
+    free_bytes: int, most_kept: int | None, decoded: int, make_set: SetMaker, tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    folder, out, decoded_paths = make_set(_pictures(4), camera={"mosaic": BAYER}), tmp_path / "out", []
+    for path in folder.glob("*.tiff"):
+        tifffile.imwrite(path, tifffile.imread(path), compression="zlib", predictor=True)
+    elemental_set = load_set(folder)
+    layouts = channel_layouts(elemental_set)
+    plain = [load_channel(elemental_set, layout).electrons for layout in layouts]
+
+    def decode(file: Any, path: Path, *arguments: Any) -> Any:
+        decoded_paths.append(path)
+        return decode_tiff(file, path, *arguments)
+
     monkeypatch.setattr(channels, "disk_usage", lambda _: SimpleNamespace(free=free_bytes))
-    decoded = _decoded(monkeypatch)
-    keeping = keeping_frames(loaded, out)
+    if most_kept:
+        monkeypatch.setattr(channels, "_MOST_KEPT", most_kept)
+    monkeypatch.setattr(frames, "decode_tiff", decode)
+    keeping = keeping_frames(elemental_set, out)
     for layout, electrons in zip(layouts, plain, strict=True):
         np.testing.assert_array_equal(load_channel(keeping, layout).electrons, electrons)
-    assert sorted(decoded) == sorted(loaded.image_paths * decoded_times)
+    assert len(decoded_paths) == decoded
+    assert {*decoded_paths} == {*elemental_set.image_paths}
     assert not list(out.iterdir())  # the files have no name
     assert keeping_frames(keeping, out) is keeping
-
-
-def test_kept_frames_are_limited_by_open_files(
-    make_set: SetMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = make_set(_pictures(4), camera={"mosaic": BAYER})
-    _compressed(folder)
-    loaded = load_set(folder)
-    monkeypatch.setattr(channels, "_MOST_KEPT", 3)
-    decoded = _decoded(monkeypatch)
-    keeping = keeping_frames(loaded, tmp_path / "out")
-    for layout in channel_layouts(loaded):
-        load_channel(keeping, layout)
-    assert len(decoded) == 1 + 4 + 2 * 1  # the layouts; the first colour; one frame for each of the others

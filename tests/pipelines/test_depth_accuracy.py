@@ -106,8 +106,8 @@ def test_reconstruction_with_depth_writes_its_errors(
     out = tmp_path / "out"
     bring_truth(scene, np.full((72, 96), FOUND_MM * 1.25))
     monkeypatch.setattr(confidence, "SURE", 0.9 * FOUND_CONFIDENCE)
-    said = done("reconstruct", scene, "--out", out, *options).stderr
+    message = done("reconstruct", scene, "--out", out, *options).stderr
     assert seen
     written = json.loads((out / "depth_errors.json").read_text())
     assert written["median_relative_error"] == pytest.approx(0.2, rel=1e-4)
-    assert "median error 150 mm (20.00%)" in said
+    assert "median error 150 mm (20.00%)" in message

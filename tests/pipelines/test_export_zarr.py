@@ -1,21 +1,19 @@
 """`export zarr`: what the libraries of OME-Zarr and zarr read is what was reconstructed, where it is."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
 import pytest
 import tifffile
 
-type Command = Callable[..., CompletedProcess[str]]
+from faintfield.pipelines.cli import run
+from tests.pipelines.conftest import Command, drawing_nothing, made_once
+from tests.pipelines.refusals import assert_refused
 
 zarr = pytest.importorskip("zarr")
 ome_zarr_models = pytest.importorskip("ome_zarr_models")
-
-SWEEP = ("--sweep-mm", "500:700:3", "--method", "backprojection")
 
 
 def _image(folder: Path) -> tuple[Any, Any]:
@@ -29,11 +27,8 @@ def _image(folder: Path) -> tuple[Any, Any]:
 
 
 def _scales(multiscale: Any) -> list[tuple[list[float], list[float]]]:
-    found = []
-    for dataset in multiscale.datasets:
-        scale, translation = dataset.coordinateTransformations
-        found.append((list(scale.scale), list(translation.translation)))
-    return found
+    pairs = [dataset.coordinateTransformations for dataset in multiscale.datasets]
+    return [(list(scale.scale), list(translation.translation)) for scale, translation in pairs]
 
 
 def _planes(out: Path) -> list[dict[str, Any]]:
@@ -41,12 +36,21 @@ def _planes(out: Path) -> list[dict[str, Any]]:
     return planes
 
 
-def test_a_sweep_has_its_depths_in_mm_and_its_samples_in_milliradians(
-    scene: Path, tmp_path: Path, done: Command
-) -> None:
-    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
-    done("reconstruct", scene, "--out", out, *SWEEP)
-    done("export", "zarr", out, stack)
+@pytest.fixture(scope="module")
+def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of five planes, to be read only."""
+
+    def make(folder: Path) -> None:
+        words = ("--out", folder / "out", "--sweep-mm", "500:700:5", "--method", "backprojection")
+        with drawing_nothing():
+            assert run([str(word) for word in ("reconstruct", simulated_scene, *words)]) == 0
+
+    return made_once(tmp_path_factory, "sweep-for-export", make) / "out"
+
+
+def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Command) -> None:
+    stack = tmp_path / "sweep.ome.zarr"
+    done("export", "zarr", sweep, stack)
     group, multiscale = _image(stack)
     assert [(axis.name, axis.type, axis.unit) for axis in multiscale.axes] == [
         ("c", "channel", None),
@@ -55,8 +59,8 @@ def test_a_sweep_has_its_depths_in_mm_and_its_samples_in_milliradians(
         ("x", "space", None),
     ]
     ((scale, translation),) = _scales(multiscale)
-    first = _planes(out)[0]
-    assert scale[:2] == [1.0, pytest.approx(100.0)]
+    first = _planes(sweep)[0]
+    assert scale[:2] == [1.0, pytest.approx(50.0)]
     assert translation[:2] == [0.0, 500.0]
     for axis, start in ((3, first["origin_mm"][0]), (2, first["origin_mm"][1])):
         assert scale[axis] * first["depth_mm"] / 1e3 == pytest.approx(first["pitch_mm"])
@@ -64,10 +68,11 @@ def test_a_sweep_has_its_depths_in_mm_and_its_samples_in_milliradians(
     assert group.attrs["faintfield"]["row_and_column"] == "mrad"
     pixels = group["0"][:]
     assert pixels.dtype == np.float32
-    np.testing.assert_array_equal(pixels[0], [tifffile.imread(out / plane["file"]) for plane in _planes(out)])
+    np.testing.assert_array_equal(pixels[0], [tifffile.imread(sweep / plane["file"]) for plane in _planes(sweep)])
 
 
-def test_planes_of_one_pitch_are_in_millimetres(scene: Path, tmp_path: Path, done: Command) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_planes_of_one_pitch_are_in_mm(scene: Path, tmp_path: Path, done: Command) -> None:
     out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
     done("reconstruct", scene, "--out", out, "--sweep-mm", "500:501:2", "--method", "backprojection", "--pitch-mm", 5)
     done("export", "zarr", out, stack)
@@ -78,7 +83,8 @@ def test_planes_of_one_pitch_are_in_millimetres(scene: Path, tmp_path: Path, don
     assert translation[2:] == [pytest.approx(value) for value in _planes(out)[0]["origin_mm"][::-1]]
 
 
-def test_large_colour_planes_are_there_at_several_resolutions(
+@pytest.mark.usefixtures("undrawn")
+def test_large_colour_planes_have_several_resolutions(
     tmp_path: Path, done: Command, small_options: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("faintfield.pipelines.formats.exchange.zarr._COARSEST_PX", 30)
@@ -104,49 +110,36 @@ def test_large_colour_planes_are_there_at_several_resolutions(
             assert translation[axis] + scale[axis] * index == pytest.approx(middle)
 
 
-def test_an_older_export_is_replaced_and_nothing_else(
-    scene: Path, tmp_path: Path, done: Command, faintfield: Command
-) -> None:
-    out, stack = tmp_path / "out", tmp_path / "sweep.ome.zarr"
-    done("reconstruct", scene, "--out", out, *SWEEP)
-    done("export", "zarr", out, stack)
-    refused = faintfield("export", "zarr", out, stack)
-    assert refused.returncode == 1
-    assert "OutputExists" in refused.stderr
-    done("export", "zarr", out, stack, "--overwrite")
+def test_only_earlier_exports_are_replaced(sweep: Path, tmp_path: Path, done: Command, faintfield: Command) -> None:
+    stack = tmp_path / "sweep.ome.zarr"
+    done("export", "zarr", sweep, stack)
+    assert_refused(faintfield("export", "zarr", sweep, stack), "OutputExists")
+    done("export", "zarr", sweep, stack, "--overwrite")
     (stack / "notes.txt").touch()
-    refused = faintfield("export", "zarr", out, stack, "--overwrite")
-    assert refused.returncode == 1
-    assert "holds files already (notes.txt)" in refused.stderr
-
-
-def test_arrays_of_others_are_left_alone(scene: Path, tmp_path: Path, done: Command, faintfield: Command) -> None:
-    """They have a zarr.json as well."""
-    out, theirs = tmp_path / "out", tmp_path / "theirs.zarr"
-    done("reconstruct", scene, "--out", out, *SWEEP)
+    ended = faintfield("export", "zarr", sweep, stack, "--overwrite")
+    assert_refused(ended, "OutputExists", "holds files already (notes.txt)")
+    # Arrays of other programs have a zarr.json, too
+    theirs = tmp_path / "theirs.zarr"
     zarr.open_group(theirs, mode="w", zarr_format=3).create_array("0", shape=(3,), dtype="float32")[:] = [1, 2, 3]
     for words in ((), ("--overwrite",)):
-        refused = faintfield("export", "zarr", out, theirs, *words)
-        assert refused.returncode == 1
-        assert "OutputExists" in refused.stderr
+        assert_refused(faintfield("export", "zarr", sweep, theirs, *words), "OutputExists")
         np.testing.assert_array_equal(zarr.open_group(theirs, mode="r")["0"][:], [1, 2, 3])
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "reason"),
     [
         (("--depth-mm", 500, "--depth-mm", 550, "--depth-mm", 700), "not in equal steps"),
         (("--depth-mm", 500, "--method", "mlem"), "holds planes of 2 calls or methods"),
     ],
 )
-def test_planes_that_fit_no_stack_are_refused(
-    words: tuple[object, ...], said: str, simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
+def test_planes_without_stack_are_refused(
+    words: tuple[object, ...], reason: str, simulated_scene: Path, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:
     out = tmp_path / "out"
-    assert (
-        faintfield("reconstruct", simulated_scene, "--out", out, *words, "--method", "backprojection").returncode == 0
-    )
+    done("reconstruct", simulated_scene, "--out", out, *words, "--method", "backprojection")
     ended = faintfield("export", "zarr", out, tmp_path / "stack.zarr")
     assert ended.returncode == 1
-    assert said in ended.stderr
+    assert reason in ended.stderr
     assert not (tmp_path / "stack.zarr").exists()

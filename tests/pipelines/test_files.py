@@ -1,5 +1,6 @@
 """Files and folders appear whole or not at all."""
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -31,7 +32,7 @@ class _Stop(BaseException):
 
 
 @pytest.mark.parametrize("content", ["words – with a dash\n", b"\0\xff bytes"])
-def test_what_is_written_is_there_and_nothing_else(content: str | bytes, tmp_path: Path) -> None:
+def test_file_is_written_alone(content: str | bytes, tmp_path: Path) -> None:
     write_whole(tmp_path / "new" / "folder" / "file", content)
     expected = content.encode() if isinstance(content, str) else content
     assert (tmp_path / "new" / "folder" / "file").read_bytes() == expected
@@ -51,7 +52,7 @@ def test_new_files_have_the_permissions_of_the_umask(tmp_path: Path) -> None:
     assert (tmp_path / "folder").stat().st_mode & 0o777 == 0o750
 
 
-def test_a_file_gets_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_is_named_once_it_is_on_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     steps: list[str] = []
 
     def watched[**P, R](name: str, step: Callable[P, R]) -> Callable[P, R]:
@@ -67,8 +68,7 @@ def test_a_file_gets_its_name_only_when_it_is_on_the_disk(tmp_path: Path, monkey
     assert steps == ["fsync", "replace", "fsync"]  # the content, its name, and the folder's entry
 
 
-@pytest.mark.parametrize("failure", [_Stop])
-def test_an_interrupted_write_keeps_the_earlier_file(failure: type[BaseException], tmp_path: Path) -> None:
+def test_interrupted_write_keeps_earlier_file(tmp_path: Path) -> None:
     path = tmp_path / "file"
     path.write_text("before")
 
@@ -76,43 +76,29 @@ def test_an_interrupted_write_keeps_the_earlier_file(failure: type[BaseException
         with writing(path) as file:
             file.write(b"half of")
             file.flush()
-            raise failure
+            raise _Stop
 
-    with pytest.raises(failure):
+    with pytest.raises(_Stop):
         stop_half_way()
     assert path.read_text() == "before"
     assert _everything_below(tmp_path) == {"file"}
 
 
-@pytest.mark.parametrize("failure", [_Stop])
-def test_an_interrupted_folder_does_not_appear(failure: type[BaseException], tmp_path: Path) -> None:
-    def stop_half_way() -> None:
-        with writing_folder(tmp_path / "out") as folder:
-            (folder / "part").touch()
-            assert not (tmp_path / "out").exists()
-            raise failure
-
-    with pytest.raises(failure):
-        stop_half_way()
-    assert _everything_below(tmp_path) == set()
-
-
+@pytest.mark.parametrize("exists", [False, True])
 @pytest.mark.parametrize("stops", [False, True])
-def test_a_folder_is_replaced_whole_or_not_at_all(stops: bool, tmp_path: Path) -> None:
+def test_folder_is_replaced_whole_or_not(exists: bool, stops: bool, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    (out / "deep").mkdir(parents=True)
-    (out / "deep" / "old").touch()
-    (out / "mark").touch()
-    try:
-        with writing_folder(out, replace_if="mark") as folder:
-            (folder / "new").touch()
-            if stops:
-                raise _Stop
-    except _Stop:
-        assert _everything_below(out) == {"deep", "deep/old", "mark"}
-    else:
-        assert _everything_below(out) == {"new"}
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    if exists:
+        (out / "deep").mkdir(parents=True)
+        (out / "deep" / "old").touch()
+        (out / "mark").touch()
+    before = _everything_below(tmp_path)
+    with contextlib.suppress(_Stop), writing_folder(out, replace_if="mark") as folder:
+        (folder / "new").touch()
+        assert out.exists() == exists
+        if stops:
+            raise _Stop
+    assert _everything_below(tmp_path) == (before if stops else {"out", "out/new"})
 
 
 def _with_a_file(out: Path) -> None:
@@ -128,7 +114,7 @@ def _with_a_file(out: Path) -> None:
         (Path.touch, {"replace_if": "elemental.toml"}, "is a file"),
     ],
 )
-def test_files_of_others_are_left_alone(
+def test_foreign_files_are_left_alone(
     prepare: Callable[[Path], object], earlier: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     prepare(tmp_path / "out")
@@ -138,7 +124,21 @@ def test_files_of_others_are_left_alone(
     assert _everything_below(tmp_path) == before
 
 
-def test_a_folder_of_nothing_but_such_names_is_replaced(tmp_path: Path) -> None:
+@pytest.mark.parametrize("reads", ["out", "out/deep", "out/deep/../../out", "out/link"])
+def test_folder_of_inputs_is_never_replaced(reads: str, tmp_path: Path) -> None:
+    (tmp_path / "out" / "deep").mkdir(parents=True)
+    (tmp_path / "out" / "mark").touch()
+    (tmp_path / "out" / "link").symlink_to(tmp_path / "elsewhere")
+    before = _everything_below(tmp_path)
+    with (
+        pytest.raises(OutputExists, match="which is read"),
+        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
+    ):
+        pytest.fail("nothing must be built")
+    assert _everything_below(tmp_path) == before
+
+
+def test_folder_of_replaceable_names_is_replaced(tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     for name in ("cameras.txt", "a.model", "b.model"):
@@ -148,58 +148,22 @@ def test_a_folder_of_nothing_but_such_names_is_replaced(tmp_path: Path) -> None:
     assert _everything_below(tmp_path) == {"out", "out/c.model"}
 
 
-def test_a_link_to_what_is_read_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "mark").touch()
-    (tmp_path / "out" / "link").symlink_to(tmp_path / "elsewhere")
-    with (
-        pytest.raises(OutputExists, match="link, which is read"),
-        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / "out" / "link"]),
-    ):
-        pytest.fail("nothing must be built")
-
-
-@pytest.mark.parametrize("reads", ["out", "out/deep", "out/deep/../../out"])
-def test_a_folder_is_never_replaced_by_what_is_made_from_it(reads: str, tmp_path: Path) -> None:
-    (tmp_path / "out" / "deep").mkdir(parents=True)
-    (tmp_path / "out" / "mark").touch()
-    with (
-        pytest.raises(OutputExists, match="which is read"),
-        writing_folder(tmp_path / "out", replace_if="mark", reads=[tmp_path / reads]),
-    ):
-        pytest.fail("nothing must be built")
-    assert _everything_below(tmp_path) == {"out", "out/deep", "out/mark"}
-
-
-def test_the_working_folder_can_be_filled_when_it_is_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    with writing_folder(Path()) as folder:
-        (folder / "part").touch()
-    assert _everything_below(tmp_path) == {"here", "here/part"}
-
-
 @pytest.mark.parametrize("write", [lambda path: write_whole(path, b""), lambda path: writing_folder(path).__enter__()])
-def test_an_impossible_place_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
+def test_impossible_place_is_named(write: Callable[[Path], object], tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(CannotWrite, match=r"file.*; name a place that can be written") as refused:
         write(tmp_path / "file" / "out")
     assert not isinstance(refused.value, DiskFull)
 
 
-def test_room_is_asked_for_before_the_work(tmp_path: Path) -> None:
+def test_room_is_asked_for_before_work(tmp_path: Path) -> None:
     require_room(tmp_path / "not" / "yet" / "there", 1)
     with pytest.raises(DiskFull, match=r"there: 1000000000000\.0 MB are needed, .* MB are free; make room"):
         require_room(tmp_path / "not" / "yet" / "there", 10**18)
 
 
-def test_the_hash_is_that_of_the_standard(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"abc")
-    assert sha256(tmp_path / "file") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-
-
 @pytest.mark.parametrize("content", [b"[" * 100_000, b'{"file": 3}', None])
-def test_a_cache_of_hashes_that_cannot_be_read_is_none(content: bytes | None, tmp_path: Path) -> None:
+def test_unreadable_cache_of_hashes_is_ignored(content: bytes | None, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"abc")
     if content is None:
         os.mkfifo(tmp_path / CACHE_FILE)
@@ -208,7 +172,7 @@ def test_a_cache_of_hashes_that_cannot_be_read_is_none(content: bytes | None, tm
     assert Hashes(tmp_path).of("file") == sha256(tmp_path / "file")
 
 
-def test_a_second_writer_of_a_folder_is_refused(tmp_path: Path) -> None:
+def test_second_writer_of_folder_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "results"
     with exclusive(folder):
         with pytest.raises(OutputBusy, match="another faintfield command is writing there"), exclusive(folder):
@@ -220,9 +184,7 @@ def test_a_second_writer_of_a_folder_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in folder.iterdir()] == ["plane.tiff"]
 
 
-def test_an_interrupt_as_soon_as_the_file_is_there_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_after_opening_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = Path.open
 
     def interrupted(self: Path, *arguments: Any) -> None:
@@ -235,7 +197,7 @@ def test_an_interrupt_as_soon_as_the_file_is_there_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_only_an_empty_folder_that_the_block_made_is_removed(tmp_path: Path) -> None:
+def test_only_new_empty_folders_are_removed(tmp_path: Path) -> None:
     made, kept, filled = tmp_path / "made", tmp_path / "kept", tmp_path / "filled"
     kept.mkdir()
     with removed_if_empty(made):

@@ -1,4 +1,4 @@
-"""What names of pictures say: archives, patterns, running numbers; and what is not said is asked for."""
+"""Names of pictures: archives, patterns, running numbers; places that no name states are asked for."""
 
 import re
 from collections.abc import Sequence
@@ -36,12 +36,6 @@ def test_row_and_column_are_found_wherever_they_stand(template: str) -> None:
     assert read(names) == NODES
 
 
-def test_positions_of_stanford_are_read_as_y_and_x() -> None:
-    (place, other) = places_by_habit(["out_00_01_-381.909_1124.376_.png", "out_16_02_-777.25_1000.5.png"])
-    assert (place.row, place.column, place.y, place.x) == (0, 1, -381.909, 1124.376)
-    assert (other.row, other.column, other.y, other.x) == (16, 2, -777.25, 1000.5)
-
-
 def test_positions_alone_give_rows_and_columns() -> None:
     generator = np.random.default_rng(20261122)
     names = [
@@ -52,11 +46,11 @@ def test_positions_alone_give_rows_and_columns() -> None:
 
 
 @pytest.mark.parametrize("template", ["input_Cam{:03}.png", "scene2024_{:03}.png"])
-def test_one_running_number_is_a_square_row_by_row(template: str) -> None:
+def test_running_numbers_are_a_square(template: str) -> None:
     names = [template.format(number) for number in range(5, 14)]
-    nodes, said = nodes_of(places_by_habit(names))
+    nodes, words = nodes_of(places_by_habit(names))
     assert nodes == [divmod(number, 3) for number in range(9)]
-    assert "9 pictures by one number; they are taken as 3 x 3, row by row" in said
+    assert "9 pictures by one number; they are taken as 3 x 3, row by row" in words
 
 
 @given(
@@ -65,7 +59,7 @@ def test_one_running_number_is_a_square_row_by_row(template: str) -> None:
     width=st.integers(1, 8),
     text=st.sampled_from(["", "IMG_", "a-"]),
 )
-def test_a_running_number_is_never_split_into_digits(first: int, side: int, width: int, text: str) -> None:
+def test_running_number_is_never_split_into_digits(first: int, side: int, width: int, text: str) -> None:
     names = [f"{text}{first + number:0{width}}.png" for number in range(side**2)]
     assert read(names) == [divmod(number, side) for number in range(side**2)]
 
@@ -78,12 +72,12 @@ def test_a_running_number_is_never_split_into_digits(first: int, side: int, widt
         (["a.png", "b.png"], "a.png: its name has no row and column; give --rows and --columns"),
     ],
 )
-def test_what_names_do_not_say_is_asked_for(names: list[str], words: str) -> None:
+def test_missing_places_are_asked_for(names: list[str], words: str) -> None:
     with pytest.raises(BadValue, match=re.escape(words)):
         read(names)
 
 
-def test_one_row_that_can_be_no_square_is_one_row() -> None:
+def test_numbers_of_no_square_are_one_row() -> None:
     assert read([f"cam_0_{n}.png" for n in range(7)]) == [(0, n) for n in range(7)]
     assert read([f"cam_{n}_3.png" for n in range(7)]) == [(n, 3) for n in range(7)]
 
@@ -98,13 +92,16 @@ def test_one_row_that_can_be_no_square_is_one_row() -> None:
         ("p{x},{y}.png", ["p0,1.png", "p0,0.png", "p1.2,0.1.png", "p1,1.png"], [(1, 0), (0, 0), (0, 1), (1, 1)]),
     ],
 )
-def test_a_pattern_says_what_names_say(pattern: str, names: list[str], nodes: list[Node]) -> None:
+def test_pattern_reads_names(pattern: str, names: list[str], nodes: list[Node]) -> None:
     assert read(names, pattern) == nodes
 
 
-def test_positions_of_a_pattern_are_those_of_its_fields() -> None:
+def test_positions_are_those_of_their_fields() -> None:
     (place,) = places_by_pattern("{name}_{row}_{column}_{y}_{x}.png", ["s_7_3_4_-1.5_2e1.png"])
     assert (place.x, place.y) == (20.0, -1.5)
+    stanford = places_by_habit(["out_00_01_-381.909_1124.376_.png", "out_16_02_-777.25_1000.5.png"])
+    expected = [(0, 1, -381.909, 1124.376), (16, 2, -777.25, 1000.5)]
+    assert [(place.row, place.column, place.y, place.x) for place in stanford] == expected
 
 
 @pytest.mark.parametrize(
@@ -115,59 +112,52 @@ def test_positions_of_a_pattern_are_those_of_its_fields() -> None:
         ("{row}_{row}.png", "{row} is no field, or is there twice; use each of {name}, {row}"),
     ],
 )
-def test_a_pattern_that_does_not_fit_is_refused(pattern: str, words: str) -> None:
+def test_unfit_pattern_is_refused(pattern: str, words: str) -> None:
     with pytest.raises(BadValue, match=re.escape(words)):
         read(["1_2.png", "1_34_5.png"], pattern)
 
 
-def answer(names: Sequence[str], pattern: str | None) -> list[Node] | str:
-    """Return the nodes that names say, or what the named failure says."""
-    try:
-        return read(names, pattern)
-    except BadValue as failure:
-        return str(failure)
-
-
 @given(st.lists(st.text(max_size=40), min_size=1, max_size=6), st.text(max_size=12))
-def test_any_names_give_nodes_or_a_named_failure(names: list[str], pattern: str) -> None:
-    for given_pattern in (None, pattern, "{row}*{column}" + pattern):
-        said = answer(names, given_pattern)
-        if isinstance(said, str):
-            assert re.search(r"give|correct|name them|use each|say which|leave", said)
+def test_any_names_give_nodes_or_named_failure(names: list[str], text: str) -> None:
+    for pattern in (None, text, "{row}*{column}" + text):
+        try:
+            assert len(read(names, pattern)) == len(names)
+        except BadValue as failure:
+            message = str(failure)
         else:
-            assert len(said) == len(names)
+            continue
+        assert re.search(r"give|correct|name them|use each|say which|leave", message)
 
 
-def test_numbers_count_as_people_count() -> None:
+def test_names_are_sorted_by_number() -> None:
     names = ["b1.png", "a10.png", "a9.png", "a09.png", "a.png", "10.png", "²3.png"]
     assert sorted(names, key=by_number) == ["10.png", "a09.png", "a9.png", "a10.png", "a.png", "b1.png", "²3.png"]
 
 
-class TestMeasuredSteps:
-    """Positions of any unit and direction become steps right and down."""
+@pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1)])
+def test_measured_steps_are_true_in_any_directions(signs: tuple[int, int]) -> None:
+    generator = np.random.default_rng(4)
+    true = {(r, c): np.array([c, 1.5 * r]) + generator.uniform(-0.1, 0.1, 2) for r in range(5) for c in range(6)}
+    stated = {node: tuple(np.array([1000.0, -3.0]) + 61.5 * place * signs) for node, place in true.items()}
+    steps = measured_steps(stated)
+    # The mean distance of columns is 1 by least squares, which the errors of the true ones change a little
+    scale = np.polyfit([c for _, c in true], [place[0] for place in true.values()], 1)[0]
+    for node, place in true.items():
+        np.testing.assert_allclose(steps[node], (place - true[0, 0]) / scale, atol=1e-9)
 
-    @pytest.mark.parametrize("signs", [(1, 1), (-1, 1), (1, -1)])
-    def test_they_are_the_true_ones_whatever_unit_and_directions(self, signs: tuple[int, int]) -> None:
-        generator = np.random.default_rng(4)
-        true = {(r, c): np.array([c, 1.5 * r]) + generator.uniform(-0.1, 0.1, 2) for r in range(5) for c in range(6)}
-        stated = {node: tuple(np.array([1000.0, -3.0]) + 61.5 * place * signs) for node, place in true.items()}
-        found = measured_steps(stated)
-        # The mean distance of columns is 1 by least squares, which the errors of the true ones change a little
-        scale = np.polyfit([c for _, c in true], [place[0] for place in true.values()], 1)[0]
-        for node, place in true.items():
-            np.testing.assert_allclose(found[node], (place - true[0, 0]) / scale, atol=1e-9)
 
-    def test_across_one_row_nothing_is_known(self) -> None:
-        found = measured_steps({(0, c): (10.0 * c, 0.3 * c % 0.7) for c in range(5)})
-        np.testing.assert_allclose([found[0, c] for c in range(5)], [(c, 0) for c in range(5)], atol=1e-12)
+def test_steps_across_one_row_are_zero() -> None:
+    steps = measured_steps({(0, c): (10.0 * c, 0.3 * c % 0.7) for c in range(5)})
+    np.testing.assert_allclose([steps[0, c] for c in range(5)], [(c, 0) for c in range(5)], atol=1e-12)
 
-    @pytest.mark.parametrize(
-        "positions",
-        [
-            {(r, c): (float(r), float(c)) for r in range(3) for c in range(3)},  # exchanged
-            {(r, c): (float((5 * c + r) % 7), float((3 * r + c) % 5)) for r in range(3) for c in range(3)},
-        ],
-    )
-    def test_positions_that_follow_no_grid_are_refused(self, positions: dict[Node, tuple[float, float]]) -> None:
-        with pytest.raises(BadValue, match=r"exchange \{x\} and \{y\} in --pattern, or put \* in their place"):
-            measured_steps(positions)
+
+@pytest.mark.parametrize(
+    "positions",
+    [
+        {(r, c): (float(r), float(c)) for r in range(3) for c in range(3)},  # exchanged
+        {(r, c): (float((5 * c + r) % 7), float((3 * r + c) % 5)) for r in range(3) for c in range(3)},
+    ],
+)
+def test_positions_without_grid_are_refused(positions: dict[Node, tuple[float, float]]) -> None:
+    with pytest.raises(BadValue, match=r"exchange \{x\} and \{y\} in --pattern, or put \* in their place"):
+        measured_steps(positions)

@@ -50,58 +50,42 @@ def at_homings(scene: ElementalSet, homings: list[int]) -> ElementalSet:
     return replace(scene, settings=msgspec.structs.replace(scene.settings, view=views))
 
 
-def test_cameras_are_shifted_by_what_lies_between_their_homing_and_that_of_the_reference(
-    scene: ElementalSet, tmp_path: Path
-) -> None:
+def test_cameras_are_shifted_along_chain_of_homings(scene: ElementalSet, tmp_path: Path) -> None:
     """Shifts add up along the chain from homing 0 to 2, and count negative backwards."""
     known = geometry(CHAIN)
     write_json(tmp_path / "geometry.json", known)
     homings = [0, 1, 2, 0, 2, 1, 2, 1, 0]  # the reference is view 4
-    found = with_measured_geometry(at_homings(scene, homings), tmp_path).settings.view
+    views = with_measured_geometry(at_homings(scene, homings), tmp_path).settings.view
     unmoved = centres_mm(np.array([node.rt_cam_ref for node in known.nodes]))
-    moved = centres_mm(np.array([view.rt_cam_ref for view in found])) - unmoved
+    moved = centres_mm(np.array([view.rt_cam_ref for view in views])) - unmoved
     wanted = {0: (-0.1, -0.03, -0.3), 1: (0.0, -0.05, -0.3), 2: (0.0, 0.0, 0.0)}
     np.testing.assert_allclose(moved, [wanted[homing] for homing in homings], atol=1e-9)
 
 
-def test_a_homing_of_unknown_shift_is_told(
-    scene: ElementalSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_shift_is_warned_of(scene: ElementalSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_json(tmp_path / "geometry.json", geometry(CHAIN[:1]))
-    found = with_measured_geometry(at_homings(scene, [0] * 6 + [5] * 3), tmp_path)
+    elemental_set = with_measured_geometry(at_homings(scene, [0] * 6 + [5] * 3), tmp_path)
     assert "3 of 9 views (view_r2_c0.tiff is the first) may be off" in capsys.readouterr().err
-    assert found.settings.view[8].rt_cam_ref == geometry([]).nodes[8].rt_cam_ref
+    assert elemental_set.settings.view[8].rt_cam_ref == geometry([]).nodes[8].rt_cam_ref
     with_measured_geometry(at_homings(scene, [7] * 9), tmp_path)
     assert not capsys.readouterr().err, "one homing shifts all views alike"
 
 
-class Taken(NamedTuple):
+class TakenFrame(NamedTuple):
     intent: int
 
 
 @pytest.mark.parametrize("own", [True, False])
-def test_the_homings_of_a_session_are_not_those_of_another(
-    own: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sessions_have_homings_of_their_own(own: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "plan.json").write_text("{}")
     known = geometry(CHAIN)
     inputs = {"plan.json": sha256(tmp_path / "plan.json") if own else "0" * 64}
     record = PosesOfSession(**msgspec.structs.asdict(known), inputs=inputs)
     write_json(tmp_path / "geometry.json", record)
-    frames = [(None, Taken(intent), tmp_path / "frames" / f"{intent}.tiff") for intent in range(3)]
+    frames = [(None, TakenFrame(intent), tmp_path / "frames" / f"{intent}.tiff") for intent in range(3)]
     monkeypatch.setattr(session_set, "taken_frames", lambda folder: frames)
     monkeypatch.setattr(session_set, "read_homing_groups", lambda folder: HomingGroups({0: 1, 1: 1, 2: 2}, None, 1))
-    found = session_set._homings_apart(tmp_path, tmp_path / "geometry.json")  # noqa: SLF001 - no public way without frames
-    shifts = {homing: record.homing_shift_mm(found["frames/0.tiff"], homing) for homing in found.values()}
+    groups = session_set._homings_apart(tmp_path, tmp_path / "geometry.json")  # noqa: SLF001 - no public way without frames
+    shifts = {homing: record.homing_shift_mm(groups["frames/0.tiff"], homing) for homing in groups.values()}
     assert len(shifts) == 2
-    assert shifts[found["frames/2.tiff"]] == (CHAIN[1].shift_mm if own else None)
-
-
-@pytest.mark.parametrize(
-    ("spread_mm", "checks", "repeat"),
-    [((0.01, 0.01), 6, True), ((0.01, 0.01), 5, False), (None, 1, False)],
-)
-def test_few_checks_do_not_show_that_switches_repeat(
-    spread_mm: tuple[float, ...] | None, checks: int, repeat: bool
-) -> None:
-    assert HomingGroups({}, spread_mm, checks).repeat() is repeat
+    assert shifts[groups["frames/2.tiff"]] == (CHAIN[1].shift_mm if own else None)

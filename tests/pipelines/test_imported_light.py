@@ -1,12 +1,10 @@
-"""What imported pictures say of light: tone curves undone, units, and gain and noise that nobody stated."""
+"""Light of imported pictures: tone curves undone, units, and gain and noise that nobody stated."""
 
 import json
 import re
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import cv2
@@ -16,11 +14,10 @@ import tifffile
 from numpy.typing import NDArray
 
 from faintfield.pipelines.formats.frames import read_frame
-from faintfield.pipelines.formats.sets.elemental_file import Noise
+from faintfield.pipelines.formats.sets.elemental_file import ElementalSetFile, Noise
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-
-type Command = Callable[..., CompletedProcess[str]]
+from tests.pipelines.conftest import Command
 
 EVERY_VALUE = np.arange(256, dtype=np.uint8).reshape(16, 16)
 
@@ -31,15 +28,15 @@ def one_picture(folder: Path, pixels: NDArray[Any], name: str = "a.png") -> Path
     return folder
 
 
+def settings_of(folder: Path) -> ElementalSetFile:
+    return load_set(folder).settings
+
+
 def imported_pixels(folder: Path) -> NDArray[Any]:
     return read_frame(load_set(folder).image_paths[0]).pixels_dn
 
 
-def light_unit(folder: Path) -> str:
-    return load_set(folder).settings.units.light
-
-
-def test_8_bit_pictures_lose_the_curve_of_srgb(tmp_path: Path, done: Command) -> None:
+def test_8_bit_pictures_lose_srgb_curve(tmp_path: Path, done: Command) -> None:
     ended = done("import", "grid", one_picture(tmp_path / "src", EVERY_VALUE), tmp_path / "out")
     assert "8-bit pictures are taken to have the tone curve of sRGB, which is undone; give --linear" in ended.stderr
     light = imported_pixels(tmp_path / "out").ravel()
@@ -49,26 +46,18 @@ def test_8_bit_pictures_lose_the_curve_of_srgb(tmp_path: Path, done: Command) ->
     for value, share in ((1, 1 / 255 / 12.92), (10, 10 / 255 / 12.92), (11, 0.003347), (64, 0.051269), (128, 0.215861)):
         assert light[value] == pytest.approx(65535 * share, abs=0.6), value
     assert (np.diff(light.astype(int)) > 0).all()
-    assert light_unit(tmp_path / "out") == "relative"
+    assert settings_of(tmp_path / "out").units.light == "relative"
     assert "estimated = true" in (tmp_path / "out" / "elemental.toml").read_text()
 
 
-def test_each_colour_loses_its_own_curve(tmp_path: Path, done: Command) -> None:
-    red_green_blue = np.full((16, 16, 3), (255, 128, 0), np.uint8)
-    done("import", "grid", one_picture(tmp_path / "src", red_green_blue[:, :, ::-1]), tmp_path / "out")
-    np.testing.assert_array_equal(
-        np.unique(imported_pixels(tmp_path / "out").reshape(-1, 3), axis=0), [[65535, 14146, 0]]
-    )
-
-
-def test_values_at_white_are_saturated_with_and_without_the_curve(tmp_path: Path, done: Command) -> None:
+def test_white_is_saturated_with_and_without_curve(tmp_path: Path, done: Command) -> None:
     src = one_picture(tmp_path / "src", EVERY_VALUE)
     for options, saturation_dn in (((), 65535.0), (("--linear",), 255.0)):
         folder = tmp_path / f"out{saturation_dn:.0f}"
         done("import", "grid", src, folder, *options)
-        loaded = load_set(folder)
-        assert loaded.noise.saturation_dn == saturation_dn
-        valid = load_channel(loaded, channel_layouts(loaded)[0]).valid
+        elemental_set = load_set(folder)
+        assert elemental_set.noise.saturation_dn == saturation_dn
+        valid = load_channel(elemental_set, channel_layouts(elemental_set)[0]).valid
         assert valid is not None
         np.testing.assert_array_equal(valid.ravel(), EVERY_VALUE.ravel() < 255)
 
@@ -81,23 +70,23 @@ def with_gamma(content: bytes, gamma: int) -> bytes:
 
 
 @pytest.mark.parametrize(("gamma", "unit"), [(100_000, "dn"), (45_455, "relative")])
-def test_a_png_may_say_that_it_is_linear(gamma: int, unit: str, tmp_path: Path, done: Command) -> None:
+def test_png_may_state_linear_values(gamma: int, unit: str, tmp_path: Path, done: Command) -> None:
     path = one_picture(tmp_path / "src", EVERY_VALUE) / "a.png"
     path.write_bytes(with_gamma(path.read_bytes(), gamma))
-    said = done("import", "grid", tmp_path / "src", tmp_path / "out").stderr
-    assert light_unit(tmp_path / "out") == unit
-    assert ("curve of sRGB" in said) == (unit == "relative")
+    words = done("import", "grid", tmp_path / "src", tmp_path / "out").stderr
+    assert settings_of(tmp_path / "out").units.light == unit
+    assert ("curve of sRGB" in words) == (unit == "relative")
     assert imported_pixels(tmp_path / "out").max() == (255 if unit == "dn" else 65535)
 
 
-def test_16_bit_pictures_are_linear_unless_said_otherwise(tmp_path: Path, done: Command) -> None:
+def test_16_bit_pictures_are_linear_unless_stated(tmp_path: Path, done: Command) -> None:
     values = np.array([[0, 257, 32896, 65535]] * 4, np.uint16)
     src = one_picture(tmp_path / "src", values)
     done("import", "grid", src, tmp_path / "linear")
-    assert light_unit(tmp_path / "linear") == "dn"
+    assert settings_of(tmp_path / "linear").units.light == "dn"
     np.testing.assert_array_equal(imported_pixels(tmp_path / "linear"), values)
     done("import", "grid", src, tmp_path / "curved", "--srgb")
-    assert light_unit(tmp_path / "curved") == "relative"
+    assert settings_of(tmp_path / "curved").units.light == "relative"
     # As 8-bit values 0, 1, 128 and 255
     np.testing.assert_array_equal(imported_pixels(tmp_path / "curved")[0], [0, 20, 14146, 65535])
     assert load_set(tmp_path / "curved").image_paths[0].suffix == ".tiff"
@@ -111,7 +100,7 @@ def with_exposure(content: bytes, exposure_s: tuple[int, int]) -> bytes:
     return content[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + content[2:]
 
 
-def test_the_exposure_of_a_photograph_is_that_of_exif(tmp_path: Path, done: Command) -> None:
+def test_exposure_of_photograph_is_from_exif(tmp_path: Path, done: Command) -> None:
     path = one_picture(tmp_path / "src", EVERY_VALUE, "a.jpg") / "a.jpg"
     path.write_bytes(with_exposure(path.read_bytes(), (1, 40)))
     done("import", "grid", tmp_path / "src", tmp_path / "out")
@@ -128,10 +117,10 @@ def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """3 x 3 16-bit views of a soft scene that moves by 2 px from node to node, of a sensor with known noise."""
     folder = tmp_path_factory.mktemp("noisy")
     rng = np.random.default_rng(4)
-    wide = cv2.GaussianBlur(rng.random((300, 360)), (0, 0), 9)
+    wide = cv2.GaussianBlur(rng.random((220, 280)), (0, 0), 9)
     wide = 3000 * ((wide - wide.min()) / np.ptp(wide)) ** 2
     for row, column in np.ndindex(3, 3):
-        light_e = wide[20 + 2 * row : 260 + 2 * row, 20 + 2 * column : 320 + 2 * column]
+        light_e = wide[20 + 2 * row : 180 + 2 * row, 20 + 2 * column : 240 + 2 * column]
         dn = BLACK_DN + GAIN * (rng.poisson(light_e) + rng.normal(0, READ_E, light_e.shape))
         tifffile.imwrite(folder / f"view_r{row}_c{column}.tiff", np.rint(dn).astype(np.uint16))
     return folder
@@ -147,15 +136,15 @@ def origin(folder: Path) -> Any:
     return json.loads((folder / "provenance.json").read_text())["noise"]
 
 
-def test_gain_and_noise_are_estimated_where_nobody_states_them(noisy: Path, tmp_path: Path, done: Command) -> None:
-    said = done("import", "grid", noisy, tmp_path / "out", "--offset-dn", BLACK_DN).stderr
+def test_unstated_gain_and_noise_are_estimated(noisy: Path, tmp_path: Path, done: Command) -> None:
+    words = done("import", "grid", noisy, tmp_path / "out", "--offset-dn", BLACK_DN).stderr
     noise = stated_noise(tmp_path / "out")
     assert noise.estimated
     assert noise.gain_dn_per_e == pytest.approx(GAIN, rel=0.15)
     assert noise.read_noise_e == pytest.approx(READ_E, rel=0.2)
-    assert light_unit(tmp_path / "out") == "dn"
-    assert "estimated from the differences of neighbouring views" in said
-    assert re.search(r"the variance of a pixel is \S+ · light \+ \S+², in DN$", said, re.MULTILINE)
+    assert settings_of(tmp_path / "out").units.light == "dn"
+    assert "estimated from the differences of neighbouring views" in words
+    assert re.search(r"the variance of a pixel is \S+ · light \+ \S+², in DN$", words, re.MULTILINE)
     record = origin(tmp_path / "out")
     assert record["how"] == "estimated"
     assert record["gain_dn"]["value"] == noise.gain_dn_per_e
@@ -165,32 +154,41 @@ def test_gain_and_noise_are_estimated_where_nobody_states_them(noisy: Path, tmp_
     assert len(record["mean_dn"]) == len(record["variance_dn2"]) >= 3
 
 
-def test_what_is_stated_stays_and_the_rest_is_estimated(noisy: Path, tmp_path: Path, done: Command) -> None:
-    done("import", "grid", noisy, tmp_path / "gain", "--offset-dn", BLACK_DN, "--gain-dn-per-e", 4)
-    noise = stated_noise(tmp_path / "gain")
-    assert (noise.gain_dn_per_e, noise.estimated, light_unit(tmp_path / "gain")) == (4.0, True, "electrons")
-    assert noise.read_noise_e == pytest.approx(READ_E, rel=0.15)
-    done("import", "grid", noisy, tmp_path / "read", "--offset-dn", BLACK_DN, "--read-noise-e", 7)
-    noise = stated_noise(tmp_path / "read")
-    assert (noise.read_noise_e, noise.estimated, light_unit(tmp_path / "read")) == (7.0, True, "dn")
-    done("import", "grid", noisy, tmp_path / "both", "--gain-dn-per-e", 3, "--read-noise-e", 5)
-    noise = stated_noise(tmp_path / "both")
+@pytest.mark.parametrize(
+    ("option", "noise", "unit"),
+    [(("--gain-dn-per-e", 4), (4.0, READ_E), "electrons"), (("--read-noise-e", 7), (GAIN, 7.0), "dn")],
+)
+def test_stated_noise_stays_beside_estimates(
+    option: tuple[object, ...], noise: tuple[float, float], unit: str, noisy: Path, tmp_path: Path, done: Command
+) -> None:
+    done("import", "grid", noisy, tmp_path / "out", "--offset-dn", BLACK_DN, *option)
+    record = stated_noise(tmp_path / "out")
+    assert (record.gain_dn_per_e, record.read_noise_e) == pytest.approx(noise, rel=0.15)
+    assert (record.estimated, settings_of(tmp_path / "out").units.light) == (True, unit)
+    assert option[1] in (record.gain_dn_per_e, record.read_noise_e)
+
+
+def test_stated_gain_and_noise_are_not_estimated(tmp_path: Path, done: Command) -> None:
+    src = one_picture(tmp_path / "src", np.zeros((8, 8), np.uint16))
+    done("import", "grid", src, tmp_path / "out", "--gain-dn-per-e", 3, "--read-noise-e", 5)
+    noise = stated_noise(tmp_path / "out")
     assert (noise.gain_dn_per_e, noise.read_noise_e, noise.estimated) == (3.0, 5.0, False)
-    assert origin(tmp_path / "both") == {"how": "stated"}
+    assert origin(tmp_path / "out") == {"how": "stated"}
 
 
-def test_noise_that_the_views_do_not_show_is_assumed_and_said_so(tmp_path: Path, done: Command) -> None:
-    said = done("import", "grid", one_picture(tmp_path / "src", np.zeros((8, 8), np.uint16)), tmp_path / "out").stderr
-    assert "gain and noise are not stated and cannot be estimated (0 blocks of 16 x 16 px" in said
+def test_noise_without_evidence_is_assumed_and_announced(tmp_path: Path, done: Command) -> None:
+    words = done("import", "grid", one_picture(tmp_path / "src", np.zeros((8, 8), np.uint16)), tmp_path / "out").stderr
+    assert "gain and noise are not stated and cannot be estimated (0 blocks of 16 x 16 px" in words
     assert (
-        "it is assumed that the variance of a pixel is 1 · light + 0², in DN; correct [noise] in elemental.toml" in said
+        "it is assumed that the variance of a pixel is 1 · light + 0², in DN; correct [noise] in elemental.toml"
+        in words
     )
     noise = stated_noise(tmp_path / "out")
     assert (noise.gain_dn_per_e, noise.read_noise_e, noise.estimated) == (1.0, 0.0, True)
     assert origin(tmp_path / "out")["how"] == "assumed"
 
 
-def test_noise_assumed_of_8_bit_pictures_is_that_of_their_rounding(tmp_path: Path, done: Command) -> None:
+def test_assumed_noise_of_8_bits_is_rounding(tmp_path: Path, done: Command) -> None:
     done("import", "grid", one_picture(tmp_path / "src", EVERY_VALUE), tmp_path / "out")
     noise = stated_noise(tmp_path / "out")
     white_step_dn = 65535 * 2.4 / 1.055 / 255  # slope of the curve at white
@@ -200,12 +198,12 @@ def test_noise_assumed_of_8_bit_pictures_is_that_of_their_rounding(tmp_path: Pat
     assert noise.gain_dn_per_e * noise.read_noise_e == pytest.approx(dark_step_dn / 12**0.5, rel=0.01)
 
 
-def test_images_of_a_model_are_treated_alike(tmp_path: Path, done: Command) -> None:
+def test_images_of_colmap_lose_their_curve_alike(tmp_path: Path, done: Command) -> None:
     src = one_picture(tmp_path / "src", EVERY_VALUE)
     (src / "cameras.txt").write_text("1 PINHOLE 16 16 20 20 8 8\n")
     (src / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
     for options, unit, white in (((), "relative", 65535), (("--linear",), "dn", 255)):
         done("import", "colmap", src, tmp_path / unit, *options)
-        assert light_unit(tmp_path / unit) == unit
+        assert settings_of(tmp_path / unit).units.light == unit
         assert imported_pixels(tmp_path / unit).max() == white
         assert stated_noise(tmp_path / unit).estimated

@@ -53,9 +53,15 @@ def _die(folder: Path, times: int, job: int) -> int:
     return job**2
 
 
-def _refuse(job: int) -> int:
+class _UnsendableError(Exception):
+    """A failure that cannot be pickled."""
+
+
+def _fail(job: int) -> int:
     if job == 1:
         raise ValueError(f"no {job}")
+    if job == 2:
+        raise _UnsendableError(lambda: None)
     return job
 
 
@@ -69,14 +75,6 @@ def _sleep_for_good(folder: Path, _: object) -> None:
     signal.pause()
 
 
-def _python(code: str, folder: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run code in an interpreter of its own."""
-    found = {**os.environ, "PYTHONPATH": os.pathsep.join(it for it in sys.path if it), **environment}
-    return subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, env=found, capture_output=True, text=True, timeout=HANG_S
-    )
-
-
 def test_one_process_does_all_jobs_in_their_order() -> None:
     found = list(in_processes(1, _own_id, range(5)))
     assert [job for job, _ in found] == [0, 1, 2, 3, 4]
@@ -88,30 +86,15 @@ def test_two_processes_work_at_same_time(tmp_path: Path) -> None:
     assert len({process for _, process in in_processes(2, partial(_meet, tmp_path), ["one", "other"])}) == 2
 
 
-def test_no_more_processes_than_jobs_and_none_without_jobs() -> None:
-    begun = in_processes(64, _own_id, range(2))
-    next(begun)
+def test_no_more_processes_than_jobs() -> None:
+    results = in_processes(64, _own_id, range(2))
+    next(results)
     assert len(multiprocessing.active_children()) <= 2
-    assert len(list(begun)) == 1
+    assert len(list(results)) == 1
     assert list(in_processes(2, _own_id, [])) == []
 
 
-def test_process_has_one_thread_and_ours_keeps_all() -> None:
-    """In an interpreter of its own, since it has one process that all others are copied from, with its environment."""
-    code = (
-        "import os, numba\n"
-        "from faintfield.pipelines.reconstruction.processes import in_processes\n"
-        "before = dict(os.environ), numba.config.NUMBA_NUM_THREADS\n"
-        "asked = \"__import__('numba').config.NUMBA_NUM_THREADS\", "
-        "\"__import__('os').environ['OPENBLAS_NUM_THREADS']\"\n"
-        "print([result for _, result in in_processes(1, eval, asked)])\n"
-        "assert (dict(os.environ), numba.config.NUMBA_NUM_THREADS) == before"
-    )
-    done = _python(code, OPENBLAS_NUM_THREADS="2")
-    assert done.stdout == "[1, '1']\n", done.stderr
-
-
-def test_job_of_process_that_dies_is_done_by_another(tmp_path: Path) -> None:
+def test_job_of_dead_process_is_done_by_another(tmp_path: Path) -> None:
     found = list(in_processes(2, partial(_die, tmp_path, 3), range(6)))
     assert sorted(found) == [(job, job**2) for job in range(6)]
     assert len([*tmp_path.iterdir()]) == 3
@@ -123,27 +106,29 @@ def test_four_deaths_of_one_job_end_work(tmp_path: Path) -> None:
     assert len([*tmp_path.iterdir()]) == 4
 
 
-def test_failure_comes_with_its_traceback_and_ends_processes() -> None:
-    with pytest.raises(ValueError, match="no 1") as failure:
-        list(in_processes(1, _refuse, range(3)))
-    assert "in _refuse" in failure.value.__notes__[0]
+@pytest.mark.parametrize(("job", "failure"), [(1, ValueError), (2, RuntimeError)])
+def test_failure_comes_with_traceback_and_ends_processes(job: int, failure: type[Exception]) -> None:
+    with pytest.raises(failure, match=r"no 1|_UnsendableError") as raised:
+        list(in_processes(1, _fail, [0, job, 3]))
+    if job == 1:
+        assert "in _fail" in raised.value.__notes__[0]
     assert not multiprocessing.active_children()
 
 
 def test_abandoned_work_leaves_no_process() -> None:
-    begun = in_processes(2, _own_id, range(4))
-    _, process = next(begun)
-    begun.close()
+    results = in_processes(2, _own_id, range(4))
+    _, process = next(results)
+    results.close()
     assert not multiprocessing.active_children()
     assert not _alive(process)
 
 
 def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(compiling, "on_compiling", [lambda: said.append("compiling")])
+    announced: list[str] = []
+    monkeypatch.setattr(compiling, "on_compiling", [lambda: announced.append("compiling")])
     monkeypatch.setattr("faintfield.pipelines.reconstruction.processes.on_compiling", compiling.on_compiling)
     assert len(list(in_processes(2, _announce, range(4)))) == 4
-    assert said == ["compiling"]
+    assert announced == ["compiling"]
 
 
 def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
@@ -161,27 +146,22 @@ def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
     _wait_until(lambda: not any(_alive(process) for process in processes))
 
 
-def test_no_module_of_current_folder_is_run(tmp_path: Path) -> None:
-    """In a process of its own, since a session has one process that all others are copied from."""
+def test_process_has_one_thread_and_trusted_modules(tmp_path: Path) -> None:
+    """In an interpreter of its own, since it has one process that all others are copied from, with its environment."""
     (tmp_path / "numba.py").write_text("open('run', 'w')")
     code = (
-        "import sys; sys.path[:] = [it for it in sys.path if it]\n"
+        "import sys; sys.path[:] = [path for path in sys.path if path]\n"
+        "import os, numba\n"
         "from faintfield.pipelines.reconstruction.processes import in_processes\n"
-        "if __name__ == '__main__': print(list(in_processes(1, abs, [-3])))"
+        "before = dict(os.environ), numba.config.NUMBA_NUM_THREADS\n"
+        "asked = \"__import__('numba').config.NUMBA_NUM_THREADS\", "
+        "\"__import__('os').environ['OPENBLAS_NUM_THREADS']\"\n"
+        "if __name__ == '__main__': print([result for _, result in in_processes(1, eval, asked)])\n"
+        "assert (dict(os.environ), numba.config.NUMBA_NUM_THREADS) == before"
     )
-    done = _python(code, tmp_path)
-    assert done.stdout == "[(-3, 3)]\n", done.stderr
+    paths = os.pathsep.join(path for path in sys.path if path)
+    environment = {**os.environ, "PYTHONPATH": paths, "OPENBLAS_NUM_THREADS": "2"}
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=HANG_S)
+    assert ended.stdout == "[1, '1']\n", ended.stderr
     assert not (tmp_path / "run").exists()
-
-
-def _unsendable(_: object) -> object:
-    raise _Unsendable(lambda: None)
-
-
-class _Unsendable(Exception):
-    """A failure that cannot be pickled."""
-
-
-def test_what_cannot_be_sent_is_told_as_it_is() -> None:
-    with pytest.raises(RuntimeError, match="_Unsendable"):
-        list(in_processes(1, _unsendable, [0, 1]))

@@ -4,10 +4,8 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from shutil import disk_usage
-from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
@@ -18,9 +16,7 @@ from faintfield.pipelines.formats import large_arrays
 from faintfield.pipelines.formats.large_arrays import available_bytes, maps_in_files, memory_or_file
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
-
-type Command = Callable[..., CompletedProcess[str]]
-type SetMaker = Callable[..., Path]
+from tests.pipelines.conftest import SetMaker
 
 # Back-projects a set with little more memory than the process has; argument 4 says what the system claims to have free.
 _LIMITED = """
@@ -32,18 +28,18 @@ from faintfield.pipelines.reconstruction import overview
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.commands.reconstruct import reconstruct_and_report
 from faintfield.pipelines.reconstruction.request import Request
-loaded, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
+elemental_set, warm = load_set(Path(sys.argv[1])), load_set(Path(sys.argv[1]).with_name("warm"))
 out, request = Path(sys.argv[2]), Request([500.0], ["backprojection"])
 reconstruct_and_report(warm, out.with_name("warm-out"), request)
 large_arrays.available_bytes = lambda: int(sys.argv[4])
-taken = int(re.search(r"VmData:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
-resource.setrlimit(resource.RLIMIT_DATA, (taken + int(sys.argv[3]),) * 2)
-reconstruct_and_report(loaded, out, request)
+used = int(re.search(r"VmData:\\s+(\\d+) kB", Path("/proc/self/status").read_text())[1]) * 1024
+resource.setrlimit(resource.RLIMIT_DATA, (used + int(sys.argv[3]),) * 2)
+reconstruct_and_report(elemental_set, out, request)
 """
 
 
 @pytest.mark.parametrize(("limit", "expected"), [("4000000\n", 4000000 - 1000000), ("max\n", 8000 * 1024)])
-def test_the_limit_of_a_control_group_counts(
+def test_limit_of_control_group_counts(
     limit: str, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     job = tmp_path / "groups" / "slurm" / "job"
@@ -58,7 +54,7 @@ def test_the_limit_of_a_control_group_counts(
     assert available_bytes() == expected
 
 
-def test_large_arrays_are_in_files_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_arrays_are_in_nameless_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(large_arrays, "available_bytes", lambda: 8000)
     allocate = memory_or_file(tmp_path / "out")
     small = allocate((10, 100), np.float32)
@@ -72,25 +68,29 @@ def test_large_arrays_are_in_files_without_a_name(tmp_path: Path, monkeypatch: p
     assert not list((tmp_path / "out").iterdir())
 
 
-def test_a_disk_without_room_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_is_named_or_avoided(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
     monkeypatch.setattr(large_arrays, "available_bytes", lambda: 0)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    monkeypatch.setattr(os, "posix_fallocate", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(os, "posix_fallocate", full)
     with pytest.raises(DiskFull, match="no space left"):
         memory_or_file(tmp_path)((10, 10), np.float32)
     assert resource.getrlimit(resource.RLIMIT_FSIZE) == before
+    assert maps_in_files(tmp_path)((1000, 1000), np.float32).base is None
 
 
-def test_a_channel_in_files_is_that_in_memory(make_set: SetMaker, tmp_path: Path) -> None:
+def test_channel_in_files_equals_that_in_memory(make_set: SetMaker, tmp_path: Path) -> None:
     images = np.random.default_rng(20110919).integers(100, 2000, (3, 12, 16)).astype(np.uint16)
     images[1, 3, 4] = 65535
     noise = {"offset_dn": 100.0, "gain_dn_per_e": 2.0, "read_noise_e": 3.0, "saturation_dn": 60000.0}
-    loaded = load_set(make_set(list(images), noise=noise))
-    (layout,) = channel_layouts(loaded)
-    in_memory = load_channel(loaded, layout)
+    elemental_set = load_set(make_set(list(images), noise=noise))
+    (layout,) = channel_layouts(elemental_set)
+    in_memory = load_channel(elemental_set, layout)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(large_arrays, "available_bytes", lambda: 0)
-        in_files = load_channel(loaded, layout, memory_or_file(tmp_path))
+        in_files = load_channel(elemental_set, layout, memory_or_file(tmp_path))
     assert not in_files.electrons.flags.owndata
     np.testing.assert_array_equal(in_files.electrons, in_memory.electrons)
     assert in_memory.valid is not None
@@ -101,7 +101,7 @@ def test_a_channel_in_files_is_that_in_memory(make_set: SetMaker, tmp_path: Path
 
 @pytest.mark.deep
 @pytest.mark.parametrize(("free_bytes", "succeeds"), [(1 << 20, True), (1 << 40, False)])
-def test_a_set_larger_than_memory_is_reconstructed(
+def test_set_larger_than_memory_is_reconstructed(
     free_bytes: int, succeeds: bool, make_set: SetMaker, tmp_path: Path
 ) -> None:
     """80 MB of electrons where 40 MB may be taken: by memory map they are done, in memory they cannot be."""
@@ -120,26 +120,17 @@ def test_a_set_larger_than_memory_is_reconstructed(
 
 
 @pytest.mark.parametrize(("free_bytes", "in_files"), [(20_000_000, [True, True, False]), (3_000_000, [False] * 3)])
-def test_maps_lie_in_files_until_half_of_the_free_disk_is_taken(
+def test_maps_in_files_leave_half_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_bytes: int, in_files: list[bool]
 ) -> None:
-    taken = 0
+    used = 0
     usage = disk_usage(tmp_path)
-    monkeypatch.setattr(large_arrays, "disk_usage", lambda _: usage._replace(free=free_bytes - taken))
-    allocate, found = maps_in_files(tmp_path), []
-    for _ in in_files:
-        made = allocate((1000, 1000), np.float32)
-        made[:] = 1.0
-        found.append(isinstance(made.base, np.memmap))
-        taken += made.nbytes if found[-1] else 0
-    assert found == in_files
+    monkeypatch.setattr(large_arrays, "disk_usage", lambda _: usage._replace(free=free_bytes - used))
+    allocate = maps_in_files(tmp_path)
+    for expected in in_files:
+        array = allocate((1000, 1000), np.float32)
+        array[:] = 1.0
+        assert isinstance(array.base, np.memmap) is expected
+        used += array.nbytes if expected else 0
     assert not isinstance(allocate((10, 10), np.float32).base, np.memmap)
     assert [*tmp_path.iterdir()] == []  # files have no names
-
-
-def test_a_full_disk_leaves_maps_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "posix_fallocate", full)
-    assert maps_in_files(tmp_path)((1000, 1000), np.float32).base is None

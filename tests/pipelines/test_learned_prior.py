@@ -76,9 +76,6 @@ def made_up(shape: tuple[int, int], seed: int = 2) -> tuple[Image, Image, Image,
     return y, patches + 0.1 * random.normal(size=shape), patches, variance
 
 
-# --- the network and OpenCV ------------------------------------------------------------------------------------------
-
-
 def test_network_output_equals_sums_in_numpy() -> None:
     network = cv2.dnn.readNetFromONNX(np.frombuffer(_FILE.read_bytes(), np.uint8))
     network.setInput(waves()[np.newaxis])
@@ -86,9 +83,6 @@ def test_network_output_equals_sums_in_numpy() -> None:
     assert np.sqrt(np.mean(np.square(output))) == pytest.approx(_ROOT_MEAN_SQUARE, abs=1e-4)
     for at, value in _VALUES.items():
         assert output[at] == pytest.approx(value, abs=1e-4)
-
-
-# --- planes of any size ----------------------------------------------------------------------------------------------
 
 
 def test_estimate_is_the_mean_over_four_turns() -> None:
@@ -123,15 +117,6 @@ def test_tiles_join_without_seam(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.abs(learned_estimate(*known) - whole).max() > 1e-2 * np.sqrt(known[-1].min())
 
 
-# --- units -----------------------------------------------------------------------------------------------------------
-
-
-def test_unit_of_light_does_not_matter() -> None:
-    y, u, p, v = made_up((48, 56))
-    scaled = learned_estimate(1000 * y, 1000 * u, 1000 * p, 1e6 * v)
-    np.testing.assert_allclose(scaled, 1000 * learned_estimate(y, u, p, v), rtol=1e-3)
-
-
 def test_network_sees_light_in_units_of_noise() -> None:
     y, u, p, v = made_up((16, 16))
     inputs, deviation = network_input(y, u, p, v)
@@ -142,9 +127,6 @@ def test_network_sees_light_in_units_of_noise() -> None:
     np.testing.assert_allclose(np.exp(inputs[3]) * np.median(np.sqrt(v)), np.sqrt(v), rtol=1e-5)
 
 
-# --- what no view sees -----------------------------------------------------------------------------------------------
-
-
 def test_unseen_samples_keep_patches_and_disturb_no_others() -> None:
     y, u, p, v = made_up((64, 80))
     v[:, 60:] = np.inf
@@ -152,9 +134,6 @@ def test_unseen_samples_keep_patches_and_disturb_no_others() -> None:
     np.testing.assert_array_equal(found[:, 60:], p[:, 60:].astype(np.float32))
     y[:, 60:] = u[:, 60:] = np.nan
     np.testing.assert_array_equal(learned_estimate(y, u, p, v), found)
-
-
-# --- what it does to pictures ----------------------------------------------------------------------------------------
 
 
 def errors(known: Known, picture: Image) -> Image:
@@ -184,19 +163,16 @@ def test_picture_comes_nearer_to_truth() -> None:
     assert after < 0.85 * before
 
 
-# --- when it should not be asked -------------------------------------------------------------------------------------
-
-
 def known_noise(shape: tuple[int, int] = (64, 64)) -> Noise:
     return Noise(np.full(shape, 0.25, np.float32), np.outer([0.25, 1, 0.25], [0.25, 1, 0.25]))
 
 
-def test_what_it_was_trained_for_is_within_its_range() -> None:
+def test_what_it_was_trained_for_is_accepted() -> None:
     assert outside_range(np.ones((64, 64)), known_noise()) is None
 
 
 @pytest.mark.parametrize(
-    ("light_e", "noise", "said"),
+    ("light_e", "noise", "message"),
     [
         (500.0, known_noise(), "times its noise"),
         (1.0, known_noise((16, 64)), "samples"),
@@ -209,7 +185,7 @@ def test_what_it_was_trained_for_is_within_its_range() -> None:
         ),
     ],
 )
-def test_what_it_was_not_trained_for_is_named(light_e: float, noise: Noise, said: str) -> None:
+def test_what_it_was_not_trained_for_is_named(light_e: float, noise: Noise, message: str) -> None:
     reason = outside_range(np.full(noise.variance.shape, light_e), noise)
     assert reason is not None
-    assert said in reason
+    assert message in reason

@@ -36,42 +36,32 @@ def _summed(frame: NDArray[np.uint16], bins: int) -> NDArray[np.float64]:
     return sums
 
 
-@pytest.mark.parametrize(("mosaic", "bins"), [(None, 3), (BAYER, 4), (["RGB"], 3), (["RGGB", "GBRG"], 4)])
-def test_bins_add_pixels_of_all_colours(mosaic: list[str] | None, bins: int, make_set: SetMaker) -> None:
-    frames = _frames(14, 18)
+@pytest.mark.parametrize(
+    ("mosaic", "bins", "colours"),
+    [(None, 3, ()), (BAYER, 4, ()), (["RGB"], 3, ()), (["RGGB", "GBRG"], 4, ()), (None, 2, (3,))],
+)
+def test_bins_add_pixels_of_all_colours(
+    mosaic: list[str] | None, bins: int, colours: tuple[int, ...], make_set: SetMaker
+) -> None:
+    frames = _frames(14, 18, *colours)
     views = _light(make_set(frames, noise=NOISE, camera={"mosaic": mosaic} if mosaic else None), bins)
     assert views.light_e.dtype == np.float32
     for light, frame in zip(views.light_e, frames, strict=True):
         np.testing.assert_allclose(light, _summed(frame, bins), rtol=1e-5, atol=1e-3)
-    assert views.variance_e2 == pytest.approx(bins**2 * (BACKGROUND_E + READ_VARIANCE_E2), rel=1e-6)
-
-
-def test_colours_of_pixel_are_added_up(make_set: SetMaker) -> None:
-    frames = _frames(8, 10, 3)
-    views = _light(make_set(frames, noise=NOISE), 2)
-    for light, frame in zip(views.light_e, frames, strict=True):
-        np.testing.assert_allclose(light, _summed(frame, 2), rtol=1e-5, atol=1e-3)
-    assert views.variance_e2 == pytest.approx(3 * 4 * (BACKGROUND_E + READ_VARIANCE_E2), rel=1e-6)
+    samples = bins**2 * (3 if colours else 1)
+    assert views.variance_e2 == pytest.approx(samples * (BACKGROUND_E + READ_VARIANCE_E2), rel=1e-6)
 
 
 @pytest.mark.parametrize("mosaic", [None, BAYER])
-def test_saturated_pixel_hides_its_bin_in_one_view(mosaic: list[str] | None, make_set: SetMaker) -> None:
+def test_saturated_and_hot_pixels_hide_their_bins(mosaic: list[str] | None, make_set: SetMaker) -> None:
     frames = _frames(8, 10)
     frames[1][5, 2] = 1000
-    folder = make_set(frames, noise=NOISE | {"saturation_dn": 1000.0}, camera={"mosaic": mosaic} if mosaic else None)
+    folder = make_set(frames, noise="noise.json", camera={"mosaic": mosaic} if mosaic else None)
+    fitted = {name: {"value": value} for name, value in (NOISE | {"saturation_dn": 1000.0}).items()}
+    (folder / "noise.json").write_text(json.dumps(fitted | {"hot_pixels": [[1, 7]]}))
     views = _light(folder, 2)
-    assert np.argwhere(views.light_e == UNKNOWN).tolist() == [[1, 2, 1]]
+    assert np.argwhere(views.light_e == UNKNOWN).tolist() == [[0, 0, 3], [1, 0, 3], [1, 2, 1]]
     assert views.light_e[views.light_e != UNKNOWN].min() > -100
-
-
-@pytest.mark.parametrize("mosaic", [None, BAYER])
-def test_hot_pixel_hides_its_bin_in_all_views(mosaic: list[str] | None, make_set: SetMaker) -> None:
-    camera = {"mosaic": mosaic} if mosaic else None
-    folder = make_set([np.full((8, 10), 200, np.uint16)] * 2, noise="noise.json", camera=camera)
-    fitted = {name: {"value": value} for name, value in NOISE.items()} | {"hot_pixels": [[5, 2]]}
-    (folder / "noise.json").write_text(json.dumps(fitted))
-    views = _light(folder, 2)
-    assert np.argwhere(views.light_e == UNKNOWN).tolist() == [[0, 2, 1], [1, 2, 1]]
 
 
 def test_response_is_divided_out(make_set: SetMaker) -> None:
@@ -98,11 +88,11 @@ def test_point_lands_where_pinhole_camera_sees_it(ray: tuple[float, float], bins
     folder = make_set([np.rint(100 + spot).astype(np.uint16)], noise=noise, camera=LENS | {"distortion": DISTORTION})
     views = _light(folder, bins)
     light = np.where(views.light_e[0] == UNKNOWN, 0, views.light_e[0])
-    found = [np.sum(index * light) / light.sum() for index in np.indices(light.shape)[::-1]]
+    centre = [np.sum(index * light) / light.sum() for index in np.indices(light.shape)[::-1]]
     expected = [
-        ((size * at + centre) + 0.5) / bins - 0.5 for size, at, centre in zip((62, 60), ray, (33, 22.5), strict=True)
+        ((size * at + middle) + 0.5) / bins - 0.5 for size, at, middle in zip((62, 60), ray, (33, 22.5), strict=True)
     ]
-    np.testing.assert_allclose(found, expected, atol=0.12 / bins)
+    np.testing.assert_allclose(centre, expected, atol=0.12 / bins)
     assert np.hypot(*(seen - [62 * ray[0] + 33, 60 * ray[1] + 22.5])) > 0.5
     # And that is where the views say that they look
     np.testing.assert_allclose(views.pixel_from_surface[0] @ [*ray, 1, 0], [*expected, 1], rtol=1e-5)
@@ -127,7 +117,7 @@ def test_interpolation_beside_unknown_bins_is_unknown(make_set: SetMaker) -> Non
     np.testing.assert_allclose(light[light != UNKNOWN], 400, rtol=1e-5)
 
 
-def test_views_look_where_their_pose_and_principal_point_say(make_set: SetMaker, edit: Edit) -> None:
+def test_views_follow_pose_and_principal_point(make_set: SetMaker, edit: Edit) -> None:
     folder = make_set(_frames(12, 16), camera={"cx_px": 6.0, "cy_px": 7.0})
     edit(folder, lambda settings: settings["view"][1].update(cx_px=9.5, cy_px=2.25))
     views = _light(folder, 2)

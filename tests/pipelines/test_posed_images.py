@@ -1,22 +1,27 @@
-"""Models of other programs, COLMAP and mrcal alike: what goes out comes back, and nothing is lost or taken silently."""
+"""Models of COLMAP and mrcal: what goes out comes back, and views see points where these programs put them."""
 
 import json
-from collections.abc import Callable
+import struct
+from dataclasses import replace
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from faintfield.pipelines.commands.exports.colmap import export_colmap
+from faintfield.pipelines.commands.imports.colmap import import_colmap
+from faintfield.pipelines.errors import BadValue
+from faintfield.pipelines.formats.exchange.colmap import ColmapImage, ColmapModel, read_model, write_model
+from faintfield.pipelines.formats.exchange.imported_set import relative
 from faintfield.pipelines.formats.files import sha256
 from faintfield.pipelines.formats.sets.elemental_set import load_set
-
-type Command = Callable[..., CompletedProcess[str]]
-type SetMaker = Callable[..., Path]
-type Edit = Callable[[Path, Callable[[dict[str, Any]], object]], Path]
+from tests.pipelines.conftest import Command, Edit, SetMaker
+from tests.pipelines.refusals import assert_refused
 
 PROGRAMS = ["colmap", "mrcal"]
 IMAGE = np.arange(192, dtype=np.uint16).reshape(12, 16)
@@ -41,14 +46,8 @@ def names_in(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def refused(ended: CompletedProcess[str], failure: str, *words: str) -> None:
-    assert ended.returncode == 1, ended.stderr
-    assert f"faintfield: {failure}: " in ended.stderr
-    assert all(word in ended.stderr for word in words), ended.stderr
-
-
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_principal_points_of_views_go_out_and_come_back(program: str, tmp_path: Path, done: Command) -> None:
+def test_exported_principal_points_come_back(program: str, tmp_path: Path, done: Command) -> None:
     (tmp_path / "src").mkdir()
     for row, column in np.ndindex(2, 3):
         tifffile.imwrite(tmp_path / "src" / f"view_r{row}_c{column}.tiff", IMAGE + np.uint16(3 * row + column))
@@ -57,63 +56,44 @@ def test_principal_points_of_views_go_out_and_come_back(program: str, tmp_path: 
     done("export", program, tmp_path / "set", tmp_path / "model")
     words = ("--images", tmp_path / "set", "--reference", "view_r1_c1.tiff")
     done("import", program, tmp_path / "model", tmp_path / "back", *words)
-    given, back = load_set(tmp_path / "set"), load_set(tmp_path / "back")
-    assert len(np.unique(given.principal_points_px(), axis=0)) == 6
-    np.testing.assert_allclose(back.principal_points_px(), given.principal_points_px(), atol=1e-9)
-    np.testing.assert_allclose(back.poses_rt_cam_ref, given.poses_rt_cam_ref, atol=1e-6)
-    assert [view.node for view in back.settings.view] == [view.node for view in given.settings.view]
-
-
-def test_views_in_folders_of_their_own_are_not_one_camera_model(
-    make_set: SetMaker, edit: Edit, tmp_path: Path, faintfield: Command
-) -> None:
-    folder = make_set([IMAGE, IMAGE])
-    for name, side in (("view_0.tiff", "a"), ("view_1.tiff", "b")):
-        (folder / side).mkdir()
-        (folder / name).rename(folder / side / "x.tiff")
-    edit(folder, lambda settings: [view.update(image=f"{'ab'[i]}/x.tiff") for i, view in enumerate(settings["view"])])
-    ended = faintfield("export", "mrcal", folder, tmp_path / "cameras")
-    refused(ended, "BadValue", "b/x.tiff would become x.cameramodel like another view")
-    assert not (tmp_path / "cameras").exists()
+    first, back = load_set(tmp_path / "set"), load_set(tmp_path / "back")
+    assert len(np.unique(first.principal_points_px(), axis=0)) == 6
+    np.testing.assert_allclose(back.principal_points_px(), first.principal_points_px(), atol=1e-9)
+    np.testing.assert_allclose(back.poses_rt_cam_ref, first.poses_rt_cam_ref, atol=1e-6)
+    assert [view.node for view in back.settings.view] == [view.node for view in first.settings.view]
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_an_export_replaces_an_earlier_one_and_nothing_else(
+def test_export_replaces_only_earlier_exports(
     program: str, make_set: SetMaker, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:
     folder, out = make_set([IMAGE, IMAGE]), tmp_path / "model"
     done("export", program, folder, out)
-    refused(faintfield("export", program, folder, out), "OutputExists", "holds files already")
+    assert_refused(faintfield("export", program, folder, out), "OutputExists", "holds files already")
     done("export", program, folder, out, "--overwrite")
+    if program == "colmap":
+        done("export", program, folder, out, "--binary", "--overwrite")
+        assert names_in(out) == ["cameras.bin", "images.bin", "points3D.bin"]
     (out / "notes.txt").touch()
     before = names_in(out)
-    refused(faintfield("export", program, folder, out, "--overwrite"), "OutputExists", "(notes.txt)")
+    assert_refused(faintfield("export", program, folder, out, "--overwrite"), "OutputExists", "(notes.txt)")
     assert names_in(out) == before
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_what_is_read_is_never_replaced(program: str, tmp_path: Path, done: Command, faintfield: Command) -> None:
+def test_inputs_are_never_replaced(program: str, tmp_path: Path, done: Command, faintfield: Command) -> None:
     src, out = write_models(tmp_path / "src"), tmp_path / "set"
     done("import", program, src, out)
     done("export", program, out, out / "model")
     before = names_in(out)
     for models, images in ((out / "model", src), (src, out)):
-        refused(
+        assert_refused(
             faintfield("import", program, models, out, "--images", images, "--overwrite"),
             "OutputExists",
             "which is read",
         )
         assert names_in(out) == before
     done("import", program, src, out, "--overwrite")
-
-
-@pytest.mark.parametrize("program", PROGRAMS)
-def test_models_and_images_are_recorded(program: str, tmp_path: Path, done: Command) -> None:
-    src = write_models(tmp_path / "src")
-    done("import", program, src, tmp_path / "set")
-    inputs = json.loads((tmp_path / "set" / "provenance.json").read_text())["inputs"]
-    models = {"colmap": ("cameras.txt", "images.txt"), "mrcal": ("a.cameramodel",)}[program]
-    assert inputs == {name: sha256(src / name) for name in (*models, "a.tiff")}
 
 
 @pytest.mark.parametrize(
@@ -124,28 +104,36 @@ def test_models_and_images_are_recorded(program: str, tmp_path: Path, done: Comm
         ("mrcal", (), "mm"),  # whose unit is the metre
     ],
 )
-def test_what_is_imported_states_no_scale_gain_or_exposure_that_nobody_gave(
+def test_import_states_no_unknown_units_and_all_inputs(
     program: str, options: tuple[object, ...], depth: str, tmp_path: Path, done: Command
 ) -> None:
-    src = write_models(tmp_path / "src", IMAGE)
-    done("import", program, src, tmp_path / "set", *options)
-    settings = load_set(tmp_path / "set").settings
+    src, folder = write_models(tmp_path / "src"), tmp_path / "set"
+    done("import", program, src, folder, *options)
+    settings = load_set(folder).settings
     assert (settings.units.depth, settings.units.light, settings.exposure_s) == (depth, "dn", None)
+    inputs = json.loads((folder / "provenance.json").read_text())["inputs"]
+    models = ("cameras.txt", "images.txt") if program == "colmap" else ("a.cameramodel",)
+    assert inputs == {name: sha256(src / name) for name in (*models, "a.tiff")}
 
 
 @pytest.mark.parametrize(("depth", "units"), [("mm", ["mm", "m"]), ("relative", ["relative"] * 2)])
-def test_an_export_says_the_unit_of_its_lengths(
-    depth: str, units: list[str], make_set: SetMaker, edit: Edit, tmp_path: Path, done: Command
+def test_export_states_unit_of_its_lengths(
+    depth: str, units: list[str], make_set: SetMaker, edit: Edit, tmp_path: Path, done: Command, faintfield: Command
 ) -> None:
-    folder = make_set([IMAGE])
+    folder = make_set([IMAGE, IMAGE])
     edit(folder, lambda settings: settings.update(units={"depth": depth}))
     for program, unit in zip(PROGRAMS, units, strict=True):
         ended = done("--json", "export", program, folder, tmp_path / program)
         assert json.loads(ended.stdout)["unit"] == unit
         assert ("has no scale" in ended.stderr) == (depth == "relative")
+    for name, side in (("view_0.tiff", "a"), ("view_1.tiff", "b")):
+        (folder / side).mkdir()
+        (folder / name).rename(folder / side / "x.tiff")
+    edit(folder, lambda settings: [view.update(image=f"{'ab'[i]}/x.tiff") for i, view in enumerate(settings["view"])])
+    ended = faintfield("export", "mrcal", folder, tmp_path / "cameras")
+    assert_refused(ended, "BadValue", "b/x.tiff would become x.cameramodel like another view")
 
 
-@pytest.mark.parametrize("program", ["colmap"])
 @pytest.mark.parametrize(
     ("image", "failure", "words"),
     [
@@ -153,11 +141,11 @@ def test_an_export_says_the_unit_of_its_lengths(
         (IMAGE[:, :14], "WrongSize", "a.tiff: is 14 x 12 px, its lens 16 x 12 px"),
     ],
 )
-def test_images_that_are_no_frames_of_the_lens_are_refused(
-    program: str, image: NDArray[Any], failure: str, words: str, tmp_path: Path, faintfield: Command
+def test_images_unlike_their_lens_are_refused(
+    image: NDArray[Any], failure: str, words: str, tmp_path: Path, faintfield: Command
 ) -> None:
     src = write_models(tmp_path / "src", image)
-    refused(faintfield("import", program, src, tmp_path / "set"), failure, words)
+    assert_refused(faintfield("import", "colmap", src, tmp_path / "set"), failure, words)
     assert names_in(tmp_path) == ["src"]
 
 
@@ -165,22 +153,92 @@ def test_images_that_are_no_frames_of_the_lens_are_refused(
     ("program", "file", "content", "words"),
     [
         ("colmap", "images.txt", IMAGES.replace("1 a.tiff", "2 a.tiff"), "a.tiff was taken with camera 2, and cameras"),
+        (
+            "colmap",
+            "cameras.txt",
+            CAMERAS.replace("PINHOLE", "OPENCV_FISHEYE"),
+            "OPENCV_FISHEYE has no counterpart here",
+        ),
         ("mrcal", "a.cameramodel", CAMERA_MODEL.replace("[20, 20", "[-20, 20"), "a.cameramodel: focal lengths must be"),
         ("mrcal", "b.cameramodel", CAMERA_MODEL.replace("20,", "21,"), "have 2 lenses"),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(
+def test_impossible_numbers_are_refused(
     program: str, file: str, content: str, words: str, tmp_path: Path, faintfield: Command
 ) -> None:
     src = write_models(tmp_path / "src")
     tifffile.imwrite(src / "b.tiff", IMAGE)
     (src / file).write_text(content)
-    refused(faintfield("import", program, src, tmp_path / "set"), "BadValue", words)
+    assert_refused(faintfield("import", program, src, tmp_path / "set"), "BadValue", words)
     assert names_in(tmp_path) == ["src"]
 
 
-def test_a_binary_model_replaces_a_text_model(make_set: SetMaker, tmp_path: Path, done: Command) -> None:
-    folder = make_set([IMAGE, IMAGE])
-    done("export", "colmap", folder, tmp_path / "model")
-    done("export", "colmap", folder, tmp_path / "model", "--binary", "--overwrite")
-    assert names_in(tmp_path / "model") == ["cameras.bin", "images.bin", "points3D.bin"]
+STORED = Path(__file__).parent / "colmap"
+
+
+def seen_by(model: ColmapModel, points: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Return where each image sees points of the world, by what was read."""
+    seen = {}
+    for image in model.images:
+        rt = image.rt_cam_world
+        seen[image.name] = model.lenses[image.camera].project(Rotation.from_rotvec(rt[:3]).apply(points) + rt[3:])
+    return seen
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_stored_models_see_as_colmap_does(kind: str) -> None:
+    """COLMAP's library sees the points of its model half a pixel apart from us."""
+    truth = json.loads((STORED / "seen.json").read_text())
+    pixels = seen_by(read_model(STORED / kind), np.array(truth["points"]))
+    assert list(pixels) == list(truth["seen"])
+    for name in pixels:
+        np.testing.assert_allclose(pixels[name] + 0.5, truth["seen"][name], atol=1e-9, err_msg=name)
+
+
+def test_text_model_takes_no_names_with_spaces(tmp_path: Path) -> None:
+    with pytest.raises(BadValue, match="has a space, where COLMAP ends a name in a text model; use --binary"):
+        write_model(tmp_path, read_model(STORED / "binary"), binary=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_model_becomes_an_elemental_set(tmp_path: Path) -> None:
+    """One camera of the stored model, its images in a folder below, its unit a metre."""
+    model = read_model(STORED / "text")
+    chosen = [image for image in model.images if image.camera in (4, 5)]
+    lone = ColmapModel({4: model.lenses[4]}, [replace(image, camera=4) for image in chosen])
+    (tmp_path / "model").mkdir()
+    write_model(tmp_path / "model", lone, binary=True)
+    for image in chosen:
+        (tmp_path / image.name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
+    import_colmap(
+        tmp_path / "model", tmp_path / "set", images=tmp_path, mm_per_unit=1000, reference="radial r4.png", exposure_s=1
+    )
+    elemental_set = load_set(tmp_path / "set")
+    assert (elemental_set.lens.fx_px, elemental_set.lens.cx_px, elemental_set.lens.cy_px) == (800.0, 322.0, 237.75)
+    expected = relative(*(image.rt_cam_world * [1, 1, 1, 1000, 1000, 1000] for image in reversed(chosen)))
+    np.testing.assert_allclose(elemental_set.poses_rt_cam_ref, [np.zeros(6), expected], atol=1e-9)
+    export_colmap(tmp_path / "set", tmp_path / "back", binary=True)
+    back = read_model(tmp_path / "back")
+    np.testing.assert_allclose([image.rt_cam_world for image in back.images], [np.zeros(6), expected], atol=1e-9)
+
+
+def test_impossible_number_of_points_is_refused(tmp_path: Path) -> None:
+    write_model(tmp_path, read_model(STORED / "binary"), binary=True)
+    path = tmp_path / "images.bin"
+    path.write_bytes(path.read_bytes()[:-8] + struct.pack("<Q", 2**62))
+    with pytest.raises(BadValue, match="is not a COLMAP model that can be read"):
+        read_model(tmp_path)
+
+
+def test_equal_names_of_images_are_refused(tmp_path: Path) -> None:
+    """They would be copied over one another."""
+    lens = read_model(STORED / "text").lenses[1]
+    images = [ColmapImage(f"{side}/0.png", 1, np.zeros(6)) for side in ("left", "right")]
+    (tmp_path / "model").mkdir()
+    write_model(tmp_path / "model", ColmapModel({1: lens}, images), binary=False)
+    for image in images:
+        (tmp_path / image.name).parent.mkdir()
+        cv2.imwrite(str(tmp_path / image.name), np.zeros((480, 640), np.uint16))
+    with pytest.raises(BadValue, match=r"right/0\.png: would become 0\.png"):
+        import_colmap(tmp_path / "model", tmp_path / "set", images=tmp_path, exposure_s=1)

@@ -24,7 +24,7 @@ from faintfield.recon.likelihood.images import ElementalImages, Image
 from faintfield.recon.prior.evidence import Evidence
 from faintfield.recon.prior.patches import patch_candidates
 from faintfield.recon.solver.data_fit import SceneProblem
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, drawing_nothing
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 
@@ -43,20 +43,26 @@ def colour_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
-def in_memory(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, list[str]]]:
-    """The colours in the order in which they are read, each with those that were still in memory."""
-    read: list[tuple[str, list[str]]] = []
+type Readings = list[tuple[str, list[str]]]
+
+
+@pytest.fixture(scope="module")
+def colour_plane(colour_set: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Readings]:
+    """A plane by patches, and its colours in the order in which they were read, each with those still in memory."""
+    out, read = tmp_path_factory.mktemp("whole"), list[tuple[str, list[str]]]()
     alive: list[tuple[str, weakref.ref[ElementalImages]]] = []
 
-    def watched(loaded: ElementalSet, layout: ChannelLayout, *allocate: Any) -> ElementalImages:
+    def watched(elemental_set: ElementalSet, layout: ChannelLayout, *allocate: Any) -> ElementalImages:
         read.append((layout.name, [name for name, images in alive if images() is not None]))
-        images = load_channel(loaded, layout, *allocate)
+        images = load_channel(elemental_set, layout, *allocate)
         alive.append((layout.name, weakref.ref(images)))
         return images
 
-    monkeypatch.setattr(sweep, "load_channel", watched)
-    return read
+    with pytest.MonkeyPatch.context() as patch, drawing_nothing():
+        patch.setattr(sweep, "load_channel", watched)
+        words = ("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", out)
+        assert run([str(word) for word in words]) == 0
+    return out, read
 
 
 def _planes(folder: Path) -> dict[str, bytes]:
@@ -65,11 +71,11 @@ def _planes(folder: Path) -> dict[str, bytes]:
 
 def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
     """Each colour of a plane by the prior, with the sum of the other colours by total variation."""
-    loaded = load_set(folder)
+    elemental_set = load_set(folder)
     objectives, first = [], []
-    for layout in channel_layouts(loaded):
-        images = load_channel(loaded, layout)
-        operator = OperatorFactory(loaded, layout, images).at(depth_mm, plane_grid(loaded, depth_mm))
+    for layout in channel_layouts(elemental_set):
+        images = load_channel(elemental_set, layout)
+        operator = OperatorFactory(elemental_set, layout, images).at(depth_mm, plane_grid(elemental_set, depth_mm))
         objectives.append(Objective.of(SceneProblem(operator, images), settings))
         first.append(solve_pmlem(objectives[-1], settings))
     red, green, blue = (one.plane for (one,) in first)
@@ -80,17 +86,10 @@ def _by_hand(folder: Path, depth_mm: float, settings: Settings) -> list[Image]:
     ]
 
 
-def test_each_colour_begins_with_sum_of_others(colour_set: Path, tmp_path: Path, done: Command) -> None:
-    done("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
-    found = tifffile.imread(tmp_path / "plane_00500.0.tiff")
-    expected = _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
-    np.testing.assert_allclose(np.moveaxis(found, -1, 0), expected, atol=1e-4)
-    records = json.loads((tmp_path / "reconstruction.json").read_text())["planes"]
-    assert [record["channel"] for record in records] == ["red", "green", "blue"]
-    assert all(record["prior"]["name"] == "patches" for record in records)
-
-
-def test_held_out_views_judge_candidates_that_know_others(colour_set: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_colour_begins_with_sum_of_others(
+    colour_set: Path, colour_plane: tuple[Path, Readings], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Held-out views judge candidates that know the other colours, too."""
     judged: list[Evidence] = []
 
     def watched(evidence: Evidence) -> dict[str, Image]:
@@ -98,13 +97,22 @@ def test_held_out_views_judge_candidates_that_know_others(colour_set: Path, monk
         return patch_candidates(evidence)
 
     monkeypatch.setattr("faintfield.pipelines.reconstruction.prior.patch_candidates", watched)
-    _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
+    plane = tifffile.imread(colour_plane[0] / "plane_00500.0.tiff")
+    expected = _by_hand(colour_set, 500.0, Settings(2.0, 2, prior="patches"))
+    np.testing.assert_allclose(np.moveaxis(plane, -1, 0), expected, atol=1e-4)
+    records = json.loads((colour_plane[0] / "reconstruction.json").read_text())["planes"]
+    assert [(record["channel"], record["prior"]["name"]) for record in records] == [
+        (channel, "patches") for channel in ("red", "green", "blue")
+    ]
     assert len(judged) >= 3 * 3  # colours times two folds and the whole
-    seen_by_some = {evidence.coverage.sum(dtype=float) for evidence in judged}
-    assert len(seen_by_some) == len(judged)
+    assert len({evidence.coverage.sum(dtype=float) for evidence in judged}) == len(judged)
     for evidence in judged:
         assert evidence.others is not None
         assert evidence.others[evidence.coverage > 0].min() > 0
+
+
+def test_memory_holds_one_colour_at_a_time(colour_plane: tuple[Path, Readings]) -> None:
+    assert colour_plane[1] == [(name, []) for name in ("red", "green", "blue", "green", "red")]
 
 
 def test_joint_planes_begin_with_other_colours(
@@ -123,28 +131,21 @@ def test_joint_planes_begin_with_other_colours(
         return found
 
     monkeypatch.setattr(tasks, "solve_together", watched)
-    both = (*NEAR, "--depth-mm", 700, "--joint", "--occlusion")
+    both = (*NEAR, "--depth-mm", 700, "--joint")
     done("reconstruct", colour_set, *both, *QUICK, *PATCHES, "--out", tmp_path)
     assert len(light) == len(begun) == 3
     for own, pilots in zip(light, begun[::-1], strict=True):
         for place, (plane, others) in pilots.items():
             np.testing.assert_array_equal(plane, own[place])
             np.testing.assert_allclose(plane + others, np.sum([one[place] for one in light], axis=0), rtol=1e-5)
-    assert len(_planes(tmp_path)) == 2 * 2 * 3  # picture, preview and record
-
-
-def test_memory_holds_one_colour_at_a_time(
-    colour_set: Path, tmp_path: Path, done: Command, in_memory: list[tuple[str, list[str]]]
-) -> None:
-    done("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
-    assert in_memory == [(name, []) for name in ("red", "green", "blue", "green", "red")]
+    assert len(_planes(tmp_path)) == 2 * 3  # picture, preview and record
 
 
 def test_interrupted_colour_plane_is_completed_alike(
-    colour_set: Path, tmp_path: Path, faintfield: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    words = ("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out")
-    assert faintfield(*words, tmp_path / "whole").returncode == 0
+    colour_set: Path, colour_plane: tuple[Path, Readings], tmp_path: Path, faintfield: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    words = ("reconstruct", colour_set, *NEAR, *QUICK, *PATCHES, "--out", tmp_path)
     calls = []
 
     def failing(*arguments: Any) -> Any:
@@ -154,7 +155,7 @@ def test_interrupted_colour_plane_is_completed_alike(
         return solve(*arguments)
 
     monkeypatch.setattr(tasks, "solve", failing)
-    assert faintfield(*words, tmp_path / "ended").returncode == 1
-    assert {path.suffix for path in (tmp_path / "ended" / ".parts").iterdir()} == {".float32", ".json"}
-    assert faintfield(*words, tmp_path / "ended").returncode == 0
-    assert _planes(tmp_path / "ended") == _planes(tmp_path / "whole")
+    assert faintfield(*words).returncode == 1
+    assert {path.suffix for path in (tmp_path / ".parts").iterdir()} == {".float32", ".json"}
+    assert faintfield(*words).returncode == 0
+    assert _planes(tmp_path) == _planes(colour_plane[0])

@@ -1,5 +1,6 @@
-"""Whatever a file holds, it is read or refused by a named failure; what is larger than expected is never decoded."""
+"""Files of any content are read or refused by a named failure; larger ones than expected are never decoded."""
 
+import contextlib
 import errno
 import fcntl
 import io
@@ -19,7 +20,6 @@ import pytest
 import tifffile
 
 from faintfield.pipelines.errors import BadValue, CannotWrite, InputError, MissingFile, UnreadableImage, WrongSize
-from faintfield.pipelines.formats.exchange.colmap import read_posed_images
 from faintfield.pipelines.formats.exchange.mrcal import read_camera_models
 from faintfield.pipelines.formats.files import Hashes, exclusive, sha256
 from faintfield.pipelines.formats.frames import read_frame
@@ -34,7 +34,7 @@ class _Settings(msgspec.Struct, forbid_unknown_fields=True):
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "x\0y"])
-def test_names_that_no_file_can_have_are_names_of_no_file(name: str, tmp_path: Path) -> None:
+def test_impossible_names_are_missing_files(name: str, tmp_path: Path) -> None:
     assert not is_file(tmp_path / name)
     assert not is_folder(tmp_path / name)
     with pytest.raises(MissingFile, match="cannot be read"):
@@ -47,7 +47,7 @@ def test_names_that_no_file_can_have_are_names_of_no_file(name: str, tmp_path: P
 
 
 @pytest.mark.parametrize("read", [read_frame, read_content, sha256, lambda path: read_toml(path, _Settings)])
-def test_a_pipe_is_refused_at_once(read: Callable[[Path], object], tmp_path: Path) -> None:
+def test_pipe_is_refused_at_once(read: Callable[[Path], object], tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "frame.tiff")
     with pytest.raises(MissingFile):
         read(tmp_path / "frame.tiff")
@@ -63,18 +63,21 @@ def test_a_pipe_is_refused_at_once(read: Callable[[Path], object], tmp_path: Pat
         ("#" * 8_000_001, "at most 8000000 are read"),
     ],
 )
-def test_toml_that_no_one_writes_is_refused(content: str, words: str, tmp_path: Path) -> None:
+def test_hostile_toml_is_refused(content: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "rig.toml").write_text(content)
     with pytest.raises(InputError, match=words) as refused:
         read_toml(tmp_path / "rig.toml", _Settings)
     assert str(refused.value).startswith(f"{tmp_path / 'rig.toml'}: ")
+    # Dots in text and in lists of numbers are no long key
+    (tmp_path / "rig.toml").write_text("format = 1\nvalue = ['" + "a b." * 40 + "', " + "0.5, " * 100 + "]")
+    assert len(read_toml(tmp_path / "rig.toml", _Settings).value) == 101
 
 
 @pytest.mark.parametrize(
     "content",
     [b"[" * 100_000, b'{"format": 1e999}', b"\xff\xfe", b""],
 )
-def test_json_that_no_one_writes_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_hostile_json_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "noise.json").write_bytes(content)
     with pytest.raises(BadValue, match=r"noise\.json: is not a record \(.*\); make it again"):
         read_json(tmp_path / "noise.json", _Settings, what="a record", remedy="make it again")
@@ -108,38 +111,37 @@ def _read_map(path: Path) -> dict[str, Any]:
         (bytes(1_100_000), "holds 1100000 bytes"),
     ],
 )
-def test_arrays_that_are_not_what_they_state_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
+def test_arrays_unlike_their_header_are_refused(content: bytes, words: str, tmp_path: Path) -> None:
     (tmp_path / "maps.npz").write_bytes(content)
     with pytest.raises(BadValue, match=rf"maps\.npz: cannot be read \(.*{words}.*; make it again"):
         _read_map(tmp_path / "maps.npz")
 
 
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize(("save", "order"), [(np.savez, "C"), (np.savez_compressed, "F")])
 def test_arrays_are_read_as_written(save: Callable[..., None], order: Literal["C", "F"], tmp_path: Path) -> None:
-    written = np.array(np.random.default_rng(20110919).normal(size=(3, 4)), order=order)
-    save(tmp_path / "maps.npz", map=written, unread=np.zeros(3))
-    found = _read_map(tmp_path / "maps.npz")
-    assert list(found) == ["map"]
-    np.testing.assert_array_equal(found["map"], written)
+    array = np.array(np.random.default_rng(20110919).normal(size=(3, 4)), order=order)
+    save(tmp_path / "maps.npz", map=array, unread=np.zeros(3))
+    arrays = _read_map(tmp_path / "maps.npz")
+    assert list(arrays) == ["map"]
+    np.testing.assert_array_equal(arrays["map"], array)
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
-def test_a_changed_byte_in_an_array_is_found(save: Callable[..., None], tmp_path: Path) -> None:
-    written = np.random.default_rng(20110919).normal(size=(3, 4)).astype(np.float32)
+def test_changed_byte_in_array_is_noticed(save: Callable[..., None], tmp_path: Path) -> None:
+    array = np.random.default_rng(20110919).normal(size=(3, 4)).astype(np.float32)
     path = tmp_path / "maps.npz"
-    save(path, map=written)
+    save(path, map=array)
     whole = path.read_bytes()
-    refused = 0
-    for place in range(len(whole)):
+    refused, places = 0, range(0, len(whole), 2)
+    for place in places:
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x41]) + whole[place + 1 :])
         try:
-            found = _read_map(path)
+            arrays = _read_map(path)
         except BadValue:
             refused += 1
         else:  # the byte is of no consequence, or of a name
-            assert not found or np.array_equal(found["map"], written)
-    assert refused > len(whole) // 2
+            assert not arrays or np.array_equal(arrays["map"], array)
+    assert refused > len(places) // 2
 
 
 # Reads frames, and prints how each was refused and by how many MB the process grew.
@@ -202,7 +204,7 @@ def test_bombs_are_refused_before_they_are_decoded(tmp_path: Path) -> None:
     assert int(grown_mb) < 200  # the strip alone would take 400, and the picture in the PNG 900
 
 
-def test_a_frame_of_another_size_is_refused_by_its_header_alone(tmp_path: Path) -> None:
+def test_frame_of_another_size_is_never_decoded(tmp_path: Path) -> None:
     _tiff(tmp_path / "frame.tiff", 4000, b"no pixels at all")
     with pytest.raises(WrongSize, match=r"frame\.tiff: is 4000 x 4000 px, the first frame 40 x 30 px"):
         read_frame(tmp_path / "frame.tiff", (40, 30), of="the first frame")
@@ -210,7 +212,7 @@ def test_a_frame_of_another_size_is_refused_by_its_header_alone(tmp_path: Path) 
         read_frame(tmp_path / "frame.tiff", (4000, 4000))
 
 
-def test_a_small_picture_after_the_first_is_passed_over(tmp_path: Path) -> None:
+def test_thumbnail_after_the_picture_is_ignored(tmp_path: Path) -> None:
     pixels = np.arange(1200, dtype=np.uint16).reshape(30, 40)
     with tifffile.TiffWriter(tmp_path / "frame.tiff") as file:
         file.write(pixels)
@@ -226,7 +228,7 @@ MODEL = {
 }
 
 
-def test_the_text_of_a_camera_model_is_read_without_the_measurements_in_it(tmp_path: Path) -> None:
+def test_camera_model_is_read_without_its_measurements(tmp_path: Path) -> None:
     text = repr(MODEL)[:-1] + ", 'icam_intrinsics': 0, 'optimization_inputs': b'" + "x!" * 1_000_000 + "'}"
     (tmp_path / "view.cameramodel").write_text(f"# written by hand\n{text}\n")
     (tmp_path / "view.tiff").touch()
@@ -241,14 +243,11 @@ def test_the_text_of_a_camera_model_is_read_without_the_measurements_in_it(tmp_p
         "__import__('pathlib').Path('made').touch()",
         repr(MODEL | {"intrinsics": [1.0] * 3}),
         repr(MODEL | {"imagersize": [200_000, 200_000]}),
-        repr({key: value for key, value in MODEL.items() if key != "extrinsics"}),
         "[" * 50_000,
         "",
     ],
 )
-def test_a_hostile_camera_model_is_refused_and_not_executed(
-    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hostile_camera_model_is_not_executed(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "view.cameramodel").write_text(text)
     with pytest.raises(BadValue, match=r"view\.cameramodel: "):
@@ -256,31 +255,21 @@ def test_a_hostile_camera_model_is_refused_and_not_executed(
     assert not (tmp_path / "made").exists()
 
 
-@pytest.mark.parametrize("name", ["../../secret.png"])
-def test_a_model_names_no_image_outside_its_folder(name: str, tmp_path: Path) -> None:
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 500 500 320 240\n")
-    (tmp_path / "images.txt").write_text(f"1 1 0 0 0 0 0 0 1 {name}\n\n")
-    with pytest.raises(BadValue, match=r"images\.txt: name = .* leaves the folder"):
-        read_posed_images(tmp_path, tmp_path)
-
-
 @pytest.mark.parametrize(("number", "refused"), [(errno.EIO, True), (errno.ENOLCK, False)])
-def test_a_lock_that_cannot_be_taken_is_a_named_failure_unless_there_are_no_locks(
+def test_failing_lock_is_named_unless_unsupported(
     number: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", fail)
-    if refused:
-        with pytest.raises(CannotWrite, match=r"results: cannot be locked"), exclusive(tmp_path / "results"):
-            pytest.fail("nothing must be written")
-    else:
-        with exclusive(tmp_path / "results"):
-            assert (tmp_path / "results").is_dir()
+    expected = pytest.raises(CannotWrite, match=r"results: cannot be locked") if refused else contextlib.nullcontext()
+    with expected, exclusive(tmp_path / "results"):
+        assert not refused
+        assert (tmp_path / "results").is_dir()
 
 
-def test_hashes_that_came_with_a_folder_are_not_believed(tmp_path: Path) -> None:
+def test_only_own_hashes_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "frame"
     path.write_bytes(b"as it was")
     os.utime(path, ns=(10**18, 10**18))
@@ -289,19 +278,8 @@ def test_hashes_that_came_with_a_folder_are_not_believed(tmp_path: Path) -> None
     for claim in (claimed, claimed | {"ctime_ns": state.st_mtime_ns, "inode": state.st_ino}):
         (tmp_path / ".hashes.json").write_bytes(msgspec.json.encode({"frame": claim}))
         assert Hashes(tmp_path).of("frame") == sha256(path)
-
-
-def test_a_hash_is_kept_while_the_file_is_untouched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "frame"
-    path.write_bytes(b"as it was")
-    os.utime(path, ns=(10**18, 10**18))
     hashes = Hashes(tmp_path)
     digest = hashes.of("frame")
     hashes.save()
     monkeypatch.setattr("faintfield.pipelines.formats.files.sha256", lambda _: pytest.fail("hashed again"))
     assert Hashes(tmp_path).of("frame") == digest
-
-
-def test_dots_in_text_and_in_lists_of_numbers_are_no_long_key(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text("format = 1\nvalue = ['" + "a b." * 40 + "', " + "0.5, " * 100 + "]")
-    assert len(read_toml(tmp_path / "rig.toml", _Settings).value) == 101

@@ -8,21 +8,21 @@ from faintfield.pipelines.calibration.reading_ahead import read_ahead
 
 
 def test_items_come_in_order_and_few_wait() -> None:
-    begun, taken, lock, most = 0, 0, threading.Lock(), 0
+    begun, consumed, lock, most = 0, 0, threading.Lock(), 0
 
     def read(item: int) -> int:
         nonlocal begun, most
         with lock:
             begun += 1
-            most = max(most, begun - taken)
+            most = max(most, begun - consumed)
         return item**2
 
-    found = []
+    items = []
     for item, content in read_ahead(range(50), read, workers=3):
         with lock:
-            taken += 1
-        found.append((item, content))
-    assert found == [(item, item**2) for item in range(50)]
+            consumed += 1
+        items.append((item, content))
+    assert items == [(item, item**2) for item in range(50)]
     assert most <= 4
 
 
@@ -30,7 +30,7 @@ def test_a_failure_comes_in_its_turn() -> None:
     def read(item: int) -> float:
         return 1 / (item - 3)
 
-    come = read_ahead(range(9), read)
-    assert [next(come)[0] for _ in range(3)] == [0, 1, 2]
+    items = read_ahead(range(9), read)
+    assert [next(items)[0] for _ in range(3)] == [0, 1, 2]
     with pytest.raises(ZeroDivisionError):
-        next(come)
+        next(items)

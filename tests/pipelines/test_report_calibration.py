@@ -12,26 +12,23 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from msgspec import structs
 
 from faintfield.pipelines.cli import run
 from faintfield.pipelines.formats.image_files import write_png
 from faintfield.pipelines.formats.results.geometry import GeometryRecord
-from faintfield.pipelines.formats.results.overview import Brightness, Overview
+from faintfield.pipelines.formats.results.overview import Overview
 from faintfield.pipelines.pages.geometry_page import holdout_rows
 from faintfield.pipelines.pages.report import write_report
 from faintfield.pipelines.pages.report_calibration import find_beside
 from faintfield.pipelines.pages.report_sets import photon_budget
 from tests.pipelines.by_hand import write_by_hand
-from tests.pipelines.conftest import Command
+from tests.pipelines.conftest import Command, drawing_nothing
+from tests.pipelines.forms import GOLDEN
 
-KNOWN = {"value": 3.4641, "se": 0.0022, "ci95": [3.4597, 3.4685]}
-NOISE: dict[str, Any] = {
-    "offset_dn": {"value": 100.0031, "se": 0.0029, "ci95": [99.9974, 100.0088]},
-    "gain_dn_per_e": {"value": 2.00026, "se": 0.0012, "ci95": [1.9979, 2.0026]},
-    "read_noise_e": KNOWN,
+NOISE = json.loads((GOLDEN / "noise.json").read_bytes()) | {
+    "read_noise_e": {"value": 3.4641, "se": 0.0022, "ci95": [3.4597, 3.4685]},
     "dark_current_e_per_s": {"value": None, "why": "all darks have one exposure time"},
-    "likelihood": "marginal Gaussian",
-    "frames": [{"file": "dark.tiff", "kind": "dark", "exposure_s": 0.1}] * 12,
     "hot_pixels": [[1, 2]],
     "temperature_c": {"mean": -20.0, "min": -20.1, "max": -19.9},
     "warnings": ["the darks drift"],
@@ -39,47 +36,18 @@ NOISE: dict[str, Any] = {
 
 
 def _geometry() -> dict[str, Any]:
-    figure = {"value": 50.0, "sigma": 0.01, "why": None}
-    names = ("pitch_x_mm", "pitch_y_mm", "scale_x", "scale_y", "squareness_rad", "backlash_x_mm", "tilt_rad")
-    stage: dict[str, Any] = dict.fromkeys((*names, "node_residual_rms_mm"), figure)
-    stage["backlash_y_mm"] = {"value": None, "sigma": None, "why": "approached from one side"}
-    stage["residuals_mm"] = [[0.1 * k, -0.1, 0.05] for k in range(9)]
-    stage["doubts"] = []
-    nodes = [
-        {"node": [r, c], "rt_cam_ref": [0.0] * 6, "sigma_mm": 0.011 * (r + 1), "sigma_rad": 1e-4}
-        for r in range(3)
-        for c in range(3)
-    ]
-    lens = dict.fromkeys(("fx_px", "fy_px", "cx_px", "cy_px"), 400.0) | {"distortion": [0.0], "sigma": [0.1] * 5}
-    known = dict.fromkeys(("rms_inlier_px", "rms_mrcal_px", "corner_sigma_px"), 0.018)
-    return {
-        "format": 1,
-        "lens": {"model": "opencv4", **lens},
-        "size_px": [800, 800],
-        "reference_node": [1, 1],
-        "nodes": nodes,
-        **known,
-        "corners": 5450,
-        "outliers": 3,
-        "holdout_ratio": None,
-        "doubts": [],
-        "transfer_sigma_px": {"500": 0.0134},
-        "repeatability": None,
-        "boards": [],
-        "stage": stage,
-        "command": "geometry",
-        "options": {"lens": "opencv4", "depth_mm": [500.0], "limit_px": 0.5},
-        "inputs": {},
-        "versions": {},
-    }
+    geometry: dict[str, Any] = json.loads((GOLDEN / "geometry.json").read_bytes())
+    geometry["stage"]["backlash_y_mm"] = {"value": None, "sigma": None, "why": "approached from one side"}
+    return geometry
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def drawn(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One plane by one method; to be read only."""
     out = tmp_path_factory.mktemp("drawn") / "out"
     words = ["--depth-mm", "500", "--method", "backprojection"]
-    assert run(["reconstruct", str(simulated_scene), "--out", str(out), *words]) == 0
+    with drawing_nothing():
+        assert run(["reconstruct", str(simulated_scene), "--out", str(out), *words]) == 0
     return out
 
 
@@ -99,7 +67,7 @@ def session(session_to_draw: Path, undrawn: None) -> Path:
 
 
 @pytest.mark.parametrize("place", ["", "reconstructions/scene"])
-def test_session_shows_its_noise_and_geometry_wherever_page_stands(place: str, session: Path, done: Command) -> None:
+def test_every_page_of_session_shows_calibrations(place: str, session: Path, done: Command) -> None:
     done("report", session / place)
     text = (session / place / "report.html").read_text()
     assert "3.464" in text
@@ -108,14 +76,15 @@ def test_session_shows_its_noise_and_geometry_wherever_page_stands(place: str, s
     assert "1 hot" in text
     assert "the darks drift" in text
     assert "−20.0 °C" in text
-    assert "5450 corners" in text
+    assert "768 corners" in text
     assert "approached from one side" in text
     assert text.count("<svg") == 3
+    assert 'id="weight"' not in text
     assert "http-equiv" in text
 
 
 @pytest.mark.parametrize(
-    ("ratio", "boards", "said"),
+    ("ratio", "boards", "rows"),
     [
         (1.25, 2, [("1.25", "limit 1.3"), ("0.00750", "px; up to 0.1 px is never refused")]),
         (10.0, 2, [("10.0", "waived"), ("0.0995", "px; up to 0.1 px")]),  # 0.01 √(10² − 1)
@@ -123,17 +92,16 @@ def test_session_shows_its_noise_and_geometry_wherever_page_stands(place: str, s
         (None, 2, [("–", "some node would see no other board")]),
     ],
 )
-def test_error_of_held_out_boards_has_its_limit(ratio: float | None, boards: int, said: list[tuple[str, str]]) -> None:
-    printed = {"columns": 9, "rows": 7, "square_mm": 40.0, "marker_mm": 30.0, "dictionary": "d", "first_marker_id": 0}
-    board = {"name": "b", **printed, "sweep": 0, "rt_ref_board": [0.0] * 6, "warp_mm": [0.0, 0.0]}
-    content = _geometry() | {"holdout_ratio": ratio, "rms_inlier_px": 0.01, "boards": [board] * boards}
-    for row, (value, why) in zip(holdout_rows(msgspec.convert(content, GeometryRecord)), said, strict=True):
+def test_error_of_held_out_boards_has_its_limit(ratio: float | None, boards: int, rows: list[tuple[str, str]]) -> None:
+    content = _geometry() | {"holdout_ratio": ratio, "rms_inlier_px": 0.01}
+    content["boards"] = content["boards"][:boards]
+    for row, (value, why) in zip(holdout_rows(msgspec.convert(content, GeometryRecord)), rows, strict=True):
         assert row.value == value
         assert why in row.why
         assert ("waived" in row.why) == (why == "waived")
 
 
-def test_page_says_whether_its_planes_were_made_with_calibration(session: Path, done: Command) -> None:
+def test_page_says_whether_planes_used_calibration(session: Path, done: Command) -> None:
     folder = session / "reconstructions" / "scene"
     done("report", folder)
     assert "It is not among the inputs of these planes" in (folder / "report.html").read_text()
@@ -153,16 +121,17 @@ def test_calibrations_can_be_named(drawn: Path, session: Path, tmp_path: Path) -
     assert 'id="geometry"' not in text
 
 
-@pytest.mark.parametrize("name", ["noise.json", "geometry.json"])
-def test_damaged_calibration_is_named(name: str, session: Path, faintfield: Command) -> None:
-    (session / name).write_text("{}")
-    ended = faintfield("report", session)
-    assert ended.returncode == 1
-    assert "BadValue" in ended.stderr
-    assert f"{name}: is not the result of `faintfield {name.removesuffix('.json')}`" in ended.stderr
+def test_damaged_calibration_is_named(session: Path, faintfield: Command) -> None:
+    for name in ("noise", "geometry"):
+        before = (session / f"{name}.json").read_bytes()
+        (session / f"{name}.json").write_text("{}")
+        ended = faintfield("report", session)
+        assert ended.returncode == 1
+        assert f"{name}.json: is not the result of `faintfield {name}`" in ended.stderr
+        (session / f"{name}.json").write_bytes(before)
 
 
-def test_geometry_without_regular_grid_is_shown_all_same(session: Path, done: Command) -> None:
+def test_geometry_without_regular_grid_is_shown(session: Path, done: Command) -> None:
     content = _geometry()
     content["stage"] |= {"residuals_mm": [], "pitch_x_mm": {"value": None, "sigma": None, "why": "one column only"}}
     (session / "geometry.json").write_text(json.dumps(content))
@@ -173,31 +142,12 @@ def test_geometry_without_regular_grid_is_shown_all_same(session: Path, done: Co
 
 
 def _overview(quantum_efficiency: float | None = 0.5, mean_signal_e: float = 0.96) -> Overview:
-    light = Brightness(
-        region="whole view",
-        noise_from="noise model",
-        snr=0.16,
-        electrons_linear=1.92,
-        electrons_from_moments=0.96,
-        mean_signal_e=mean_signal_e,
-        photons_linear=None,
-        photons_from_moments=None,
-    )
-    return Overview(
-        set="scene",
-        views=49,
-        grid=(7, 7),
-        poses="stated",
-        size_px=(640, 480),
-        exposure_s=0.1,
-        frames_per_view=1,
-        read_noise_e=12**0.5,
-        has_noise_reference=False,
-        quantum_efficiency=quantum_efficiency,
-        dark_e=0.02,
-        grey_scale_dn=(0.0, 1.0),
-        brightness=light,
-    )
+    overview = msgspec.json.decode((GOLDEN / "overview_set.json").read_bytes(), type=Overview)
+    light: dict[str, float | None] = {"snr": 0.16, "electrons_linear": 1.92, "electrons_from_moments": 0.96}
+    light["mean_signal_e"] = mean_signal_e
+    light["photons_linear"] = light["photons_from_moments"] = None
+    camera = {"exposure_s": 0.1, "read_noise_e": 12**0.5, "dark_e": 0.02, "quantum_efficiency": quantum_efficiency}
+    return structs.replace(overview, views=49, brightness=structs.replace(overview.brightness, **light), **camera)
 
 
 def test_photon_budget_is_that_of_papers_equations() -> None:
@@ -216,27 +166,20 @@ def test_photon_budget_is_that_of_papers_equations() -> None:
     assert budget.shares == pytest.approx(
         {"read noise": 12 / 12.98, "light": 0.96 / 12.98, "dark current": 0.02 / 12.98}
     )
+    assert photon_budget(_overview(mean_signal_e=0.0)) is None
 
 
-@pytest.mark.parametrize("mean_signal_e", [-0.1, 0.0])
-def test_without_light_there_is_no_budget(mean_signal_e: float) -> None:
-    assert photon_budget(_overview(mean_signal_e=mean_signal_e)) is None
-
-
-def test_without_quantum_efficiency_budget_has_electrons_only() -> None:
+def test_budget_without_quantum_efficiency_has_electrons_only() -> None:
     budget = photon_budget(_overview(quantum_efficiency=None))
     assert budget is not None
     assert [row.electrons for row in budget.light] == [1.92, 0.96, 0.96]
     assert {number for row in budget.light for number in (row.photons, row.flux, row.all_views)} == {None}
-    assert budget.variance_e2 == pytest.approx(12.98)
 
 
 def test_weights_tried_and_certificates_are_shown(session_to_draw: Path, done: Command) -> None:
     session = session_to_draw
     path = session / "reconstructions" / "scene" / "reconstruction.json"
     content = json.loads(path.read_text())
-    done("report", session)
-    assert 'id="weight"' not in (session / "report.html").read_text()
     curve = [{"weight": 0.1 * 2**k, "held_out": 50.0 + (k - 2) ** 2} for k in range(5)]
     certificate = {"kind": "bound", "value": 0.00823, "reached": False}
     content["planes"][0] |= {

@@ -1,6 +1,5 @@
 """`faintfield run` takes the options of `reconstruct`, and does again only what they change."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from faintfield.pipelines.reconstruction.request import select_planes
 from faintfield.pipelines.reconstruction.surface_request import select_surface
 from faintfield.recon.errors import NothingInFocus
 from tests.pipelines.conftest import Command
+from tests.pipelines.forms import read_record
 from tests.pipelines.surfaces import Searches
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -25,11 +25,6 @@ def _ran(session: Path, **options: Any) -> list[str]:
     return [step.step for step in run(session, options=Options(**options)).steps if step.ran]
 
 
-def _record(session: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads((session / "reconstructions" / "reconstruction.json").read_bytes())
-    return record
-
-
 def test_only_options_of_sets_are_missing_from_run() -> None:
     options = {
         command: {name for one in app[command].assemble_argument_collection() for name in one.names}
@@ -40,73 +35,61 @@ def test_only_options_of_sets_are_missing_from_run() -> None:
 
 
 @pytest.mark.parametrize(
-    ("command", "words", "said"),
+    ("command", "words", "message"),
     [
         ("run", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call of their"),
         ("run", "--depth-mm auto --sweep auto", "--sweep auto makes all planes of a range, and --depth-mm auto leaves"),
-        ("run", "--depth auto --sweep-mm 4:9:9 --depth-map", "--depth-map compares those of a sweep, and --depth-mm"),
-        (
-            "run",
-            "--depth-mm 500 --depth 700 --depth-map",
-            "--depth-map compares depths, and 2 are given; give at least",
-        ),
+        ("run", "--depth-mm 500 --depth 700 --depth-map", "--depth-map compares depths, and 2 are given; give at"),
         ("run", "--depth-mm 500 --method mlem --uncertainty", "--uncertainty is for pmlem, joint and occlusion, not"),
         ("run", "--depth-mm 500 --joint --penalty none --prior auto", "--prior auto starts from total variation"),
         ("run", "--depth-mm 500 --prior tv --proposal", "--proposal saves what a prior proposes, and tv proposes"),
-        ("run", "--depth-mm 500 --depth-range-mm 400:900", "a range of depths or disparities is that of a surface"),
         ("run", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity-range-px"),
         ("run", "--depth-mm 500 --workers 2 --scheduler here", "--workers starts processes here, --scheduler names"),
         ("run", "--sweep-mm 400:900", "--sweep-mm 400:900: is no sweep; give FIRST:LAST:COUNT"),
-        ("reconstruct", "--depth-mm auto --depth-mm 500", "--depth-mm auto finds all depths; give others in a call"),
         ("reconstruct", "--surface --depth-range-mm 4:9 --disparity-range-px 1:2", "--depth-range-mm and --disparity"),
     ],
 )
 def test_options_that_exclude_each_other_are_refused(
-    command: str, words: str, said: str, recorded_session: Path, faintfield: Command
+    command: str, words: str, message: str, recorded_session: Path, faintfield: Command
 ) -> None:
     ended = faintfield(command, recorded_session, *words.split())
     assert ended.returncode == 2
-    assert ended.stderr.startswith(f"faintfield: wrong usage: {said}")
+    assert ended.stderr.startswith(f"faintfield: wrong usage: {message}")
     assert len(ended.stderr.splitlines()) == 1
 
 
-def test_planes_solved_together_are_made_once(session: Path) -> None:
-    asked: dict[str, Any] = {"depth_mm": [500.0, 700.0], "joint": True, "uncertainty": True, "pitch_mm": 8.0, **_QUICK}
+def _fail(*_: object) -> None:
+    raise NothingInFocus("begun")
+
+
+def test_planes_solved_together_are_made_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: dict[str, Any] = {"depth_mm": [500.0, 700.0], "joint": True, "uncertainty": True, "pitch_mm": 16.0, **_QUICK}
     assert _ran(session, **asked) == ["reconstruct"]
-    record = _record(session)
+    record = read_record(session / "reconstructions")
     assert {plane["method"] for plane in record["planes"]} == {"joint"}
     assert all((session / "reconstructions" / plane["sigma_file"]).is_file() for plane in record["planes"])
     assert _ran(session, **asked) == []
-    assert _ran(session, **asked, method=["joint"]) == []
-    assert _ran(session, **{**asked, "uncertainty": False}, likelihood="poisson") == ["reconstruct"]
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.tasks.solve_together", _fail)
+    with pytest.raises(NothingInFocus, match="begun"):
+        _ran(session, **{**asked, "uncertainty": False}, likelihood="poisson")
 
 
 def test_depths_are_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("autofocus", "request"):
         monkeypatch.setattr(f"faintfield.pipelines.reconstruction.{module}.searched_range_mm", lambda _: _SEARCHED_MM)
-    asked: dict[str, Any] = {"method": ["backprojection"], "pitch_mm": 4.0}
+    asked: dict[str, Any] = {"method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, depth_mm=["auto"], **asked) == ["reconstruct"]
-    record = _record(session)
-    found = record["best_focus"]["depth_mm"]
-    assert record["options"]["depth_mm"] == found
-    assert found == pytest.approx([500.0, 700.0], rel=0.01)
-    with monkeypatch.context() as patch:
-
-        def searched(*_: object) -> None:
-            raise NothingInFocus("searched")
-
-        patch.setattr("faintfield.pipelines.reconstruction.request.best_focus", searched)
-        assert _ran(session, depth_mm=["auto"], **asked) == []
-        assert _ran(session, depth=["auto"], **asked) == []
-        for other in ({"sweep_mm": "450:900:3"}, {"passes": 7}):
-            with pytest.raises(NothingInFocus, match="searched"):
-                _ran(session, depth_mm=["auto"], **asked, **other)
-    assert _ran(session, depth_mm=["auto"], sweep_mm="450:900:3", **asked) == ["reconstruct"]
-    assert _record(session)["best_focus"]["searched_mm"][0] == [450.0, 900.0]
-    assert _ran(session, depth_mm=["auto"], sweep_mm="900:450:5", **asked) == []
-    assert _ran(session, depth_mm=[500.0], **asked) == ["reconstruct"]
-    assert _ran(session, depth_mm=["auto"], **asked) == ["reconstruct"]
-    assert _record(session)["options"]["depth_mm"] == found
+    record = read_record(session / "reconstructions")
+    depth_mm = record["best_focus"]["depth_mm"]
+    assert record["options"]["depth_mm"] == depth_mm
+    assert depth_mm == pytest.approx([500.0, 700.0], rel=0.01)
+    assert record["best_focus"]["searched_mm"] == [[*_SEARCHED_MM]]
+    monkeypatch.setattr("faintfield.pipelines.reconstruction.request.best_focus", _fail)
+    assert _ran(session, depth_mm=["auto"], **asked) == []
+    assert _ran(session, depth=["auto"], **asked) == []
+    for other in ({"sweep_mm": "450:900:3"}, {"passes": 7}):
+        with pytest.raises(NothingInFocus, match="begun"):
+            _ran(session, depth_mm=["auto"], **asked, **other)
 
 
 def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,30 +97,28 @@ def test_range_of_sweep_is_searched_only_once(session: Path, monkeypatch: pytest
     monkeypatch.setattr(range_found, lambda *_: (497.0, 503.0))
     asked: dict[str, Any] = {"sweep": "auto", "method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, **asked) == ["reconstruct"]
-    options = _record(session)["options"]
+    options = read_record(session / "reconstructions")["options"]
     depths = options["depth_mm"]
     assert options["auto_sweep"] == len(depths)
     assert (depths[0], depths[-1]) == (497.0, 503.0)
-    monkeypatch.setattr(range_found, lambda *_: (495.0, 505.0))
+    monkeypatch.setattr(range_found, _fail)
     assert _ran(session, **asked) == []
-    assert _ran(session, **asked, depth_mm=[600.0]) == ["reconstruct"]
-    assert _ran(session, **asked, depth_mm=[600.0]) == []
     assert _ran(session, **{**asked, "sweep": None, "depth_mm": depths}) == ["reconstruct"]
-    assert "auto_sweep" not in _record(session)["options"]
+    assert "auto_sweep" not in read_record(session / "reconstructions")["options"]
 
 
 def test_depth_map_is_made_once(seen: Searches, session: Path) -> None:
     asked: dict[str, Any] = {"sweep_mm": "480:520:5", "depth_map": True, "method": ["backprojection"], "pitch_mm": 16.0}
     assert _ran(session, **asked) == ["reconstruct"]
     assert _ran(session, **asked) == []
-    (session / "reconstructions" / _record(session)["depth_map"]["file"]).unlink()
+    (session / "reconstructions" / "depth_mm.tiff").unlink()
     assert _ran(session, **asked) == ["reconstruct"]
 
 
 def test_disparities_of_session_are_depths(session: Path) -> None:
     asked: dict[str, Any] = {"disparity_px": [-60.0, -50.0], "method": ["backprojection"], "pitch_mm": 8.0}
     assert _ran(session, **asked) == ["reconstruct"]
-    assert len(_record(session)["planes"]) == 2
+    assert len(read_record(session / "reconstructions")["planes"]) == 2
     assert _ran(session, **asked) == []
     assert _ran(session, **{**asked, "disparity_px": [-60.0]}) == ["reconstruct"]
 

@@ -41,6 +41,15 @@ def _ran(session: Path, depth_mm: float = 700.0) -> list[str]:
     return [step.step for step in run(session, options=_options(depth_mm)).steps if step.ran]
 
 
+def _flip_last_bit(path: Path) -> None:
+    content = path.read_bytes()
+    path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+
+
+def _refuse(*_: object, **__: object) -> None:
+    raise BadValue("begun; wait")
+
+
 def test_geometry_of_session_is_where_its_camera_was(calibrated_session: Path) -> None:
     session = calibrated_session
     assert verify(session).problems == ()
@@ -50,8 +59,8 @@ def test_geometry_of_session_is_where_its_camera_was(calibrated_session: Path) -
     frames = {f"frames/{path.name}" for planned, _, path in taken_frames(session) if planned.kind == "charuco"}
     assert set(content["inputs"]) == frames | {"plan.json"}
     for entry in content["nodes"]:
-        told_mm = -100.0 * (np.array(entry["node"][::-1]) - 1)  # the lab's gantry goes where it is told
-        np.testing.assert_allclose(entry["rt_cam_ref"][3:5], told_mm, atol=0.15)
+        commanded_mm = -100.0 * (np.array(entry["node"][::-1]) - 1)  # the lab's gantry goes where it is told
+        np.testing.assert_allclose(entry["rt_cam_ref"][3:5], commanded_mm, atol=0.15)
     assert {(board["name"], board["sweep"]) for board in content["boards"]} == {("large", sweep) for sweep in range(4)}
     assert content["stage"]["scale_x"]["value"] == pytest.approx(1, abs=1e-3)
     for axis in "xy":  # the gantry comes from below, whatever the order: its play cannot show
@@ -111,14 +120,14 @@ class TestRun:
         assert _ran(session) == steps
         assert f"warning: frames/{frame.name} and 0 other frames are not what was captured" in capsys.readouterr().err
 
-    def test_missing_and_damaged_results_are_made_again(self, session: Path) -> None:
+    def test_missing_and_unreadable_results_are_made_again(self, session: Path) -> None:
         (session / "reconstructions" / "report.html").unlink()
         assert _ran(session) == ["report"]
-        (session / "cameras" / "node_r0_c1.cameramodel").unlink()
-        assert _ran(session)[0] == "geometry"
         for damaged in ('{"format": 1,', '{"inputs": 3}'):
             (session / "reconstructions" / "reconstruction.json").write_text(damaged)
             assert _ran(session) == ["reconstruct"]
+        _flip_last_bit(session / "reconstructions" / "plane_00700.0.tiff")
+        assert _ran(session) == ["reconstruct"]
         assert verify(session).problems == ()
 
     def test_altered_results_are_made_again(
@@ -132,22 +141,15 @@ class TestRun:
                 with pytest.raises(ResultDamaged, match=name):
                     verify_all(session / name)
             (session / name).write_text(json.dumps(content, indent=2).replace("0", "1"))
+        (session / "cameras" / "node_r0_c1.cameramodel").unlink()
+        beside = ("noise_maps.npz", "reconstructions/plane_00700.0.tiff")
+        for name in beside:
+            _flip_last_bit(session / name)
         assert _ran(session) == ["noise", "geometry", "reconstruct"]
         assert "noise: noise.json: was altered after it was written" in capsys.readouterr().err
         assert verify_all(session).results is not None
-        for name in results[:3]:
+        for name in (*results[:3], *beside, "cameras/node_r0_c1.cameramodel"):
             assert (session / name).read_bytes() == (calibrated_session / name).read_bytes()
-
-    @pytest.mark.parametrize(
-        ("step", "name"), [("reconstruct", "reconstructions/plane_00700.0.tiff"), ("noise", "noise_maps.npz")]
-    )
-    def test_altered_files_beside_results_are_made_again(self, step: str, name: str, session: Path) -> None:
-        whole = (session / name).read_bytes()
-        (session / name).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-        with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
-            verify_all(session)
-        assert _ran(session)[0] == step
-        assert (session / name).read_bytes() == whole
 
     def test_report_of_earlier_planes_is_made_again(self, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def interrupted(*_: object, **__: object) -> None:
@@ -159,21 +161,22 @@ class TestRun:
                 _ran(session, 500.0)
         assert _ran(session, 500.0) == ["report"]
 
-    def test_another_lens_is_another_geometry(self, session: Path) -> None:
-        assert run(session, options=_options(), lens="opencv4").steps[1].ran
-        assert json.loads((session / "geometry.json").read_text())["lens"]["model"] == "opencv4"
-        assert not run(session, options=_options(), lens="opencv4").steps[1].ran
+    def test_other_lens_or_maps_begin_their_step(self, session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr("faintfield.pipelines.commands.run.geometry", _refuse)
+            with pytest.raises(BadValue, match="begun"):
+                run(session, options=_options(), lens="opencv4")
+        _flip_last_bit(session / "noise_maps.npz")
+        monkeypatch.setattr("faintfield.pipelines.commands.run.noise", _refuse)
+        with pytest.raises(BadValue, match="begun"):
+            _ran(session)
 
     def test_failed_step_skips_only_its_dependents(self, session: Path, capsys: pytest.CaptureFixture[str]) -> None:
-        frames = {path: path.read_bytes() for path in (session / "frames").glob("*_charuco_*")}
-        for path in (session / "geometry.json", *frames):
+        for path in (session / "geometry.json", *(session / "frames").glob("*_charuco_*")):
             path.unlink()
         with pytest.raises(MissingFile, match=r"run `faintfield run .*still to be done: geometry, reconstruct, report"):
             _ran(session, 500.0)
         assert "reconstruct: skipped, because it needs geometry" in capsys.readouterr().err
-        for path, content in frames.items():
-            path.write_bytes(content)
-        assert _ran(session, 500.0) == ["geometry", "reconstruct"]
 
     def test_call_without_depths_or_session_is_refused(self, recorded_session: Path, tmp_path: Path) -> None:
         with pytest.raises(WrongUsage, match=r"give --depth-mm or --sweep-mm"):
@@ -190,6 +193,11 @@ def test_session_is_verified_with_its_results(recorded_session: Path, session: P
     assert found.session.present == found.session.planned
     assert (found.results.problems, found.results.unchecked) == ((), ())
     assert found.results.inputs > found.session.planned
+    for name in ("noise_maps.npz", "reconstructions/plane_00700.0.tiff"):
+        _flip_last_bit(session / name)
+        with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
+            verify_all(session)
+        _flip_last_bit(session / name)
     next((session / "frames").glob("*_flat_0_*")).write_bytes(b"another")
     with pytest.raises(ResultDamaged, match=r"_flat_0_.* was altered since it was made from it"):
         verify_all(session / "noise.json")

@@ -1,9 +1,7 @@
 """`simulate`: what is written is what the simulated world gives, with its truth beside it."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
 import numpy as np
@@ -18,8 +16,7 @@ from faintfield.pipelines.reconstruction.overview import brightness
 from faintfield.recon.metrics import photons_from_linear_snr, photons_from_moments
 from faintfield.rig.simulation.experiment import paper_experiment
 from faintfield.rig.simulation.scene import render
-
-type Command = Callable[..., CompletedProcess[str]]
+from tests.pipelines.conftest import Command
 
 # The paper's camera
 READ_NOISE_E, ETA, DARK_E, GAIN, OFFSET_DN = 12**0.5, 0.5, 0.2 * 0.1, 2.0, 100.0
@@ -33,29 +30,32 @@ def _truth(folder: Path) -> dict[str, Any]:
 
 
 def _electrons(folder: Path) -> NDArray[np.float32]:
-    loaded = load_set(folder)
-    return np.stack([loaded.noise.electrons(read_frame(path).pixels_dn) for path in loaded.image_paths])
+    elemental_set = load_set(folder)
+    return np.stack([elemental_set.noise.electrons(read_frame(path).pixels_dn) for path in elemental_set.image_paths])
 
 
 def _all_files(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_set_holds_views_a_noise_reference_and_its_truth(simulated_scene: Path) -> None:
-    views = [f"view_r{row}_c{column}.tiff" for row in range(3) for column in range(3)]
-    truth = [
-        f"truth/{name}" for depth in ("00500.0", "00700.0") for name in (f"plane_{depth}.tiff", f"visible_{depth}.png")
-    ]
-    own = ["elemental.toml", "flat.tiff", "noise_reference.tiff", "object_region.png", "provenance.json", "truth.json"]
-    noise_free = [f"noise_free/{name}" for name in ("elemental.toml", "flat.tiff", *views)]
-    assert set(_all_files(simulated_scene)) == {*views, *truth, *own, *noise_free}
-    for name in (*views, "noise_reference.tiff"):
+VIEWS = {f"view_r{row}_c{column}.tiff" for row in range(3) for column in range(3)}
+FILES = {
+    *VIEWS,
+    *("elemental.toml", "flat.tiff", "noise_reference.tiff", "object_region.png", "provenance.json", "truth.json"),
+    *(f"noise_free/{name}" for name in ("elemental.toml", "flat.tiff", *VIEWS)),
+}
+
+
+def test_set_holds_views_noise_reference_and_truth(simulated_scene: Path) -> None:
+    truth = {f"truth/{name}" for z in ("00500.0", "00700.0") for name in (f"plane_{z}.tiff", f"visible_{z}.png")}
+    assert set(_all_files(simulated_scene)) == FILES | truth
+    for name in (*VIEWS, "noise_reference.tiff"):
         frame = read_frame(simulated_scene / name).pixels_dn
         assert frame.shape == (72, 96)
         assert frame.dtype == np.uint16
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
+def test_same_seed_gives_same_bytes(
     simulated_scene: Path, tmp_path: Path, done: Command, small_options: tuple[object, ...]
 ) -> None:
     done("simulate", tmp_path / "again", *small_options)
@@ -69,7 +69,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(
     assert not any("view" in name or "reference" in name for name in same)
 
 
-def test_the_noise_free_set_holds_the_electrons_that_rays_carry(simulated_scene: Path) -> None:
+def test_noise_free_set_holds_electrons_of_rays(simulated_scene: Path) -> None:
     truth, experiment = _truth(simulated_scene), paper_experiment(96, 72).grey()
     light = [view.light for view in render(experiment.planes, experiment.optics, np.array(truth["true_rt_cam_ref"]))]
     region = read_frame(simulated_scene / "object_region.png").pixels_dn > 127
@@ -80,7 +80,7 @@ def test_the_noise_free_set_holds_the_electrons_that_rays_carry(simulated_scene:
     np.testing.assert_array_equal([view.rt_cam_ref for view in settings.view], truth["true_rt_cam_ref"])
 
 
-def test_dark_views_differ_from_the_noise_free_ones_by_noise_of_eq_6(simulated_scene: Path) -> None:
+def test_dark_views_have_noise_of_eq_6(simulated_scene: Path) -> None:
     expected = _electrons(simulated_scene / "noise_free").astype(float) + DARK_E
     residual = _electrons(simulated_scene) - expected
     variance = expected + READ_VARIANCE_E2
@@ -92,7 +92,7 @@ def test_dark_views_differ_from_the_noise_free_ones_by_noise_of_eq_6(simulated_s
     assert np.mean(normalised**2) == pytest.approx(1, abs=4 * deviation)
 
 
-def test_the_noise_reference_saw_nothing(simulated_scene: Path) -> None:
+def test_noise_reference_saw_nothing(simulated_scene: Path) -> None:
     frame = read_frame(simulated_scene / "noise_reference.tiff").pixels_dn
     electrons = (frame.astype(float) - OFFSET_DN) / GAIN
     deviation = np.sqrt(READ_VARIANCE_E2 + DARK_E)
@@ -100,12 +100,10 @@ def test_the_noise_reference_saw_nothing(simulated_scene: Path) -> None:
     assert electrons.std() == pytest.approx(deviation, rel=4 / np.sqrt(2 * frame.size))
 
 
-@pytest.mark.parametrize(("snr", "seed"), [(0.16, 1), (20.0, 1)])
-def test_the_snr_of_eq_4_measured_over_the_objects_is_the_one_asked_for(
-    snr: float, seed: int, tmp_path: Path, done: Command
-) -> None:
+@pytest.mark.parametrize("snr", [0.16, 20.0])
+def test_measured_snr_is_that_asked_for(snr: float, tmp_path: Path, done: Command) -> None:
     options = ("--size-px", 320, 240, "--rows", 1, "--columns", 1)
-    result = json.loads(done("--json", "simulate", tmp_path / "set", "--snr", snr, "--seed", seed, *options).stdout)
+    result = json.loads(done("--json", "simulate", tmp_path / "set", "--snr", snr, *options).stdout)
     assert result["snr"] == pytest.approx(snr, rel=1e-6)
     measured = brightness(load_set(tmp_path / "set"))
     assert (measured.region, measured.noise_from) == ("object region", "noise reference")
@@ -122,7 +120,7 @@ def test_the_snr_of_eq_4_measured_over_the_objects_is_the_one_asked_for(
     assert deviation < 0.15 * snr
 
 
-def test_photons_are_told_by_the_papers_formula_and_by_counting(simulated_scene: Path) -> None:
+def test_photons_are_stated_by_formula_and_by_count(simulated_scene: Path) -> None:
     truth = _truth(simulated_scene)
     known = {"quantum_efficiency": ETA, "read_noise_e": READ_NOISE_E}
     assert truth["photons_linear"] == pytest.approx(photons_from_linear_snr(0.16, **known))
@@ -133,7 +131,7 @@ def test_photons_are_told_by_the_papers_formula_and_by_counting(simulated_scene:
     assert truth["photons_on_object"] == pytest.approx(on_object, rel=1e-4)
 
 
-def test_truth_planes_are_what_the_reference_view_shows_of_each_object(simulated_scene: Path) -> None:
+def test_truth_planes_are_seen_in_reference_view(simulated_scene: Path) -> None:
     """Undistorted, the noise-free reference view is the texture wherever its object is visible."""
     truth, view = _truth(simulated_scene), _electrons(simulated_scene / "noise_free")[4]
     lens = load_set(simulated_scene).lens
@@ -156,7 +154,7 @@ def test_truth_planes_are_what_the_reference_view_shows_of_each_object(simulated
 
 
 @pytest.mark.parametrize("poses", ["true", "nominal"])
-def test_the_set_states_true_or_nominal_poses(
+def test_set_states_true_or_nominal_poses(
     poses: str, tmp_path: Path, done: Command, small_options: tuple[object, ...]
 ) -> None:
     done("simulate", tmp_path / "set", *small_options, "--poses", poses)
@@ -174,7 +172,7 @@ def test_the_set_states_true_or_nominal_poses(
     assert errors[:, :3].std() == pytest.approx(3.5e-3, rel=4 / np.sqrt(48))
 
 
-def test_a_perfect_gantry_has_no_errors(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
+def test_perfect_gantry_has_no_errors(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
     options = ("--position-error-mm", 0, "--rotation-error-mrad", 0, "--pitch-mm", 20)
     done("simulate", tmp_path / "set", *small_options, *options)
     poses = load_set(tmp_path / "set").poses_rt_cam_ref
@@ -182,9 +180,7 @@ def test_a_perfect_gantry_has_no_errors(tmp_path: Path, done: Command, small_opt
     assert not poses[:, [0, 1, 2, 5]].any()
 
 
-def test_a_bayer_sensor_gives_each_pixel_the_colour_of_its_filter(
-    tmp_path: Path, done: Command, small_options: tuple[object, ...]
-) -> None:
+def test_bayer_pixel_has_colour_of_its_filter(tmp_path: Path, done: Command, small_options: tuple[object, ...]) -> None:
     done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
     assert load_set(tmp_path / "set").settings.camera.mosaic == ("RG", "GB")
     truth, experiment = _truth(tmp_path / "set"), paper_experiment(96, 72)
@@ -199,7 +195,7 @@ def test_a_bayer_sensor_gives_each_pixel_the_colour_of_its_filter(
     assert read_frame(tmp_path / "set" / "truth" / "plane_00500.0.tiff").pixels_dn.shape == (72, 96, 3)
 
 
-def test_a_folder_that_holds_something_else_is_refused_even_to_overwrite(
+def test_folder_of_other_files_is_never_overwritten(
     tmp_path: Path, faintfield: Command, small_options: tuple[object, ...]
 ) -> None:
     (tmp_path / "theirs").mkdir()
@@ -212,7 +208,7 @@ def test_a_folder_that_holds_something_else_is_refused_even_to_overwrite(
     assert _all_files(tmp_path) == before
 
 
-def test_a_set_is_replaced_only_when_asked(
+def test_set_is_replaced_only_when_asked(
     scene: Path, faintfield: Command, done: Command, small_options: tuple[object, ...]
 ) -> None:
     (scene / "stale.txt").touch()
@@ -226,28 +222,17 @@ def test_a_set_is_replaced_only_when_asked(
     assert [path.name for path in scene.parent.iterdir()] == [scene.name]
 
 
-SURFACES = ("--objects", "surfaces", "--size-px", 96, 72, "--rows", 3, "--columns", 3)
-
-
-@pytest.fixture(params=["grey", "bayer"])
-def colour(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
-
-
-@pytest.fixture
-def surfaces(tmp_path: Path, done: Command, colour: str) -> Path:
-    done("simulate", tmp_path / "set", *SURFACES, "--colour", colour)
-    return tmp_path / "set"
-
-
-def test_the_truth_is_the_depth_and_the_light_at_the_pixels_of_an_ideal_reference_view(
-    surfaces: Path, colour: str
+@pytest.mark.parametrize("colour", ["grey", "bayer"])
+def test_truth_of_surfaces_is_depth_and_light(
+    colour: str, tmp_path: Path, done: Command, small_options: tuple[object, ...]
 ) -> None:
-    views = [f"view_r{row}_c{column}.tiff" for row in range(3) for column in range(3)]
-    own = ["elemental.toml", "flat.tiff", "noise_reference.tiff", "object_region.png", "provenance.json", "truth.json"]
+    """Both are those at the pixels of an ideal reference view."""
+    surfaces, snr = tmp_path / "set", 5.0
+    words = ("simulate", surfaces, "--objects", "surfaces", *small_options, "--colour", colour, "--snr", snr)
+    assert json.loads(done("--json", *words).stdout)["snr"] == pytest.approx(snr, rel=1e-6)
+    assert brightness(load_set(surfaces)).snr == pytest.approx(snr, rel=0.1)
     truth = ["truth/true_depth_mm.tiff", "truth/true_picture.tiff"]
-    noise_free = [f"noise_free/{name}" for name in ("elemental.toml", "flat.tiff", *views)]
-    assert set(_all_files(surfaces)) == {*views, *own, *truth, *noise_free}
+    assert set(_all_files(surfaces)) == FILES | set(truth)
     assert json.loads((surfaces / "provenance.json").read_text())["options"]["objects"] == "surfaces"
     stated = json.loads((surfaces / "truth.json").read_text())
     assert (stated["planes"], stated["surface"]) == ([], {"depth_mm": truth[0], "picture": truth[1]})
@@ -272,29 +257,16 @@ def test_the_truth_is_the_depth_and_the_light_at_the_pixels_of_an_ideal_referenc
     assert seen.mean() == pytest.approx(light[inside].mean(), rel=0.01)
 
 
-def test_the_light_has_the_snr_that_is_asked_for(tmp_path: Path, done: Command) -> None:
-    result = json.loads(done("--json", "simulate", tmp_path / "set", *SURFACES, "--snr", 5).stdout)
-    assert result["snr"] == pytest.approx(5, rel=1e-6)
-    measured = brightness(load_set(tmp_path / "set"))
-    assert measured.snr == pytest.approx(5, rel=0.1)
-
-
-def test_such_a_set_is_reconstructed_and_reported_without_the_toys_truth(surfaces: Path, done: Command) -> None:
-    out = surfaces.parent / "planes"
-    done("reconstruct", surfaces, "--depth-mm", 600, "--method", "backprojection", "--out", out)
-    done("report", out)
+def test_set_of_surfaces_has_no_metrics_of_planes(
+    tmp_path: Path, done: Command, undrawn: None, small_options: tuple[object, ...]
+) -> None:
+    folder, out = tmp_path / "set", tmp_path / "planes"
+    done("simulate", folder, "--objects", "surfaces", *small_options)
+    done("reconstruct", folder, "--depth-mm", 600, "--method", "backprojection", "--out", out)
     assert (out / "report.html").is_file()
     assert not (out / "metrics.json").exists()
-
-
-def test_a_truth_that_names_files_outside_its_folder_is_refused(tmp_path: Path, done: Command) -> None:
-    done("simulate", tmp_path / "set", *SURFACES)
-    path = tmp_path / "set" / "truth.json"
-    truth = read_truth(path.parent)
-    assert truth is not None
-    assert truth.surface is not None
     for name in ("depth_mm", "picture"):
-        stated = json.loads(path.read_text())
+        stated = _truth(folder)
         stated["surface"][name] = "../elsewhere.tiff"
         (tmp_path / name).mkdir()
         (tmp_path / name / "truth.json").write_text(json.dumps(stated))

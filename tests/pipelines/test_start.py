@@ -1,4 +1,4 @@
-"""How commands start: what `--version` and help load, and that compiling kernels is not done in silence."""
+"""Start of commands: modules that `--version` and help load, and the announcement of compiled kernels."""
 
 import os
 import subprocess
@@ -18,23 +18,15 @@ HEAVY = {
     *("zarr", "distributed", "multiprocessing", "rich.progress"),
 }
 
-# Prints the exit code of some words, and the modules that they load, to standard error.
-_LOADED = """
+# Prints --version and each command with the modules that its help loads besides those of the commands before it.
+_LOADED_BY_EACH = """
 import sys
 before = set(sys.modules)
 from faintfield.pipelines.cli import run
-code = run(sys.argv[1:])
-print(code, *sorted(set(sys.modules) - before), file=sys.stderr)
-"""
-
-# Prints each command with the modules that its help loads besides those of the commands before it.
-_LOADED_BY_EACH = """
-import sys
-from faintfield.pipelines.cli import run
-for command in sys.argv[1:]:
-    before = set(sys.modules)
-    code = run([*command.split(), "--help"])
+for command in ["--version", *sys.argv[1:]]:
+    code = run([command] if command == "--version" else [*command.split(), "--help"])
     print(command, code, *(set(sys.modules) - before), sep=",", file=sys.stderr)
+    before = set(sys.modules)
 """
 
 # A file with two kernels, and a command that calls both.
@@ -60,8 +52,8 @@ cli.main([])
 """
 
 
-def _said(program: str, *words: str, cwd: Path | None = None, **environment: str) -> str:
-    """Return what a program says on standard error, in a process of its own."""
+def _complaint(program: str, *words: str, cwd: Path | None = None, **environment: str) -> str:
+    """Return the standard error of a program in a process of its own."""
     ended = subprocess.run(
         [sys.executable, "-c", program, *words],
         capture_output=True,
@@ -73,19 +65,6 @@ def _said(program: str, *words: str, cwd: Path | None = None, **environment: str
     return ended.stderr
 
 
-@pytest.mark.parametrize(
-    ("words", "not_even"),
-    [
-        ("--version", {"cyclopts", "rich", "msgspec", "logging"}),
-    ],
-)
-def test_nothing_is_loaded_that_is_not_shown(words: str, not_even: set[str]) -> None:
-    code, *loaded = _said(_LOADED, *words.split()).split()
-    assert code == "0"
-    assert "faintfield.pipelines.cli" in loaded
-    assert not {*loaded} & (HEAVY | not_even)
-
-
 def _commands(parent: App, before: str = "") -> Iterator[str]:
     """Yield every command and group of commands."""
     for name in parent:
@@ -94,25 +73,25 @@ def _commands(parent: App, before: str = "") -> Iterator[str]:
             yield from _commands(parent[name], f"{before}{name} ")
 
 
-def test_the_help_of_no_command_loads_what_it_computes_with() -> None:
+def test_version_and_help_load_nothing_heavy() -> None:
     commands = list(_commands(app))
     assert {"run", "demo", "stage test", "import grid", "export zarr"} <= {*commands}
-    loaded = {
-        name: {*rest}
-        for name, *rest in (line.split(",") for line in _said(_LOADED_BY_EACH, *commands).split("\n")[:-1])
-    }
-    assert loaded.keys() == {*commands}
+    lines = _complaint(_LOADED_BY_EACH, *commands).split("\n")[:-1]
+    loaded = {name: {*modules} for name, *modules in (line.split(",") for line in lines)}
+    assert loaded.keys() == {"--version", *commands}
+    assert "faintfield.pipelines.cli" in loaded["--version"]
+    assert not loaded["--version"] & {"cyclopts", "rich", "msgspec", "logging"}
     for command, modules in loaded.items():
         assert "0" in modules
         assert not modules & HEAVY, command
 
 
 @pytest.mark.deep
-def test_compiling_is_said_once_unless_the_cache_holds_all(tmp_path: Path) -> None:
+def test_compiling_is_announced_once_unless_cached(tmp_path: Path) -> None:
     (tmp_path / "kernels.py").write_text(_KERNELS)
     cached = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-    said = _said(_COMMAND, cwd=tmp_path, **cached)
-    assert said.startswith("compiling kernels, ")
-    assert len(said.splitlines()) == 1
-    assert _said(_COMMAND, cwd=tmp_path, **cached) == ""
-    assert _said(_COMMAND, cwd=tmp_path, **cached, NUMBA_CPU_NAME="generic") == said
+    complaint = _complaint(_COMMAND, cwd=tmp_path, **cached)
+    assert complaint.startswith("compiling kernels, ")
+    assert len(complaint.splitlines()) == 1
+    assert _complaint(_COMMAND, cwd=tmp_path, **cached) == ""
+    assert _complaint(_COMMAND, cwd=tmp_path, **cached, NUMBA_CPU_NAME="generic") == complaint

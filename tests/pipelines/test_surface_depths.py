@@ -1,11 +1,209 @@
-"""Maps of bins on the samples of a picture, against a search of each sample; samples between pixels."""
+"""Sets of all kinds for `reconstruct --surface`: what the search for depths is given, and what is refused."""
 
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
 import numpy as np
 import pytest
+import tifffile
+from numpy.typing import NDArray
 
+from faintfield.pipelines.formats.frames import read_frame
+from faintfield.pipelines.formats.image_files import write_frame
+from faintfield.pipelines.formats.sets.elemental_set import load_set
+from faintfield.pipelines.reconstruction import surface_depths
+from faintfield.pipelines.reconstruction.channels import channel_layouts, load_channel
 from faintfield.pipelines.reconstruction.comparison import BETWEEN_PIXELS
+from faintfield.pipelines.reconstruction.operators import OperatorFactory, plane_grid
+from faintfield.pipelines.reconstruction.penalised import Objective, solve_then_sigma
+from faintfield.pipelines.reconstruction.planes import solve
+from faintfield.pipelines.reconstruction.solutions import Settings
 from faintfield.pipelines.reconstruction.surface_depths import between_pixels, enlarged
+from faintfield.recon.solver.data_fit import SceneProblem
+from faintfield.recon.surface.pinhole_views import UNKNOWN
+from tests.pipelines.conftest import Command, Edit
+from tests.pipelines.surfaces import Searches
 from tests.recon.surface_scene import expected_light, views_of
+
+pytestmark = pytest.mark.usefixtures("undrawn")
+
+RANGE = ("--depth-range-mm", "400:900")
+FAST = (*RANGE, "--penalty-weight", 0.5, "--passes", 2)
+
+
+def _plain(settings: dict[str, Any]) -> None:
+    """Leave out the distortion and the flat field, so that electrons can be computed by hand."""
+    settings["camera"]["distortion"] = []
+    settings["camera"].pop("flat", None)
+
+
+def _light_e(folder: Path, view: str) -> NDArray[np.float64]:
+    """Return the electrons of a view less the dark current, by hand: 100 DN, 2 DN/e⁻, 0.2 e⁻/s in 0.1 s."""
+    return np.asarray((read_frame(folder / view).pixels_dn - 100.0) / 2.0 - 0.02)
+
+
+def test_search_is_given_electrons_of_light(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+    edit(scene, _plain)
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    ((views, inverse_depths, nodes),) = seen
+    assert views.light_e.shape == (9, 72, 96)
+    np.testing.assert_allclose(views.light_e[5], _light_e(scene, "view_r1_c2.tiff"), atol=1e-4)
+    assert (1 / inverse_depths[[-1, 0]]).tolist() == pytest.approx([400, 900])
+    assert nodes[5].tolist() == [1, 2]
+
+
+def test_colours_add_up_and_each_has_picture(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+    edit(scene, _plain)
+    for path in scene.glob("view_*.tiff"):
+        grey = read_frame(path).pixels_dn
+        write_frame(path, np.stack([grey, grey, grey], axis=-1))
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    by_hand = _light_e(scene, "view_r2_c0.tiff").sum(axis=2)
+    np.testing.assert_allclose(seen[0][0].light_e[6], by_hand, atol=1e-3)
+    picture = tifffile.imread(scene / "out" / "picture.tiff")
+    assert picture.shape == (72, 96, 3)
+    np.testing.assert_allclose(picture[:, :, 0], picture[:, :, 2], rtol=1e-5)
+
+
+def test_mosaic_is_binned_by_its_period(
+    seen: Searches, tmp_path: Path, edit: Edit, small_options: tuple[object, ...], done: Command
+) -> None:
+    done("simulate", tmp_path / "set", *small_options, "--colour", "bayer")
+    edit(tmp_path / "set", _plain)
+    done("reconstruct", tmp_path / "set", "--surface", *FAST, "--out", tmp_path / "out")
+    cells = _light_e(tmp_path / "set", "view_r1_c1.tiff").reshape(36, 2, 48, 2).sum(axis=(1, 3))
+    np.testing.assert_allclose(seen[0][0].light_e[4], cells, atol=1e-3)
+    assert tifffile.imread(tmp_path / "out" / "picture.tiff").shape == (72, 96, 3)
+    visibility = tifffile.imread(tmp_path / "out" / "visibility.tiff")
+    assert visibility[28:44, 38:58].mean() == pytest.approx(9, rel=0.1)
+    assert tifffile.imread(tmp_path / "out" / "depth_mm.tiff").shape == (72, 96)
+
+
+def test_saturated_view_does_not_count(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+    edit(scene, _plain)
+    write_frame(scene / "view_r0_c1.tiff", np.full((72, 96), 65535, np.uint16))
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    light_e = seen[0][0].light_e
+    assert (light_e[1] == UNKNOWN).all()
+    assert (np.delete(light_e, 1, axis=0) > -100).all()
+    assert tifffile.imread(scene / "out" / "visibility.tiff").max() < 8.5
+
+
+def test_distortion_is_undone_and_flat_field_divided_out(
+    seen: Searches, scene: Path, edit: Edit, done: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each pixel holds as many electrons as the column where a pinhole camera shows its point, by OpenCV, plus 50."""
+    monkeypatch.setattr(surface_depths, "check_agreement", lambda *_: None)  # the views are one picture
+    edit(scene, lambda settings: settings["camera"].update(distortion=[-0.2, 0.02, 0.0005, -0.0003, 0.0]))
+    flat, camera = tifffile.imread(scene / "flat.tiff"), tomllib.loads((scene / "elemental.toml").read_text())["camera"]
+    matrix = np.array([[camera["fx_px"], 0, camera["cx_px"]], [0, camera["fy_px"], camera["cy_px"]], [0, 0, 1]])
+    rows, columns = np.indices(flat.shape, np.float64)
+    pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(pixels, matrix, np.array(camera["distortion"]), P=matrix).reshape(*flat.shape, 2)
+    assert np.abs(ideal[:, :, 0] - columns).max() > 2
+    for path in scene.glob("view_*.tiff"):
+        write_frame(path, np.rint(100 + 2 * (flat * (50 + ideal[:, :, 0]) + 0.02)).astype(np.uint16))
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    light_e = seen[0][0].light_e
+    known = light_e > UNKNOWN
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(light_e[known], np.broadcast_to(50 + columns, light_e.shape)[known], atol=0.7)
+
+
+def test_views_without_nodes_are_row(seen: Searches, scene: Path, edit: Edit, done: Command) -> None:
+    edit(scene, lambda settings: [view.pop("node") for view in settings["view"]])
+    done("reconstruct", scene, "--surface", *FAST, "--out", scene / "out")
+    assert seen[0][2].tolist() == [[0, index] for index in range(9)]
+
+
+def test_imported_grid_may_have_own_principal_points(
+    seen: Searches, scene: Path, tmp_path: Path, done: Command
+) -> None:
+    """Pictures aligned on a plane: what moves by −12 px from node to node, aligned on −2 px, is left with −10 px."""
+    (tmp_path / "pictures").mkdir()
+    for path in scene.glob("view_r*_c*.tiff"):
+        shutil.copy(path, tmp_path / "pictures")
+    grid = ("import", "grid", tmp_path / "pictures", tmp_path / "set", "--disparity-px", 2)
+    done(*grid)
+    options = ("--disparity-range-px=-12:-1", *FAST[2:])
+    done("reconstruct", tmp_path / "set", "--surface", *options, "--out", tmp_path / "out")
+    depth = 1 / seen[0][1]
+    assert depth[0] / depth[-1] == pytest.approx((12 + 2) / (1 + 2), rel=1e-6)
+
+
+def _middle_row(settings: dict[str, Any]) -> None:
+    settings.update(view=settings["view"][3:6], reference_view=1)
+
+
+def _all_at_once(settings: dict[str, Any]) -> None:
+    for view in settings["view"]:
+        view["rt_cam_ref"] = [0.0] * 6
+
+
+@pytest.mark.parametrize(
+    ("change", "words", "code", "message"),
+    [
+        (_middle_row, RANGE, 1, "BadValue: {set}: has 3 views, and a surface needs at least 4"),
+        (_all_at_once, RANGE, 1, "NothingInFocus: {set}: all views were taken from one place"),
+        (None, ("--depth-range-mm", "5:20"), 1, "GeometryMismatch: between 5 and 20 mm the other views see 0%"),
+        (None, ("--depth-range-mm", "0.01:900"), 1, "GeometryMismatch: surface between 0.01 and 900 mm: 128 depths"),
+        (None, ("--depth-range-mm", "400:400"), 2, "is no range; give two different numbers as NEAR:FAR"),
+        (None, ("--depth-range-mm=-9:400",), 2, "depths are positive, and at most 1000000000 mm"),
+        (None, ("--disparity-range-px=-9:3",), 1, "BadValue: no plane in front of the cameras has a disparity of 3"),
+        (None, (*RANGE, "--depth-mm", 500), 2, "--depth-mm would have no effect"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(
+    change: Callable[[dict[str, Any]], object] | None, words: tuple[object, ...], code: int, message: str,
+    seen: Searches, scene: Path, edit: Edit, faintfield: Command,
+) -> None:  # fmt: skip
+    if change is not None:
+        edit(scene, change)
+    ended = faintfield("reconstruct", scene, "--surface", *words, "--out", scene / "out")
+    assert (ended.returncode, seen) == (code, [])
+    assert message.format(set=scene) in ended.stderr
+    assert len(ended.stderr.splitlines()) == 1
+    assert not (scene / "out").exists()
+
+
+def test_range_up_to_infinity_is_searched(seen: Searches, scene: Path, faintfield: Command, done: Command) -> None:
+    call = ("reconstruct", scene, "--surface", *FAST[2:], "--out", scene / "out", "--depth-range-mm")
+    assert "warning" not in done(*call, "400:1000000000").stderr
+    assert "a narrower range would find more" in done(*call, "10:900").stderr
+    assert 1 / seen[0][1][0] == pytest.approx(1e9)
+
+
+def test_saturated_or_too_small_views_are_refused(
+    seen: Searches, scene: Path, tmp_path: Path, faintfield: Command, done: Command
+) -> None:
+    for path in scene.glob("view_*.tiff"):
+        write_frame(path, np.full((72, 96), 65535, np.uint16))
+    done("simulate", tmp_path / "small", "--size-px", 30, 20, "--rows", 2, "--columns", 2)
+    for folder, message in (
+        (scene, "GeometryMismatch: no pixel of any of the 9 views sees the plane"),
+        (tmp_path / "small", "has views of 30 x 20 px, and a surface needs at least 24 px"),
+    ):
+        ended = faintfield("reconstruct", folder, "--surface", *FAST, "--out", tmp_path / "out")
+        assert (ended.returncode, seen) == (1, [])
+        assert message in ended.stderr
+        assert not (tmp_path / "out").exists()
+
+
+def test_deviation_without_images_is_that_of_plane(simulated_scene: Path) -> None:
+    elemental_set = load_set(simulated_scene)
+    (layout,) = channel_layouts(elemental_set)
+    images = load_channel(elemental_set, layout)
+    operator = OperatorFactory(elemental_set, layout, images).at(500.0, plane_grid(elemental_set, 500.0))
+    settings = Settings(penalty_weight=0.5, passes=5)
+    solution, sigma = solve_then_sigma(Objective.of(SceneProblem(operator, images), settings), settings)
+    expected = solve(operator, images, "pmlem", replace(settings, uncertainty=True))
+    np.testing.assert_array_equal(solution.plane, expected.plane)
+    np.testing.assert_array_equal(sigma(), expected.sidecars["sigma"])
 
 
 @pytest.mark.parametrize("bins", [2, 3])
@@ -22,7 +220,7 @@ def test_each_sample_has_value_of_nearest_bin(bins: int, moved: float) -> None:
     np.testing.assert_array_equal(enlarged(part, shape, bins, moved=moved), expected)
 
 
-def test_samples_between_pixels_blur_as_much_as_samples_anywhere() -> None:
+def test_samples_between_pixels_have_mean_blur() -> None:
     def kept(place: float) -> float:
         return (1 - place) ** 2 + place**2
 

@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import msgspec
 import numpy as np
 import pytest
 import tifffile
 
 from faintfield.pipelines.commands.verify import verify
-from faintfield.pipelines.errors import BadValue, CannotWrite, ResultDamaged
+from faintfield.pipelines.errors import BadValue, ResultDamaged
 from faintfield.pipelines.formats.digests import DIGEST_KEY, with_digest
 from faintfield.pipelines.formats.provenance import provenance
-from faintfield.pipelines.formats.results.plane_files import read_current
-from faintfield.pipelines.formats.results.surface import SURFACE_FILE, SurfaceFileRecord, surfaces_below
-from faintfield.pipelines.reconstruction import surface_files
+from faintfield.pipelines.formats.results.surface import SURFACE_FILE, surfaces_below
+from faintfield.pipelines.formats.results.verification import records_of, verify_results
 from faintfield.pipelines.reconstruction.map_pictures import robust_limits
 from faintfield.pipelines.reconstruction.surface_files import SurfaceMaps, write_surface
 from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_facts, surface_maps, write_example
@@ -26,16 +24,8 @@ from tests.pipelines.surfaces import OPTIONS, SHAPE, surface_facts, surface_maps
 pytestmark = pytest.mark.usefixtures("undrawn")
 
 # Every file of a surface in mm.
-FILES = {
-    *(
-        f"{name}{suffix}"
-        for name in ("picture", "picture_sigma", "depth_mm", "depth_sigma_mm")
-        for suffix in (".tiff", ".png")
-    ),
-    *(f"{name}{suffix}" for name in ("depth_confidence", "visibility") for suffix in (".tiff", ".png")),
-    "surface.ply",
-    "parallax.webp",
-}
+MAPS = ("picture", "picture_sigma", "depth_mm", "depth_sigma_mm", "depth_confidence", "visibility")
+FILES = {"surface.ply", "parallax.webp", *(f"{name}{suffix}" for name in MAPS for suffix in (".tiff", ".png"))}
 
 
 @pytest.fixture(scope="module")
@@ -52,31 +42,17 @@ def surface(written: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written, tmp_path / "surface"))
 
 
-def _alter(folder: Path, **changes: Any) -> None:
-    """Change the surface in a record and give it a digest that agrees."""
-    path = folder / SURFACE_FILE
-    content = json.loads(path.read_bytes())
-    content["surface"].update(changes)
-    del content[DIGEST_KEY]
-    path.write_bytes(with_digest(json.dumps(content).encode()))
-
-
-def test_files_are_those_that_record_names(written: Path) -> None:
-    record = surfaces_below(written)[written]
+def test_maps_are_written_and_recorded_as_they_are(written: Path) -> None:
+    maps, record = surface_maps(), surfaces_below(written)[written]
     assert {path.name for path in written.iterdir()} == FILES | {SURFACE_FILE}
     assert set(record.files) == FILES == set(record.sha256)
-
-
-def test_maps_are_written_as_they_are(written: Path) -> None:
-    maps = surface_maps()
-    for name in ("picture", "picture_sigma", "depth", "depth_sigma", "depth_confidence", "visibility"):
-        unit = "_mm" if name in ("depth", "depth_sigma") else ""
-        found = tifffile.imread(written / f"{name}{unit}.tiff")
+    for name in MAPS:
+        found = tifffile.imread(written / f"{name}.tiff")
         assert (str(found.dtype), found.shape) == ("float32", SHAPE)
-        np.testing.assert_allclose(found, getattr(maps, name), rtol=1e-6)  # NaN where it is NaN
+        np.testing.assert_allclose(found, getattr(maps, name.removesuffix("_mm")), rtol=1e-6)  # NaN where it is NaN
 
 
-def test_record_counts_what_is_known(written: Path) -> None:
+def test_record_counts_known_samples(written: Path) -> None:
     found = surfaces_below(written)[written].surface
     unknown = 9 * 19
     ball = sum((r - 40) ** 2 + (c - 50) ** 2 < 400 for r in range(90) for c in range(120))
@@ -135,79 +111,32 @@ def test_surface_of_which_nothing_is_known_is_written(tmp_path: Path, monkeypatc
     assert verify(tmp_path).results is not None
 
 
-def test_failure_on_way_leaves_nothing_that_vouches(surface: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object, **__: object) -> int:
-        raise CannotWrite("no")
-
-    monkeypatch.setattr(surface_files, "write_points", fail)
-    with pytest.raises(CannotWrite):
-        write_example(surface)
-    assert not (surface / SURFACE_FILE).exists()
-
-
-class TestVerify:
-    """`faintfield verify` of a folder with a surface, and of its record alone."""
-
-    def test_all_agrees(self, written: Path) -> None:
-        for path in (written, written / SURFACE_FILE):
-            found = verify(path).results
-            assert found is not None
-            assert (found.records, found.files, found.problems) == (1, len(FILES), ())
-
-    def test_every_file_is_compared(self, surface: Path) -> None:
-        for name in sorted(FILES):
-            whole = (surface / name).read_bytes()
-            (surface / name).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-            with pytest.raises(ResultDamaged, match=f"{name}: was altered"):
-                verify(surface / SURFACE_FILE)
-            (surface / name).write_bytes(whole)
-        (surface / "visibility.tiff").unlink()
-        with pytest.raises(ResultDamaged, match=r"visibility\.tiff: is missing"):
-            verify(surface)
-
-    def test_altered_record_is_found(self, surface: Path) -> None:
-        text = (surface / SURFACE_FILE).read_text()
-        (surface / SURFACE_FILE).write_text(text.replace('"depths": 64', '"depths": 65'))
-        with pytest.raises(ResultDamaged, match="was altered after it was written"):
-            verify(surface)
+def test_verify_compares_every_file(surface: Path) -> None:
+    for path in (surface, surface / SURFACE_FILE):
+        verdict = verify(path).results
+        assert verdict is not None
+        assert (verdict.records, verdict.files, verdict.problems) == (1, len(FILES), ())
+    for name in sorted(FILES):
+        whole = (surface / name).read_bytes()
+        (surface / name).write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+        (problem,) = verify_results(records_of(surface)).problems
+        assert f"{name}: was altered" in problem
+        (surface / name).write_bytes(whole)
 
 
-class TestReading:
-    """Records are read with the limits of all results."""
-
-    @pytest.mark.parametrize(
-        "changes",
-        [
-            {"picture": "../picture.tiff"},
-            {"film": "/dev/zero"},
-            {"unit": "inch"},
-            {"shape": [-1, 5]},
-        ],
-        ids=str,
-    )
-    def test_what_no_surface_can_be_is_refused(self, changes: dict[str, Any], surface: Path) -> None:
-        _alter(surface, **changes)
-        with pytest.raises(BadValue, match="is not a result that can be shown"):
-            surfaces_below(surface)
-
-    def test_link_out_of_folder_is_refused(self, surface: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
-        elsewhere = tmp_path_factory.mktemp("elsewhere") / "film.webp"
-        elsewhere.write_bytes(b"")
-        (surface / "parallax.webp").unlink()
-        (surface / "parallax.webp").symlink_to(elsewhere)
-        with pytest.raises(BadValue, match=r"parallax\.webp: leads out of the folder"):
-            surfaces_below(surface)
-
-    def test_current_surface_is_kept_and_any_other_made_again(self, surface: Path) -> None:
-        path, inputs = surface / SURFACE_FILE, {"elemental.toml": "0" * 64}
-        origin = provenance("reconstruct", OPTIONS, inputs)
-        kept = read_current(path, SurfaceFileRecord, origin)
-        assert kept is not None
-        assert kept.surface == surfaces_below(surface)[surface].surface
-        other = msgspec.structs.replace(OPTIONS, depth_range_mm=(400.0, 900.0))
-        assert read_current(path, SurfaceFileRecord, provenance("reconstruct", other, inputs)) is None
-        (surface / "surface.ply").write_bytes(b"")
-        assert read_current(path, SurfaceFileRecord, origin) is None
+@pytest.mark.parametrize(
+    "changes",
+    [{"picture": "../picture.tiff"}, {"film": "/dev/zero"}, {"unit": "inch"}, {"shape": [-1, 5]}],
+    ids=str,
+)
+def test_impossible_surface_is_refused(changes: dict[str, Any], surface: Path) -> None:
+    path = surface / SURFACE_FILE
+    content = json.loads(path.read_bytes())
+    content["surface"].update(changes)
+    del content[DIGEST_KEY]
+    path.write_bytes(with_digest(json.dumps(content).encode()))
+    with pytest.raises(BadValue, match="is not a result that can be shown"):
+        surfaces_below(surface)
 
 
 def test_limits_of_map_leave_outliers_out() -> None:

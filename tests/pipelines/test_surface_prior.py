@@ -1,6 +1,5 @@
 """`reconstruct --surface --prior`: the files and records it promises, what it refuses, and its errors."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.reconstruction import prior as prior_module
 from faintfield.pipelines.reconstruction import surface
 from tests.pipelines.conftest import Command, Edit
+from tests.pipelines.forms import read_record
 from tests.pipelines.surfaces import FOUND_MM, Searches
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -23,11 +23,6 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 RANGE = ("--depth-range-mm", "400:900")
 FAST = ("--surface", *RANGE, "--penalty-weight", 0.5, "--passes", 4)
 PROPOSED = {f"picture_{name}{suffix}" for name in ("proposal", "moved") for suffix in (".tiff", ".png")}
-
-
-def _record(folder: Path) -> dict[str, Any]:
-    record: dict[str, Any] = json.loads((folder / "surface.json").read_bytes())
-    return record
 
 
 def _map(folder: Path, name: str = "picture") -> NDArray[np.float32]:
@@ -41,7 +36,7 @@ def test_default_picture_is_total_variation_with_detail(
     done("reconstruct", scene, *FAST, "--out", tmp_path / "default")
     done("reconstruct", scene, *FAST, "--prior", "tv", "--out", tmp_path / "tv")
     np.testing.assert_array_equal(_map(tmp_path / "default"), _map(tmp_path / "tv") + np.float32(1))
-    default, tv = _record(tmp_path / "default"), _record(tmp_path / "tv")
+    default, tv = read_record(tmp_path / "default", "surface.json"), read_record(tmp_path / "tv", "surface.json")
     assert tv["options"] == default["options"] | {"prior": "tv"}
     assert not {"prior", "proposal"} & {*default["options"], *default["surface"]["channels"][0]}
     assert set(default["sha256"]) == set(tv["sha256"])
@@ -52,7 +47,7 @@ def test_surface_at_one_depth_equals_the_plane(seen: Searches, scene: Path, tmp_
     done("reconstruct", scene, "--surface", *RANGE, *weight, "--prior", "tv", "--out", tmp_path / "surface")
     done("reconstruct", scene, "--depth-mm", FOUND_MM, *weight, "--prior", "tv", "--out", tmp_path / "plane")
     found, plane = _map(tmp_path / "surface"), _map(tmp_path / "plane", f"plane_{FOUND_MM:07.1f}")
-    (channel,) = _record(tmp_path / "surface")["surface"]["channels"]
+    (channel,) = read_record(tmp_path / "surface", "surface.json")["surface"]["channels"]
     assert channel["certificate"]["reached"]
     # Both are certified to 1 % of the same optimum
     assert np.linalg.norm(found - plane) < 0.02 * np.linalg.norm(plane)
@@ -68,7 +63,7 @@ def test_proposal_and_change_are_written_beside_picture(
     assert picture.dtype == proposal.dtype == moved.dtype == np.float32
     assert min(picture.min(), proposal.min()) >= 0
     assert ((picture - proposal) * moved >= 0).all()
-    record = _record(tmp_path / "out")
+    record = read_record(tmp_path / "out", "surface.json")
     (channel,) = record["surface"]["channels"]
     assert channel["prior"]["name"] == "patches"
     for weights in channel["prior"]["mixture"].values():
@@ -95,7 +90,7 @@ def test_each_colour_has_prior_of_its_own(
         grey = read_frame(path).pixels_dn
         write_frame(path, np.stack([grey, grey // 2 + 50, grey], axis=-1))
     done("reconstruct", scene, *FAST, "--prior", "patches", "--proposal", "--out", tmp_path)
-    red, green, blue = (channel["prior"] for channel in _record(tmp_path)["surface"]["channels"])
+    red, green, blue = (channel["prior"] for channel in read_record(tmp_path, "surface.json")["surface"]["channels"])
     assert red == blue != green
     assert _map(tmp_path, "picture_moved").shape == _map(tmp_path).shape == (72, 96, 3)
 
@@ -110,7 +105,7 @@ def test_too_few_views_give_picture_of_total_variation(
     edit(scene, four_views)
     done("reconstruct", scene, *FAST, "--prior", "tv", "--out", tmp_path / "tv")
     done("reconstruct", scene, *FAST, "--prior", "patches", "--proposal", "--out", tmp_path / "patches")
-    (channel,) = _record(tmp_path / "patches")["surface"]["channels"]
+    (channel,) = read_record(tmp_path / "patches", "surface.json")["surface"]["channels"]
     assert channel["prior"] == {"name": "tv", "left_out": "too few views to hold some out"}
     assert not PROPOSED & {path.name for path in (tmp_path / "patches").iterdir()}
     np.testing.assert_array_equal(_map(tmp_path / "patches"), _map(tmp_path / "tv"))

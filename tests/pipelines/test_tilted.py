@@ -19,6 +19,8 @@ from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.formats.plane_poses import read_plane_poses
 from tests.pipelines.conftest import Command
 
+pytestmark = pytest.mark.usefixtures("undrawn")
+
 WIDTH, HEIGHT, FOCAL_PX = 120, 90, 150.0
 POINT_MM = np.array([10.0, -5.0, 600.0])
 NORMAL = np.array([0.2, -0.7, 1.0])
@@ -151,7 +153,7 @@ def test_any_normal_becomes_pose_whose_plane_holds_point(
 
 
 @pytest.mark.parametrize(
-    ("plane", "failure", "said"),
+    ("plane", "failure", "message"),
     [
         ({"name": "00600.0", "rt_ref_plane": [0.0] * 5 + [600.0]}, BadValue, "is no name for files"),
         ({"name": "a", "point_mm": [0, 0, 1.0]}, BadValue, "give either rt_ref_plane, or point_mm and normal"),
@@ -161,25 +163,28 @@ def test_any_normal_becomes_pose_whose_plane_holds_point(
     ],
 )
 def test_what_is_no_plane_is_refused(
-    plane: dict[str, Any], failure: type[Exception], said: str, tmp_path: Path
+    plane: dict[str, Any], failure: type[Exception], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(failure) as refused:
         read_plane_poses([_poses(tmp_path / "p.toml", plane)])
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
-def test_plane_behind_camera_is_refused(target: Path, tmp_path: Path, faintfield: Command) -> None:
-    behind = {"name": "behind", "point_mm": [0, 0, -600.0], "normal": [0, 0, 1.0], "size_mm": [100.0, 80.0]}
-    poses = _poses(tmp_path / "p.toml", behind)
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ({"rt_ref_plane": [0, 1.5, 0, 0, 0, 600.0]}, "does not meet it in front"),
+        ({"rt_ref_plane": [0, 1.12, 0, 0, 0, 600.0]}, "samples, and at most"),
+        (
+            {"point_mm": [0, 0, -600.0], "normal": [0, 0, 1.0], "size_mm": [100.0, 80.0]},
+            "plane 'a': lies behind the camera, at -600 mm along its axis",
+        ),
+    ],
+)
+def test_plane_outside_view_is_refused(
+    pose: dict[str, Any], message: str, target: Path, tmp_path: Path, faintfield: Command
+) -> None:
+    poses = _poses(tmp_path / "poses.toml", {"name": "a", **pose})
     ended = faintfield("reconstruct", target, "--out", tmp_path / "out", "--plane-pose", poses)
     assert ended.returncode == 1
-    assert "plane 'behind': lies behind the camera, at -600 mm along its axis" in ended.stderr
-
-
-def test_planes_that_view_does_not_meet_are_refused(target: Path, tmp_path: Path, faintfield: Command) -> None:
-    for turn, said in ((1.5, "does not meet it in front"), (1.12, "samples, and at most")):
-        poses = _poses(tmp_path / "poses.toml", {"name": "steep", "rt_ref_plane": [0, turn, 0, 0, 0, 600.0]})
-        ended = faintfield("reconstruct", target, "--out", tmp_path / "out", "--plane-pose", poses)
-        assert ended.returncode == 1
-        assert said in ended.stderr
-        assert "size_mm" in ended.stderr
+    assert message in ended.stderr

@@ -5,9 +5,8 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from subprocess import CompletedProcess
 from types import SimpleNamespace
 from typing import Any
 
@@ -24,12 +23,10 @@ from faintfield.pipelines.formats.sets.elemental_set import load_set
 from faintfield.pipelines.formats.sets.stated import plane_stem, rounded_depth
 from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits, Units, json_of, record_of
 from faintfield.pipelines.pages.napari_layers import show_planes
+from tests.pipelines.conftest import SMALL, Command
 from tests.pipelines.forms import GOLDEN
 from tests.pipelines.test_golden import KINDS
 
-type Command = Callable[..., CompletedProcess[str]]
-
-SMALL = ("--size-px", 96, 72, "--rows", 3, "--columns", 3)
 BRIGHT = ("--snr", 60, "--position-error-mm", 0, "--rotation-error-mrad", 0, "--objects", "surfaces")
 
 # What states a unit, in words, keys and names; options of the command line are not meant.
@@ -38,6 +35,8 @@ UNITS_IN_TEXT = {
     "electrons": re.compile(r"e⁻|electron|photon|_e2?\b", re.IGNORECASE),
     "s": re.compile(r"\d s\b|exposure_s\W+[\d.]+"),
 }
+
+QUICK = ("--penalty-weight", 1, "--passes", 2)
 
 # Times that were measured: of the command itself.
 WALL_TIMES = re.compile(
@@ -53,13 +52,13 @@ RECORDS = [
     pytest.param(path, kind, id=path.stem)
     for name, kind in KINDS.items()
     for path in sorted(GOLDEN.glob(f"{name}_*.json"))
-    if path.stem != "metrics_demo"  # also of a calibration
+    if path.stem != "metrics_demo" and "units" in kind.__struct_fields__  # the former is also of a calibration
 ]
 
 
 @pytest.mark.parametrize(("depth", "light"), [("relative", "dn"), ("disparity_px", "relative")])
 @pytest.mark.parametrize(("path", "kind"), RECORDS)
-def test_every_record_is_read_as_it_was_written_in_any_units(
+def test_records_are_read_as_written_in_any_units(
     path: Path, kind: type[msgspec.Struct], depth: DepthUnit, light: LightUnit
 ) -> None:
     record: Any = msgspec.json.decode(path.read_bytes(), type=kind)
@@ -83,7 +82,7 @@ def _keys(value: Any) -> Iterator[str]:
             yield from _keys(part)
 
 
-def test_a_key_that_others_named_is_kept() -> None:
+def test_key_of_a_user_is_kept() -> None:
     record = msgspec.json.decode((GOLDEN / "plane_pmlem.json").read_bytes(), type=PlaneFileRecord)
     options = msgspec.structs.replace(record.options, plane_pose={"depth": [0.0] * 6, "mean": [1.0] * 6})
     units = StatedUnits("relative", "relative")
@@ -92,7 +91,7 @@ def test_a_key_that_others_named_is_kept() -> None:
     assert json.loads(json_of(odd))["inputs"] == {"mean_e": "0" * 64}
 
 
-def test_a_depth_below_zero_is_read_as_a_disparity_only() -> None:
+def test_negative_depth_is_read_as_disparity_only() -> None:
     content = (GOLDEN / "plane_pmlem.json").read_bytes().replace(b'"depth_mm": 500.0', b'"depth_mm": -500.0')
     with pytest.raises(msgspec.ValidationError, match="a depth is below"):
         record_of(content, PlaneFileRecord)
@@ -111,15 +110,6 @@ def with_scale(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def pictures(with_scale: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Its views alone: pictures of which nobody knows anything."""
-    folder = tmp_path_factory.mktemp("pictures")
-    for path in with_scale.glob("view_*.tiff"):
-        shutil.copy(path, folder)
-    return folder
-
-
 def without_scale(folder: Path, depth: DepthUnit, light: LightUnit) -> Path:
     """Make a set one whose depth and light are in these units, and whose exposure is not known."""
     settings = read_set_file(folder / "elemental.toml")
@@ -132,93 +122,50 @@ def without_scale(folder: Path, depth: DepthUnit, light: LightUnit) -> Path:
 
 
 @pytest.fixture
-def imported(pictures: Path, tmp_path: Path, done: Command) -> tuple[Path, str]:
-    """A set of the pictures by disparity, 1 = white, and what its import said."""
+def imported(with_scale: Path, tmp_path: Path, done: Command) -> tuple[Path, str]:
+    """Return a set of the pictures alone, by disparity and with 1 = white, and the words of its import."""
+    pictures = tmp_path / "pictures"
+    pictures.mkdir()
+    for path in with_scale.glob("view_*.tiff"):
+        shutil.copy(path, pictures)
     ended = done("import", "grid", pictures, tmp_path / "set", "--offset-dn", 100, "--read-noise-e", 3)
     return without_scale(tmp_path / "set", "disparity_px", "relative"), ended.stdout + ended.stderr
 
 
-def test_planes_are_written_in_the_units_of_their_set(with_scale: Path, tmp_path: Path, done: Command) -> None:
+@pytest.mark.usefixtures("undrawn")
+def test_planes_are_written_in_units_of_set(tmp_path: Path, done: Command) -> None:
     """The same set in DN, and relative to white, gives the same planes times the gain, and times that over white."""
-    planes, records = {}, {}
+    scene, planes, records = tmp_path / "scene", {}, {}
+    done("simulate", scene, "--size-px", 48, 36, "--rows", 2, "--columns", 2, "--snr", 60)
     for light in ("electrons", "dn", "relative"):
-        folder = Path(shutil.copytree(with_scale, tmp_path / light / "set"))
+        folder = Path(shutil.copytree(scene, tmp_path / light / "set"))
         settings = read_set_file(folder / "elemental.toml")
         write_set(folder, msgspec.structs.replace(settings, units=Units("mm", light)))
         out = tmp_path / light / "out"
-        quick = ("--penalty-weight", 1, "--passes", 2, "--uncertainty")
-        done("reconstruct", folder, "--out", out, "--depth-mm", 700, *quick)
+        done("reconstruct", folder, "--out", out, "--depth-mm", 700, "--prior", "tv", *QUICK, "--uncertainty")
         planes[light] = [read_frame(out / f"plane_00700.0{name}.tiff").pixels_dn for name in ("", "_sigma")]
         records[light] = record_of((out / "reconstruction.json").read_bytes(), ReconstructionRecord)
-    noise = load_set(with_scale).settings.noise
+    noise = load_set(scene).settings.noise
     assert not isinstance(noise, str)
     assert noise.saturation_dn is not None
     white_dn = noise.saturation_dn - (noise.offset_dn or 0)
     for light, factor in (("dn", noise.gain_dn_per_e), ("relative", noise.gain_dn_per_e / white_dn)):
-        for made, of_electrons in zip(planes[light], planes["electrons"], strict=True):
-            np.testing.assert_allclose(made, factor * of_electrons, rtol=1e-5)
+        for plane, of_electrons in zip(planes[light], planes["electrons"], strict=True):
+            np.testing.assert_allclose(plane, factor * of_electrons, rtol=1e-5)
         for field in ("mean_e", "flux_e"):
-            made, of_electrons = (getattr(records[key].planes[0], field) for key in (light, "electrons"))
-            assert made == pytest.approx(factor * of_electrons, rel=1e-6)
-
-
-def test_lengths_by_disparity_are_in_pixels(imported: tuple[Path, str], tmp_path: Path, done: Command) -> None:
-    folder, _ = imported
-    done("reconstruct", folder, "--out", tmp_path / "out", "--disparity-px=-3.25", "--method", "backprojection")
-    (plane,) = json.loads((tmp_path / "out" / "reconstruction.json").read_text())["planes"]
-    # The reference view has 96 x 72 px, and its principal point in the middle; samples are its pixels
-    assert plane["disparity_px"] == pytest.approx(-3.25, abs=1e-6)
-    assert plane["pitch_px"] == pytest.approx(1.0)
-    assert plane["origin_px"] == pytest.approx([-47.5, -35.5])
-    assert plane["file"] == "plane_px_-003.250.tiff"
+            value, of_electrons = (getattr(records[key].planes[0], field) for key in (light, "electrons"))
+            assert value == pytest.approx(factor * of_electrons, rel=1e-6)
 
 
 @pytest.mark.parametrize(
     ("unit", "depth", "name"),
     [("mm", 500.0, "plane_00500.0"), ("relative", 4.6315789, "plane_rel_4.63158"), ("relative", 12.0, "plane_rel_12")],
 )
-def test_planes_are_named_by_the_unit_of_their_depth(
+def test_planes_are_named_by_unit_of_depth(
     unit: DepthUnit, depth: float, name: str, with_scale: Path, tmp_path: Path
 ) -> None:
     folder = Path(shutil.copytree(with_scale, tmp_path / "set"))
     assert plane_stem(load_set(without_scale(folder, unit, "electrons")), depth) == name
-
-
-class Findings(dict[str, list[str]]):
-    """Where each unit is stated."""
-
-    def look(self, where: str, text: str) -> None:
-        text = WALL_TIMES.sub("", text)
-        for unit, pattern in UNITS_IN_TEXT.items():
-            for hit in pattern.finditer(text):
-                self.setdefault(unit, []).append(f"{where}: …{text[max(hit.start() - 40, 0) : hit.end() + 20]}…")
-
-
-def _stated(where: str, text: str) -> Findings:
-    found = Findings()
-    found.look(where, text)
-    return found
-
-
-def search(folder: Path, said: str) -> Findings:
-    """Return where a unit is stated: in names and texts of files, tags of TIFFs, headers, and what was said."""
-    found = Findings()
-    found.look("terminal", said)
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-        found.look("name", path.relative_to(folder).as_posix())
-        if path.suffix == ".html":
-            found.look(path.name, _words(path.read_text()))
-        elif path.suffix in (".json", ".toml"):
-            found.look(path.name, path.read_text())
-        elif path.suffix == ".ply":
-            found.look(path.name, path.read_bytes().partition(b"end_header")[0].decode())
-        elif path.suffix == ".tiff":
-            with tifffile.TiffFile(path) as file:
-                for tag in file.pages.first.tags.values():
-                    found.look(f"{path.name}, {tag.name}", f"{tag.value} ")
-                    if tag.code == RESOLUTION_UNIT and tag.value == CENTIMETRE:
-                        found.look(path.name, "a pitch in mm")
-    return found
 
 
 def _words(page: str) -> str:
@@ -228,90 +175,118 @@ def _words(page: str) -> str:
     return html.unescape(page)
 
 
-def everything(done: Command, folder: Path, out: Path, planes: tuple[object, ...], sweep: tuple[object, ...]) -> str:
-    """Make all that can be made of a set, into folders of `out`, and return what was said."""
-    quick = ("--penalty-weight", 1, "--passes", 2)
-    calls: list[tuple[object, ...]] = [
-        ("reconstruct", folder, "--out", out / "planes", *planes, *quick, "--uncertainty"),
-        ("reconstruct", folder, "--out", out / "sweep", *sweep, "--method", "backprojection", "--depth-map"),
-        ("reconstruct", folder, "--out", out / "auto", "--depth-mm", "auto", "--method", "backprojection"),
-        ("reconstruct", folder, "--out", out / "surface", "--surface", *quick),
+def texts_of(folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield names, texts, tags of TIFFs and headers of all files, each with the place where it stands."""
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        yield "name", path.relative_to(folder).as_posix()
+        if path.suffix == ".html":
+            yield path.name, _words(path.read_text())
+        elif path.suffix in (".json", ".toml"):
+            yield path.name, path.read_text()
+        elif path.suffix == ".ply":
+            yield path.name, path.read_bytes().partition(b"end_header")[0].decode()
+        elif path.suffix == ".tiff":
+            with tifffile.TiffFile(path) as file:
+                for tag in file.pages.first.tags.values():
+                    centimetres = tag.code == RESOLUTION_UNIT and tag.value == CENTIMETRE
+                    yield f"{path.name}, {tag.name}", "a pitch in mm" if centimetres else f"{tag.value} "
+
+
+def stated_units(folder: Path, words: str) -> dict[str, list[str]]:
+    """Return the places in a folder, and in the words of its commands, where each unit is stated."""
+    places: dict[str, list[str]] = {}
+    for where, text in [("terminal", words), *texts_of(folder)]:
+        text = WALL_TIMES.sub("", text)
+        for unit, pattern in UNITS_IN_TEXT.items():
+            for hit in pattern.finditer(text):
+                context = text[max(hit.start() - 40, 0) : hit.end() + 20]
+                places.setdefault(unit, []).append(f"{where}: …{context}…")
+    return places
+
+
+def outputs(done: Command, folder: Path, out: Path, *calls: tuple[object, ...]) -> str:
+    """Make results of a set, a report, and exports of them into folders of `out`; return the words of the commands."""
+    for_all = [
         ("report", out),
         ("verify", out, "--inputs", folder),
         ("export", "zarr", out / "sweep", out / "sweep.ome.zarr", "--overwrite"),
         ("export", "colmap", folder, out / "colmap", "--overwrite"),
     ]
-    said = ""
-    for call in calls:
+    words = ""
+    for call in [*(("reconstruct", folder, *call) for call in calls), *for_all]:
         ended = done(*call)
-        said += ended.stdout + ended.stderr
-    for call in calls[4:]:
-        said += done("--json", *call).stdout
-    return said
+        words += ended.stdout + ended.stderr
+    return words + "".join(done("--json", *call).stdout for call in for_all[1:])
 
 
-def test_units_in_texts_are_found() -> None:
-    for unit, text in (("mm", "pitch_mm: 3"), ("mm", "700 mm,"), ("electrons", "mean_e"), ("s", "exposure of 0.1 s")):
-        assert [*_stated("page", text)] == [unit]
-
-
-def test_nothing_states_a_unit_that_nobody_gave(imported: tuple[Path, str], tmp_path: Path, done: Command) -> None:
-    folder, said = imported
-    said += everything(done, folder, tmp_path / "out", ("--disparity-px", -8), ("--sweep-px", "-14:-4:6"))
-    assert search(tmp_path / "out", said) == {}
-    assert "disparit" in said
+def test_no_output_states_an_unknown_unit(imported: tuple[Path, str], tmp_path: Path, done: Command) -> None:
+    folder, words = imported
+    out = tmp_path / "out"
+    sweep = ("--out", out / "sweep", "--sweep-px", "-14:-4:5", "--method", "backprojection", "--depth-map")
+    words += outputs(done, folder, out, sweep)
+    assert stated_units(out, words) == {}
+    assert "disparit" in words
+    record = json.loads((out / "sweep" / "reconstruction.json").read_text())["planes"][0]
+    # The reference view has 96 x 72 px, and its principal point in the middle; samples are its pixels
+    assert record["disparity_px"] == pytest.approx(-14, abs=1e-6)
+    assert record["pitch_px"] == pytest.approx(1.0)
+    assert record["origin_px"] == pytest.approx([-47.5, -35.5])
+    assert record["file"] == "plane_px_-014.000.tiff"
 
 
 @pytest.mark.deep
-def test_nothing_of_relative_poses_states_a_unit_that_nobody_gave(
-    with_scale: Path, tmp_path: Path, done: Command
+@pytest.mark.parametrize(
+    ("unit", "plane", "sweep"),
+    [("disparity_px", "--disparity-px=-8", "-14:-4:6"), ("relative", "--depth=700", "500:1000:6")],
+)
+def test_no_output_of_any_command_states_unknown_units(
+    unit: DepthUnit, plane: str, sweep: str, with_scale: Path, imported: tuple[Path, str], tmp_path: Path, done: Command
 ) -> None:
-    folder = Path(shutil.copytree(with_scale, tmp_path / "set"))
-    for path in [*folder.glob("*.json"), *folder.glob("noise_free*"), *folder.glob("object_region*")]:
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    without_scale(folder, "relative", "dn")
-    said = everything(done, folder, tmp_path / "out", ("--depth", 700), ("--sweep", "500:1000:6"))
-    assert search(tmp_path / "out", said) == {}
-    assert "has no scale, so that lengths are relative" in said
+    folder, words = imported
+    if unit == "relative":
+        folder, words = Path(shutil.copytree(with_scale, tmp_path / "relative")), ""
+        for path in [*folder.glob("*.json"), *folder.glob("noise_free*"), *folder.glob("object_region*")]:
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        without_scale(folder, unit, "dn")
+    out, back = tmp_path / "out", ("--method", "backprojection")
+    words += outputs(
+        done,
+        folder,
+        out,
+        ("--out", out / "planes", plane, *QUICK, "--uncertainty"),
+        ("--out", out / "sweep", "--sweep-px" if unit == "disparity_px" else "--sweep", sweep, *back, "--depth-map"),
+        ("--out", out / "auto", "--depth-mm", "auto", *back),
+        ("--out", out / "surface", "--surface", *QUICK),
+    )
+    assert stated_units(out, words) == {}
+    assert unit == "disparity_px" or "has no scale, so that lengths are relative" in words
 
 
 @pytest.mark.parametrize("unit", ["mm", "relative", "disparity_px"])
-def test_rounded_depths_have_a_name_of_their_own(unit: DepthUnit, with_scale: Path, tmp_path: Path) -> None:
-    loaded = load_set(without_scale(Path(shutil.copytree(with_scale, tmp_path / "set")), unit, "electrons"))
-    focal_px, pitch_mm = loaded.settings.camera.fx_px, 50
+def test_rounded_depths_have_their_own_name(unit: DepthUnit, with_scale: Path, tmp_path: Path) -> None:
+    elemental_set = load_set(without_scale(Path(shutil.copytree(with_scale, tmp_path / "set")), unit, "electrons"))
+    focal_px, pitch_mm = elemental_set.settings.camera.fx_px, 50
     # Half a digit; a disparity of fx p / z changes by that if z does by z² / (fx p)
     half = {"mm": 0.05, "relative": 5e-4, "disparity_px": 5e-4 * 710**2 / (focal_px * pitch_mm)}[unit]
     for depth in np.linspace(690, 710, 41).tolist():
-        rounded = rounded_depth(loaded, depth)
+        rounded = rounded_depth(elemental_set, depth)
         assert abs(rounded - depth) <= 1.01 * half
-        assert rounded_depth(loaded, rounded) == pytest.approx(rounded, rel=1e-12)
-        name = plane_stem(loaded, rounded)
-        assert name == plane_stem(loaded, rounded * (1 + 1e-9))
+        assert rounded_depth(elemental_set, rounded) == pytest.approx(rounded, rel=1e-12)
+        name = plane_stem(elemental_set, rounded)
+        assert name == plane_stem(elemental_set, rounded * (1 + 1e-9))
 
 
-@pytest.mark.parametrize(
-    ("units", "unit", "label"),
-    [(StatedUnits(), "mm", "depth"), (StatedUnits("disparity_px"), "pixel", "disparity")],
-)
-def test_layers_of_napari_are_in_the_units_of_their_set(
-    units: StatedUnits, unit: str, label: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[dict[str, Any]] = []
-
-    class Viewer:
-        def __init__(self, **_: object) -> None:
-            pass
-
-        def add_image(self, data: Any, **named: Any) -> None:
-            made.append(named)
-
-    monkeypatch.setitem(sys.modules, "napari", SimpleNamespace(Viewer=Viewer, run=lambda: None))
+def test_layers_of_napari_are_in_units_of_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layers: list[dict[str, Any]] = []
+    viewer = SimpleNamespace(add_image=lambda data, **options: layers.append(options))
+    napari = SimpleNamespace(Viewer=lambda **_: viewer, run=lambda: None)
+    monkeypatch.setitem(sys.modules, "napari", napari)
     record = record_of((GOLDEN / "reconstruction_sweep.json").read_bytes(), ReconstructionRecord)
     planes = [msgspec.structs.replace(plane, pitch_mm=1.0) for plane in record.planes]
-    record = msgspec.structs.replace(record, units=units, planes=planes)
+    record = msgspec.structs.replace(record, units=StatedUnits("disparity_px"), planes=planes)
     (tmp_path / "reconstruction.json").write_bytes(json_of(record))
     for plane in planes:
         tifffile.imwrite(tmp_path / plane.file, np.zeros(plane.shape, np.float32))
     show_planes(tmp_path)
-    assert made[0]["units"] == (unit,) * 3
-    assert made[0]["axis_labels"] == (label, "y", "x")
+    assert layers[0]["units"] == ("pixel",) * 3
+    assert layers[0]["axis_labels"] == ("disparity", "y", "x")
