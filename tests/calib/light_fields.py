@@ -39,22 +39,10 @@ def light_field(
     detail: float = 1.0,
     seed: int = 1,
 ) -> Views:
-    """Return views (row, column) by node (row, column), of values 0…1.
+    """Return views (row, column) by node (row, column), of values 0…1, of layers from far to near.
 
-    Parameters
-    ----------
-    layers : tuple of Layer
-        From far to near.
-    grid, size_px : (int, int)
-        Rows and columns of nodes; width and height of a view.
-    aligned_px : float
-        Added to every disparity, as aligning the pictures on a plane does.
-    ratio : float
-        Pitch along columns over pitch along rows.
-    detail : float
-        Slope of the textures' spectrum: larger is smoother.
-    seed : int
-        Seed of the textures.
+    `aligned_px` is added to every disparity, as aligning the pictures on a plane does; `ratio` is the pitch along
+    columns over that along rows; `detail` is the slope of the textures' spectrum: larger is smoother.
     """
     generator = np.random.default_rng(seed)
     textures = [_texture(generator, detail) for _ in layers]
@@ -69,9 +57,10 @@ def light_field(
             moved_px = layer.disparity_px + aligned_px
             on_x = x - ratio * moved_px * (column - grid[1] // 2) - layer.centre_px[0]
             on_y = y - moved_px * (row - grid[0] // 2) - layer.centre_px[1]
-            seen = np.outer(np.abs(on_y) <= layer.half_size_px[1], np.abs(on_x) <= layer.half_size_px[0])
-            places = np.meshgrid(on_y, on_x, indexing="ij")
-            picture = np.where(seen, map_coordinates(texture, places, order=1, mode="grid-wrap"), picture)
+            rows = np.flatnonzero(np.abs(on_y) <= layer.half_size_px[1])
+            columns = np.flatnonzero(np.abs(on_x) <= layer.half_size_px[0])
+            places = np.meshgrid(on_y[rows], on_x[columns], indexing="ij")
+            picture[np.ix_(rows, columns)] = map_coordinates(texture, places, order=1, mode="grid-wrap")
         views[row, column] = picture.reshape(height, 2, width, 2).mean(axis=(1, 3)).astype(np.float32)
     return views
 
@@ -79,8 +68,8 @@ def light_field(
 def with_noise(views: Views, snr: float, seed: int = 5) -> Views:
     """Return the views with noise of such deviation that the mean light is `snr` times it."""
     generator = np.random.default_rng(seed)
-    sigma = float(np.mean([it.mean() for it in views.values()])) / snr
-    return {node: (it + generator.normal(0, sigma, it.shape)).astype(np.float32) for node, it in views.items()}
+    sigma = float(np.mean([view.mean() for view in views.values()])) / snr
+    return {node: (view + generator.normal(0, sigma, view.shape)).astype(np.float32) for node, view in views.items()}
 
 
 def _texture(generator: np.random.Generator, slope: float) -> NDArray[np.float64]:

@@ -1,27 +1,23 @@
-"""What the pictures of a grid say of their order, against scenes whose order is known."""
+"""Order of the pictures of a grid, against scenes whose order is known."""
 
-from collections.abc import Callable
-
+import cv2
 import numpy as np
 import pytest
 
+from faintfield.calib.arrangement.fitting_views import compare_pair
 from faintfield.calib.arrangement.look import Look, look
-from faintfield.calib.arrangement.occlusion import find_far_side
+from faintfield.calib.arrangement.matching import Tables
 from faintfield.calib.arrangement.orientation import Orientation, counted
-from faintfield.calib.arrangement.pictures import prepare
+from faintfield.calib.arrangement.scene import pitch_ratio
 from tests.calib.light_fields import CARDS, Layer, Views, light_field, with_noise
 
 # Added to all disparities: some cards then move with the camera, others against it; or all with it.
 ALIGNED_PX, ALL_WITH_IT_PX = 2.4, 4.2
 
 
-def _seen(views: Views, given: Orientation | None = None) -> Look:
+def overview(views: Views, order: Orientation | None = None) -> Look:
     nodes = sorted(views)
-    return look(nodes, lambda index: views[nodes[index]], given)
-
-
-def _renamed(views: Views, name: Callable[[int, int], tuple[int, int]]) -> Views:
-    return {name(*node): picture for node, picture in views.items()}
+    return look(nodes, lambda index: views[nodes[index]], order)
 
 
 def _misnamed(views: Views, orientation: Orientation) -> Views:
@@ -33,200 +29,211 @@ def _misnamed(views: Views, orientation: Orientation) -> Views:
         column = last[1] - column if orientation.flip_columns else column
         return (int(column), int(row)) if orientation.transpose else (int(row), int(column))
 
-    return _renamed(views, name)
+    return {name(*node): picture for node, picture in views.items()}
 
 
 @pytest.fixture(scope="module")
 def aligned() -> Views:
-    return light_field(grid=(5, 6), aligned_px=ALIGNED_PX)
+    return light_field(grid=(3, 4), aligned_px=ALIGNED_PX)
 
 
 @pytest.mark.parametrize(
     "wanted",
-    [
-        Orientation(False, False, True),
-        Orientation(False, True, True),
-        Orientation(True, True),
-        Orientation(True, False, True),
-    ],
+    [Orientation(False, True, True), Orientation(True, True), Orientation(True, False, True)],
     ids=str,
 )
-def test_order_is_found_in_aligned_pictures(wanted: Orientation, aligned: Views) -> None:
+def test_order_is_read_from_aligned_pictures(wanted: Orientation, aligned: Views) -> None:
     misnamed = _misnamed(aligned, wanted)
-    found = _seen(misnamed)
-    assert found.orientation == wanted
-    assert (found.direction, found.undecided, found.aligned) == ("pictures", False, True)
-    # The views themselves are where they were rendered
-    placed = dict(
-        zip(found.orientation.of(sorted(misnamed)), (misnamed[node] for node in sorted(misnamed)), strict=True)
-    )
-    assert all(placed[node] is aligned[node] for node in aligned)
-
-
-@pytest.mark.parametrize(("aligned_px", "least_px", "largest_px"), [(0.0, -3.8, -1.0), (ALL_WITH_IT_PX, 0.4, 3.2)])
-def test_the_range_of_disparities_holds_all_layers_and_little_more(
-    aligned_px: float, least_px: float, largest_px: float
-) -> None:
-    found = _seen(light_field(grid=(5, 5), aligned_px=aligned_px))
-    assert found.disparity_px is not None
-    assert found.disparity_px[0] < least_px + 0.05
-    assert found.disparity_px[1] > largest_px - 0.05
-    assert found.disparity_px[0] > least_px - 0.6
-    assert found.disparity_px[1] < largest_px + 0.6
-    # Where all points move with the camera, only hidden parts tell that nothing is reversed
-    assert (found.orientation, found.direction) == (Orientation(), "pictures")
-
-
-@pytest.mark.parametrize("reversed_order", [False, True])
-def test_what_is_hidden_lies_on_the_far_side(reversed_order: bool) -> None:
-    views = light_field(grid=(3, 3), aligned_px=ALIGNED_PX)
-    if reversed_order:
-        views = _renamed(views, lambda row, column: (2 - row, 2 - column))
-    nodes = sorted(views)
-    light = prepare(nodes, lambda index: views[nodes[index]]).light
-    result = find_far_side(light, [(1, 1)], np.arange(-2, 2.1, 0.5), distance=1, ratio=1.0)
-    assert (result.z > 5) is not reversed_order
-    assert (result.z < -5) is reversed_order
-
-
-def test_an_edge_of_brightness_is_no_edge_of_depth() -> None:
-    # One slanted wall, as many layers side by side that touch: no part of it is hidden
-    views = light_field((Layer(0.0),), grid=(5, 5), aligned_px=1.0)
-    assert abs(_seen(views).side_z) < 4
-
-
-@pytest.mark.parametrize(("ratio", "transpose"), [(1.5, False), (0.6, True)])
-def test_another_pitch_along_columns_is_measured(ratio: float, transpose: bool) -> None:
-    found = _seen(_misnamed(light_field(grid=(5, 5), ratio=ratio), Orientation(transpose)))
-    assert found.orientation == Orientation(transpose)
-    assert found.ratio == pytest.approx(ratio, rel=0.02)
-    assert found.disparity_px is not None
-    # The range is the one along rows of nodes for x over the ratio: that along y
-    assert found.disparity_px[0] == pytest.approx(-3.8 * _range_scale(found), abs=0.7)
-
-
-def _range_scale(found: Look) -> float:
-    return found.ratio
-
-
-def test_a_square_pitch_is_called_square(aligned: Views) -> None:
-    assert _seen(aligned).ratio == 1.0
+    result = overview(misnamed)
+    assert result.orientation == wanted
+    assert (result.direction, result.undecided, result.aligned) == ("pictures", False, True)
+    assert result.ratio == 1.0
+    assert result.copies == []
+    placed = dict(zip(result.orientation.of(sorted(misnamed)), sorted(misnamed), strict=True))
+    assert all(misnamed[placed[node]] is aligned[node] for node in aligned), "views are where they were rendered"
 
 
 @pytest.mark.parametrize(
-    ("along", "reversed_order", "transpose"),
-    [("row", True, False), ("row", False, True), ("column", False, False), ("column", True, True)],
+    ("side", "aligned_px", "least_px", "largest_px"), [(5, 0.0, -3.8, -1.0), (4, ALL_WITH_IT_PX, 0.4, 3.2)]
 )
-def test_a_single_row_or_column(along: str, reversed_order: bool, transpose: bool) -> None:
-    views = light_field(grid=(1, 7) if along == "row" else (7, 1), aligned_px=ALIGNED_PX)
-    wanted = Orientation(transpose, reversed_order, reversed_order)
-    found = _seen(_misnamed(views, wanted))
-    placed = found.orientation.of(sorted(_misnamed(views, wanted)))
-    assert placed == wanted.of(sorted(_misnamed(views, wanted)))
-    assert found.direction == "pictures"
+def test_disparity_range_holds_all_layers(side: int, aligned_px: float, least_px: float, largest_px: float) -> None:
+    result = overview(light_field(grid=(side, side), aligned_px=aligned_px))
+    assert result.disparity_px is not None
+    assert least_px - 0.6 < result.disparity_px[0] < least_px + 0.05
+    assert largest_px - 0.05 < result.disparity_px[1] < largest_px + 0.6
+    # Where all points move with the camera, only hidden parts tell that nothing is reversed
+    assert (result.orientation, result.direction) == (Orientation(), "pictures")
 
 
-def test_all_points_moving_against_the_camera_are_in_order() -> None:
-    found = _seen(light_field((Layer(-1.5),), grid=(5, 5)))
-    assert (found.orientation, found.direction, found.undecided) == (Orientation(), "signs", False)
-    assert found.aligned is False
+def test_edge_of_brightness_is_no_edge_of_depth() -> None:
+    assert abs(overview(light_field((Layer(0.0),), grid=(4, 4), aligned_px=1.0)).side_z) < 4
 
 
-def test_one_plane_with_one_reversed_number_is_in_order_by_its_sign() -> None:
-    for wanted in (Orientation(flip_rows=True), Orientation(flip_columns=True)):
-        found = _seen(_misnamed(light_field((Layer(-1.5),), grid=(5, 5)), wanted))
-        assert (found.orientation, found.direction, found.undecided) == (wanted, "signs", False)
+def test_pitch_ratio_is_measured() -> None:
+    ratio, order = 0.6, Orientation(transpose=True)
+    result = overview(_misnamed(light_field(grid=(4, 4), ratio=ratio), order))
+    assert result.orientation == order
+    assert result.ratio == pytest.approx(ratio, rel=0.02)
+    assert result.disparity_px is not None
+    # The range is the one along rows of nodes for x over the ratio: that along y
+    assert result.disparity_px[0] == pytest.approx(-3.8 * result.ratio, abs=0.7)
 
 
-def test_one_plane_moving_with_the_camera_is_undecided() -> None:
-    assert _seen(light_field((Layer(1.5),), grid=(5, 5))).undecided
+@pytest.mark.parametrize(("grid", "transpose"), [((1, 7), False), ((7, 1), True)])
+def test_reversed_single_line_is_put_in_order(grid: tuple[int, int], transpose: bool) -> None:
+    wanted = Orientation(transpose, flip_rows=True, flip_columns=True)
+    misnamed = _misnamed(light_field(grid=grid, aligned_px=ALIGNED_PX), wanted)
+    result = overview(misnamed)
+    assert result.orientation.of(sorted(misnamed)) == wanted.of(sorted(misnamed))
+    assert result.direction == "pictures"
 
 
-def test_one_plane_that_does_not_move_keeps_its_names() -> None:
-    found = _seen(with_noise(light_field((Layer(0.0),), grid=(5, 5)), 20))
-    assert (found.seen, found.orientation, found.direction) == (True, Orientation(), "names")
-    assert (found.undecided, found.aligned) == (False, None)
+@pytest.mark.parametrize(
+    "wanted", [Orientation(), Orientation(flip_rows=True), Orientation(flip_columns=True)], ids=str
+)
+def test_plane_moving_against_the_camera_shows_order(wanted: Orientation) -> None:
+    result = overview(_misnamed(light_field((Layer(-1.5),), grid=(3, 3)), wanted))
+    assert (result.orientation, result.direction, result.undecided) == (wanted, "signs", False)
+    assert result.aligned is False
 
 
-def test_an_order_that_is_given_is_kept_and_contradicted(aligned: Views) -> None:
-    for given in (Orientation(flip_rows=True), Orientation(transpose=True), Orientation().turned()):
-        found = _seen(aligned, given)
-        assert (found.orientation, found.contradicted) == (given, True)
-    assert not _seen(aligned, Orientation()).contradicted
+def test_plane_moving_with_the_camera_is_undecided() -> None:
+    assert overview(light_field((Layer(1.5),), grid=(3, 3))).undecided
 
 
-def test_noise_leaves_the_range_and_the_axes(aligned: Views) -> None:
-    snr = 1.0
-    found = _seen(with_noise(_misnamed(aligned, Orientation(transpose=True)), snr))
-    assert found.seen
-    assert found.orientation.transpose
-    assert found.disparity_px is not None
-    assert found.disparity_px[0] < -1.2
-    assert found.disparity_px[1] > 1.2
+def test_still_plane_keeps_its_names() -> None:
+    result = overview(with_noise(light_field((Layer(0.0),), grid=(3, 3)), 20))
+    assert (result.seen, result.orientation, result.direction) == (True, Orientation(), "names")
+    assert (result.undecided, result.aligned) == (False, None)
 
 
-def test_dark_pictures_keep_their_names(aligned: Views) -> None:
-    snr = 0.16
-    found = _seen(with_noise(aligned, snr))
-    assert found.orientation == Orientation()
-    assert not found.undecided
-    assert found.odd == []
+@pytest.mark.parametrize(
+    "order",
+    [Orientation(), Orientation(flip_rows=True), Orientation(transpose=True), Orientation().turned()],
+    ids=str,
+)
+def test_wrong_prescribed_order_is_contradicted(order: Orientation, aligned: Views) -> None:
+    result = overview(aligned, order)
+    assert (result.orientation, result.contradicted) == (order, order != Orientation())
 
 
-def test_pictures_of_noise_and_of_different_scenes_show_nothing() -> None:
-    generator = np.random.default_rng(0)
-    noise = {node: generator.random((96, 128), np.float32) for node in np.ndindex(5, 5)}
-    assert not _seen(noise).seen
-    scenes = {(r, c): light_field(grid=(1, 1), seed=5 * r + c)[0, 0] for r, c in np.ndindex(5, 5)}
-    assert not _seen(scenes).seen
+def test_noise_leaves_the_range_and_the_axes() -> None:
+    aligned = light_field(grid=(4, 5), aligned_px=ALIGNED_PX)
+    result = overview(with_noise(_misnamed(aligned, Orientation(transpose=True)), snr=1.0))
+    assert result.seen
+    assert result.orientation.transpose
+    assert result.disparity_px is not None
+    assert result.disparity_px[0] < -1.2
+    assert result.disparity_px[1] > 1.2
 
 
-def test_views_that_do_not_fit_are_named_and_leave_the_rest(aligned: Views) -> None:
-    spoilt = dict(aligned)
-    spoilt[1, 2] = np.ascontiguousarray(aligned[1, 2][::-1, ::-1])
-    spoilt[3, 4] = np.roll(aligned[3, 4], 11, axis=0)
+@pytest.mark.parametrize("content", ["noise", "scenes"])
+def test_unrelated_pictures_show_nothing(content: str) -> None:
+    generator, nodes = np.random.default_rng(0), list(np.ndindex(4, 4))
+    views = {node: generator.random((96, 128), np.float32) for node in nodes}
+    if content == "scenes":
+        views = {(r, c): light_field(grid=(1, 1), size_px=(128, 96), seed=5 * r + c)[0, 0] for r, c in nodes}
+    assert not overview(views).seen
+
+
+def test_spoilt_views_are_named_and_do_not_matter() -> None:
+    spoilt = light_field(grid=(4, 5), aligned_px=ALIGNED_PX)
+    spoilt[1, 2] = np.ascontiguousarray(spoilt[1, 2][::-1, ::-1])
+    spoilt[3, 4] = np.roll(spoilt[3, 4], 11, axis=0)
     spoilt[0, 0] = light_field(CARDS, (1, 1), seed=99)[0, 0]
-    found = _seen(spoilt)
-    assert [sorted(spoilt)[index] for index in found.odd] == [(0, 0), (1, 2), (3, 4)]
-    assert found.orientation == Orientation()
+    result = overview(spoilt)
+    assert [sorted(spoilt)[index] for index in result.odd] == [(0, 0), (1, 2), (3, 4)]
+    assert result.orientation == Orientation()
 
 
-def test_copies_are_named(aligned: Views) -> None:
+def test_copies_and_different_light_are_measured(aligned: Views) -> None:
     nodes = sorted(aligned)
-    copied = {**aligned, (2, 2): aligned[0, 1]}
-    assert _seen(copied).copies == [(nodes.index((0, 1)), nodes.index((2, 2)))]
-    assert _seen(aligned).copies == []
+    result = overview({**aligned, (2, 2): aligned[0, 1], (1, 3): aligned[1, 3] * np.float32(1.5)})
+    assert result.copies == [(nodes.index((0, 1)), nodes.index((2, 2)))]
+    assert result.light[nodes.index((1, 3))] == pytest.approx(1.5, rel=0.1)
+    assert result.orientation == Orientation()
 
 
 def test_missing_views_change_nothing(aligned: Views) -> None:
-    left = {node: it for node, it in _misnamed(aligned, Orientation(flip_columns=True)).items() if sum(node) % 5}
-    found = _seen(left)
-    assert (found.orientation, found.direction) == (Orientation(flip_columns=True), "pictures")
+    misnamed = _misnamed(aligned, Orientation(flip_columns=True))
+    result = overview({node: picture for node, picture in misnamed.items() if sum(node) % 4})
+    assert (result.orientation, result.direction) == (Orientation(flip_columns=True), "pictures")
 
 
-def test_a_turned_and_a_shifted_view_are_measured(aligned: Views) -> None:
-    import cv2
-
-    nodes = sorted(aligned)
-    changed = dict(aligned)
+def test_turned_and_shifted_views_are_measured() -> None:
+    views = light_field(grid=(5, 6), aligned_px=ALIGNED_PX)
+    turned, shifted = (sorted(views).index(node) for node in ((2, 3), (1, 1)))
     turn = cv2.getRotationMatrix2D((79.5, 59.5), -2.0, 1.0)  # clockwise as seen, from x towards y
-    changed[2, 3] = cv2.warpAffine(aligned[2, 3], turn, (160, 120), borderMode=cv2.BORDER_REFLECT).astype(np.float32)
-    changed[1, 1] = np.roll(aligned[1, 1], 2, axis=0)
-    found = _seen(changed)
-    assert np.degrees(found.turn_rad[nodes.index((2, 3))]) == pytest.approx(2.0, abs=0.3)
-    others = np.delete(np.degrees(found.turn_rad), nodes.index((2, 3)))
-    assert np.abs(others).max() < 0.3
-    assert found.shift_px[nodes.index((1, 1))] == pytest.approx([0.0, 2.0], abs=0.4)
-
-
-def test_light_that_differs_is_measured(aligned: Views) -> None:
-    brighter = {node: it * np.float32(1.5 if node == (4, 4) else 1.0) for node, it in aligned.items()}
-    found = _seen(brighter)
-    assert found.light[sorted(aligned).index((4, 4))] == pytest.approx(1.5, rel=0.1)
-    assert found.orientation == Orientation()
-    assert found.odd == []
+    views[2, 3] = cv2.warpAffine(views[2, 3], turn, (160, 120), borderMode=cv2.BORDER_REFLECT).astype(np.float32)
+    views[1, 1] = np.roll(views[1, 1], 2, axis=0)
+    result = overview(views)
+    assert np.degrees(result.turn_rad[turned]) == pytest.approx(2.0, abs=0.3)
+    assert np.abs(np.delete(np.degrees(result.turn_rad), turned)).max() < 0.3
+    assert result.shift_px[shifted] == pytest.approx([0.0, 2.0], abs=0.4)
 
 
 def test_every_second_view_is_a_grid() -> None:
     assert counted([(4, 10), (4, 14), (8, 10), (10, 18)]) == [(0, 0), (0, 1), (2, 0), (3, 2)]
     assert counted([(3, 5)]) == [(0, 0)]
+
+
+def _small(grid: tuple[int, int], seed: int = 21) -> Views:
+    return light_field(CARDS, grid=grid, size_px=(128, 96), aligned_px=ALIGNED_PX, seed=seed)
+
+
+@pytest.mark.parametrize(("grid", "snr", "seed"), [((3, 4), np.inf, 0), ((1, 9), 3.0, 2)])
+def test_neighbours_fit_unless_shuffled(grid: tuple[int, int], snr: float, seed: int) -> None:
+    views = with_noise(_small(grid), snr)
+    ordered = overview(views)
+    assert (ordered.order.verdict, ordered.still) == ("fits", False)
+    order, pictures = np.random.default_rng(seed).permutation(len(views)), list(views.values())
+    shuffled = {node: pictures[index] for node, index in zip(views, order, strict=True)}
+    assert overview(shuffled).order.verdict == "denied"
+
+
+def test_line_of_views_is_no_square() -> None:
+    line = _small((1, 9), seed=22)
+    assert overview({divmod(place, 3): view for (_, place), view in line.items()}).order.verdict == "denied"
+
+
+def test_copies_with_noise_fit_anywhere() -> None:
+    result = overview(with_noise(dict.fromkeys(np.ndindex(3, 4), _small((1, 1))[0, 0]), 50))
+    assert (result.seen, result.order.verdict, result.still) == (True, "open", True)
+
+
+@pytest.mark.parametrize(("grid", "snr", "seed"), [((3, 4), 0.16, 0), ((1, 9), 1.0, 2)])
+def test_dark_views_keep_their_order(grid: tuple[int, int], snr: float, seed: int) -> None:
+    result = overview(with_noise(_small(grid), snr, seed))
+    assert result.order.verdict in ("open", "few", "fits")
+    assert (result.orientation, result.undecided, result.odd) == (Orientation(), False, [])
+
+
+@pytest.mark.parametrize("grid", [(1, 2), (2, 2)], ids=str)
+def test_up_to_four_views_are_too_few(grid: tuple[int, int]) -> None:
+    assert overview(light_field(CARDS, grid=grid, size_px=(128, 96))).order.verdict == "few"
+
+
+def test_small_disparities_count_in_pixels_of_files() -> None:
+    """Pictures above 448 px are halved, and so are disparities: 0.4 px of the files are 0.2 px there."""
+    result = overview(light_field((Layer(-0.4),), grid=(3, 3), size_px=(460, 80)))
+    assert (result.direction, result.aligned, result.still) == ("signs", False, False)
+
+
+@pytest.mark.parametrize(("no_sign_px", "ratio"), [(0.125, 1.5), (0.25, 1.0)])
+def test_blocks_for_the_ratio_must_agree(no_sign_px: float, ratio: float) -> None:
+    """A pitch ratio of 1.5 from 13 blocks; 20 more are wrong by more than half of `no_sign_px` explains."""
+    shifts_px = np.arange(-1, 1.01, 0.1)
+    along_px = {(1, 0): np.array([0.6] * 13 + [0.4] * 20), (0, 1): np.full(33, 0.4)}
+    scores = {
+        key: np.array(1 - (shifts_px - px[:, np.newaxis]) ** 2, np.float32)[np.newaxis] for key, px in along_px.items()
+    }
+    chance = Tables(shifts_px, {key: np.zeros_like(score) for key, score in scores.items()}, (3, 11))
+    assert pitch_ratio(Tables(shifts_px, scores, (3, 11)), chance, 1.5, no_sign_px)[0] == pytest.approx(ratio)
+
+
+def test_blocks_outside_the_other_view_are_ignored() -> None:
+    generator = np.random.default_rng(3)
+    view, other = generator.standard_normal((2, 120, 160)).astype(np.float32)
+    other[:, :60] = view[:, 100:]
+    pair = compare_pair({(0, 0): view, (0, 1): other}, (0, 0), (0, 1), 0, (-102.0, -98.0))
+    assert pair.score > 0.99

@@ -32,7 +32,7 @@ def in_camera(rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.float64]
 
 
 @given(rt_cam_ref=poses, rt_ref_plane=planes)
-def test_the_ray_to_a_point_is_mapped_to_that_point_with_the_sign_of_its_depth(
+def test_rays_are_mapped_to_points_of_the_plane(
     rt_cam_ref: NDArray[np.float64], rt_ref_plane: NDArray[np.float64]
 ) -> None:
     for homography, rt in zip(plane_from_ray(rt_cam_ref, rt_ref_plane), rt_cam_ref, strict=True):
@@ -43,7 +43,7 @@ def test_the_ray_to_a_point_is_mapped_to_that_point_with_the_sign_of_its_depth(
         np.testing.assert_allclose(mapped[:, :2] / mapped[:, 2:], POINTS_MM, rtol=1e-7, atol=1e-6)
 
 
-def test_a_plane_seen_from_its_back_keeps_positive_scale() -> None:
+def test_plane_from_its_back_keeps_positive_scale() -> None:
     from_behind = np.array([0.0, np.pi, 0.0, 0.0, 0.0, 500.0])
     column, row, scale = plane_from_ray(np.zeros((1, 6)), from_behind)[0] @ [0.1, 0.2, 1.0]
     assert scale > 0
@@ -51,20 +51,12 @@ def test_a_plane_seen_from_its_back_keeps_positive_scale() -> None:
 
 
 @pytest.mark.parametrize("plane", [[0, 0, 0, 0, 0, 0.0], [0, np.pi / 2, 0, 0, 0, 500.0]], ids=["through", "edge on"])
-def test_a_camera_within_the_plane_sees_nothing_of_it(plane: list[float]) -> None:
+def test_camera_within_the_plane_sees_nothing(plane: list[float]) -> None:
     np.testing.assert_array_equal(plane_from_ray(np.zeros((1, 6)), np.array(plane)), np.zeros((1, 3, 3)))
 
 
-def test_the_plane_across_the_axis_is_the_textbook_inverse() -> None:
-    rt = np.array([0.1, -0.2, 0.3, 40.0, -30.0, 20.0])
-    rotation = Rotation.from_rotvec(rt[:3]).as_matrix()
-    direct = np.column_stack([rotation[:, 0], rotation[:, 1], 700.0 * rotation[:, 2] + rt[3:]])
-    homography = plane_from_ray(rt[np.newaxis], fronto_parallel_rt_ref_plane(700.0))[0]
-    np.testing.assert_allclose(homography @ direct, np.eye(3), atol=1e-12)
-
-
 @given(rt_cam_ref=poses)
-def test_a_view_with_a_principal_point_of_its_own_sees_what_the_camera_matrix_says(
+def test_views_may_have_their_own_principal_points(
     rt_cam_ref: NDArray[np.float64],
 ) -> None:
     f_px, centre, centres = 800.0, np.array([319.5, 239.5]), np.array([[330.0, 250.0], [319.5, 239.5], [100.0, -20.0]])
@@ -79,9 +71,7 @@ def test_a_view_with_a_principal_point_of_its_own_sees_what_the_camera_matrix_sa
 
 
 @pytest.mark.parametrize(("size_px", "across"), [((640, 480), 5), ((5, 3), 4)])
-def test_the_lattice_of_an_image_holds_the_middles_of_equal_parts_of_its_pixels(
-    size_px: tuple[int, int], across: int
-) -> None:
+def test_lattice_holds_middles_of_equal_parts(size_px: tuple[int, int], across: int) -> None:
     """Pixel 0 reaches from −½ to ½: cut into 20 pieces each, the pixels of a part have their mean in its middle."""
     columns, rows = ((-0.5 + (np.arange(20 * size) + 0.5) / 20).reshape(across, -1).mean(axis=1) for size in size_px)
     expected = [(column, row) for row in rows for column in columns]
@@ -93,24 +83,18 @@ VIEW = np.array([0.02, -0.05, 0.1, 30.0, -20.0, 5.0])
 TILTED = np.array([0.2, -0.3, 0.1, 10.0, -5.0, 600.0])
 
 
-def seen_in_both(plane: NDArray[np.float64], points_mm: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-    """Return where the reference and the view see points of a plane, by scipy's rotations."""
-    in_ref = Rotation.from_rotvec(plane[:3]).apply(np.pad(points_mm, ((0, 0), (0, 1)))) + plane[3:]
-    return LENS.project(in_ref), LENS.project(Rotation.from_rotvec(VIEW[:3]).apply(in_ref) + VIEW[3:])
-
-
-def test_a_point_is_transferred_to_where_the_view_sees_it() -> None:
-    in_reference, in_view = seen_in_both(TILTED, POINTS_MM)
-    np.testing.assert_allclose(transfer(LENS, VIEW, TILTED, in_reference), in_view, atol=1e-5)
+def test_point_is_transferred_to_its_image() -> None:
+    in_ref, in_view = in_camera(np.zeros(6), TILTED), in_camera(VIEW, TILTED)
+    np.testing.assert_allclose(transfer(LENS, VIEW, TILTED, LENS.project(in_ref)), LENS.project(in_view), atol=1e-5)
 
 
 @pytest.mark.parametrize("plane", [[0, 0, 0, 0, 0, -500.0], [0, np.pi / 2, 0, 5, 0, 0.0]], ids=["behind", "beside"])
-def test_a_plane_that_is_not_in_front_transfers_nothing(plane: list[float]) -> None:
+def test_plane_not_in_front_transfers_nothing(plane: list[float]) -> None:
     pixels = np.array([[100.0, 200.0]])  # looks away from the plane beside
     assert np.isnan(transfer(LENS, np.zeros(6), np.array(plane), pixels)).all()
 
 
-def test_the_stated_sigma_of_a_transfer_is_that_of_drawn_lenses_and_poses() -> None:
+def test_transfer_sigma_is_that_of_drawn_cameras() -> None:
     generator = np.random.default_rng(3)
     scales = np.array([0.8, 0.7, 0.5, 0.4, 1e-3, 2e-3, 1e-4, 1e-4, *[2e-4] * 3, *[0.05] * 3])
     mixing = np.eye(14) + 0.3 * generator.normal(size=(14, 14))
@@ -119,23 +103,18 @@ def test_the_stated_sigma_of_a_transfer_is_that_of_drawn_lenses_and_poses() -> N
     stated = transfer_sigma_px(LENS, VIEW[None], [root @ root.T], TILTED, pixels)[0]
     truth = transfer(LENS, VIEW, TILTED, pixels)
     squares = np.zeros(3)
-    for _ in range(2000):
+    for _ in range(1000):
         drawn = np.array([*LENS.parameters, *VIEW]) + root @ generator.normal(size=14)
         lens = Lens.from_parameters(LENS.size_px, drawn[:8])
         squares += ((transfer(lens, drawn[8:], TILTED, pixels) - truth) ** 2).sum(axis=1)
-    np.testing.assert_allclose(stated, np.sqrt(squares / 2000), rtol=0.06)
+    np.testing.assert_allclose(stated, np.sqrt(squares / 1000), rtol=0.06)
 
 
-def test_sigma_is_stated_up_to_the_edges_of_the_view_and_no_farther() -> None:
+def test_sigma_ends_at_the_edges_of_the_view() -> None:
     pinhole = Lens((640, 480), 800.0, 800.0, 319.5, 239.5)
     # The view stands 50 mm to the right: a plane at 400 mm moves by 100 px to the left
-    view = np.array([0.0, 0, 0, -50.0, 0, 0])
-    columns = np.array([99.4, 99.6, 300.0, 739.4, 739.6])
-    pixels = np.column_stack([columns, np.full(5, 100.0)])
-    plane = fronto_parallel_rt_ref_plane(400.0)
-    np.testing.assert_allclose(transfer(pinhole, view, plane, pixels)[:, 0], columns - 100.0, atol=1e-9)
+    view, plane = np.array([0.0, 0, 0, -50.0, 0, 0]), fronto_parallel_rt_ref_plane(400.0)
+    pixels = np.array([[99.4, 100], [99.6, 100], [739.4, 100], [739.6, 100], [300, -0.6], [300, -0.4], [300, 479.6]])
+    np.testing.assert_allclose(transfer(pinhole, view, plane, pixels), pixels - [100.0, 0.0], atol=1e-9)
     sigma_px = transfer_sigma_px(pinhole, view[None], [1e-4 * np.eye(10)], plane, pixels)[0]
-    assert np.isfinite(sigma_px).tolist() == [False, True, True, True, False]
-    rows = np.column_stack([np.full(4, 300.0), [-0.6, -0.4, 479.4, 479.6]])
-    sigma_px = transfer_sigma_px(pinhole, view[None], [1e-4 * np.eye(10)], plane, rows)[0]
-    assert np.isfinite(sigma_px).tolist() == [False, True, True, False]
+    assert np.isfinite(sigma_px).tolist() == [False, True, True, False, False, True, False]

@@ -7,10 +7,11 @@ from faintfield.calib.errors import TooFewViews
 from faintfield.calib.geometry import BoardObservation, Target
 from faintfield.calib.geometry.observations import gather
 
-SHAPES = {"small": (3, 4), "large": (5, 4)}
+SHAPES = {"small": (3, 4), "large": (5, 4), "wide": (6, 8)}
+ALL_SMALL, ALL_WIDE = list(range(12)), list(range(48))
 
 
-def seen(
+def view(
     node: tuple[int, int], board: str, corners: list[int], sweep: int = 0, sigma_px: float = 0.1
 ) -> BoardObservation:
     numbers = np.array(corners)
@@ -18,67 +19,59 @@ def seen(
     return BoardObservation(node, Target(board, sweep), numbers, pixels, np.full(len(corners), sigma_px))
 
 
-ALL_SMALL = list(range(12))
-
-
 @pytest.mark.parametrize(
-    ("corners", "counts"),
+    ("board", "corners", "counts"),
     [
-        ([0, 1, 2, 3, 4, 5], True),
-        ([0, 1, 2, 4, 5], False),  # five
-        ([0, 4, 1, 5, 8, 9], True),  # two columns
-        ([0, 1, 2, 3, 4, 7], True),  # two rows
+        ("small", [0, 1, 2, 3, 4, 5], True),
+        ("small", [0, 1, 2, 4, 5], False),  # five
+        ("small", [0, 4, 1, 5, 8, 9], True),  # two columns
+        ("small", [0, 1, 2, 3, 4, 7], True),  # two rows
+        ("wide", list(range(8)), False),  # one row
+        ("wide", list(range(0, 48, 8)), False),  # one column
     ],
 )
-def test_a_view_counts_with_six_corners_on_two_rows_and_two_columns(corners: list[int], counts: bool) -> None:
-    other = seen((0, 1), "small", corners)
-    found = gather([seen((0, 0), "small", ALL_SMALL), other], SHAPES, (0, 0))
-    assert ((0, 1) in found.nodes) is counts
-    assert found.corner_count == 12 + (len(corners) if counts else 0)
+def test_view_counts_with_six_corners_off_a_line(board: str, corners: list[int], counts: bool) -> None:
+    whole = ALL_SMALL if board == "small" else ALL_WIDE
+    result = gather([view((0, 0), board, whole), view((0, 1), board, corners)], SHAPES, (0, 0))
+    assert ((0, 1) in result.nodes) is counts
+    assert result.corner_count == len(whole) + (len(corners) if counts else 0)
 
 
-@pytest.mark.parametrize("line", [list(range(8)), list(range(0, 48, 8))], ids=["a row", "a column"])
-def test_corners_on_one_line_do_not_count(line: list[int]) -> None:
-    shapes = {"wide": (6, 8)}
-    everything = seen((0, 0), "wide", list(range(48)))
-    assert gather([everything, seen((0, 1), "wide", line)], shapes, (0, 0)).nodes == [(0, 0)]
-
-
-def test_nodes_count_that_a_chain_of_boards_connects_to_the_reference_which_comes_first() -> None:
+def test_nodes_are_connected_to_the_reference_by_boards() -> None:
     views = [
-        seen((2, 2), "small", ALL_SMALL, sweep=2),  # shares a board with no node that counts
-        seen((0, 0), "large", ALL_SMALL, sweep=1),
-        seen((0, 1), "large", ALL_SMALL, sweep=1),
-        seen((1, 1), "small", ALL_SMALL),
-        seen((0, 1), "small", ALL_SMALL),
+        view((2, 2), "small", ALL_SMALL, sweep=2),  # shares a board with no node that counts
+        view((0, 0), "large", ALL_SMALL, sweep=1),
+        view((0, 1), "large", ALL_SMALL, sweep=1),
+        view((1, 1), "small", ALL_SMALL),
+        view((0, 1), "small", ALL_SMALL),
     ]
-    found = gather(views, SHAPES, (1, 1))
-    assert found.nodes == [(1, 1), (0, 0), (0, 1)]
-    assert found.targets == [Target("small", 0), Target("large", 1)]
-    assert found.target_of.tolist() == [0, 0, 1, 1]
-    assert found.node_of.tolist() == [0, 2, 1, 2]
-    assert found.view_name(2) == "node (0, 0), board 'large', sweep 1"
+    result = gather(views, SHAPES, (1, 1))
+    assert result.nodes == [(1, 1), (0, 0), (0, 1)]
+    assert result.targets == [Target("small", 0), Target("large", 1)]
+    assert result.target_of.tolist() == [0, 0, 1, 1]
+    assert result.node_of.tolist() == [0, 2, 1, 2]
+    assert result.view_name(2) == "node (0, 0), board 'large', sweep 1"
     with pytest.raises(TooFewViews, match=r"node \(5, 5\)"):
         gather(views, SHAPES, (5, 5))
 
 
-def test_corners_lie_on_the_lattice_of_the_largest_board_with_weights_relative_to_the_median_sigma() -> None:
+def test_corners_have_lattice_places_and_relative_weights() -> None:
     views = [
-        seen((0, 0), "small", ALL_SMALL, sigma_px=0.1),
-        seen((0, 0), "large", [0, 1, 4, 5, 18, 19], sigma_px=0.4),
+        view((0, 0), "small", ALL_SMALL, sigma_px=0.1),
+        view((0, 0), "large", [0, 1, 4, 5, 18, 19], sigma_px=0.4),
     ]
-    found = gather(views, SHAPES, (0, 0))
-    assert found.pixels.shape == (2, 5, 4, 2)
-    large, small = found.weights
+    result = gather(views, SHAPES, (0, 0))
+    assert result.pixels.shape == (2, 5, 4, 2)
+    large, small = result.weights
     assert (small[:3] == 1.0).all()
     assert (small[3:] == -1.0).all()
     assert np.argwhere(large > 0).tolist() == [[0, 0], [0, 1], [1, 0], [1, 1], [4, 2], [4, 3]]
-    assert large[4, 3] == pytest.approx(0.25)
-    assert found.pixels[0, 4, 3].tolist() == [19.0, 19.0]
-    assert found.pixels[1, 2, 1].tolist() == [9.0, 9.0]
-    assert not found.pixels[1, 3:].any()
+    assert large[4, 3] == pytest.approx(0.25)  # relative to the median sigma
+    assert result.pixels[0, 4, 3].tolist() == [19.0, 19.0]
+    assert result.pixels[1, 2, 1].tolist() == [9.0, 9.0]
+    assert not result.pixels[1, 3:].any()
 
 
-def test_a_corner_that_the_board_does_not_have_is_refused() -> None:
+def test_corner_outside_the_board_is_refused() -> None:
     with pytest.raises(ValueError, match="board 'small' has no corner 12"):
-        gather([seen((0, 0), "small", [*ALL_SMALL, 12])], SHAPES, (0, 0))
+        gather([view((0, 0), "small", [*ALL_SMALL, 12])], SHAPES, (0, 0))

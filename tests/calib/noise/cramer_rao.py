@@ -18,19 +18,7 @@ from faintfield.calib.noise.likelihood.rounding import ROUNDING_DN2
 
 @dataclass(frozen=True)
 class Sensor:
-    """True parameters of a sensor.
-
-    Attributes
-    ----------
-    gain_dn_per_e, read_noise_e, dark_current_e_per_s : float
-        EMVA 1288's K, σ_d and μ_I.
-    offset_dn : float
-        Mean of a dark frame of zero exposure.
-    dsnu_e, dcnu_e_per_s : float
-        Standard deviations over the pixels of the offset and of the dark current.
-    jitter_dn : float
-        Standard deviation of the level of frames.
-    """
+    """True parameters of a sensor: EMVA 1288's K, σ_d and μ_I, offset, spreads over pixels, and jitter of frames."""
 
     gain_dn_per_e: float
     read_noise_e: float
@@ -50,27 +38,9 @@ def cramer_rao(
     flat_signals_dn: Sequence[float] = (),
     flat_frames: int = 2,
 ) -> dict[str, float]:
-    """Return the Cramér–Rao bound on the standard errors of gain, read noise and dark current.
+    """Return the Cramér–Rao bound on the standard errors of `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`.
 
-    Parameters
-    ----------
-    sensor : Sensor
-        True parameters.
-    exposures_s : sequence of float
-        Exposure times of the darks, at least two different.
-    frames : int
-        Number of darks at each exposure.
-    pixels : int
-        Number of pixels of a frame.
-    flat_signals_dn : sequence of float
-        Mean signal of each flat series above the offset.
-    flat_frames : int
-        Number of frames of each flat series.
-
-    Returns
-    -------
-    dict
-        Standard errors of `gain_dn_per_e`, `read_noise_e`, `dark_current_e_per_s`.
+    There are `frames` darks at each exposure, and `flat_frames` flats of each signal above the offset.
     """
     values = _parameters(sensor)
     moments = _expected_moments(sensor, np.asarray(exposures_s, float), frames, pixels, flat_signals_dn, flat_frames)

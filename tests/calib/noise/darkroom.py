@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from faintfield.calib.noise import Conditions, Series, measure_series
+
 Frames = list[tuple[str, NDArray[np.uint16]]]
 
 
@@ -69,6 +71,26 @@ def expose(chip: Chip, exposure_s: float, rng: np.random.Generator, photons: flo
 def darks(chip: Chip, exposures_s: Sequence[float], frames: int, rng: np.random.Generator) -> dict[float, Frames]:
     """Take `frames` darks of each exposure."""
     return {t: [(f"dark_{t:g}s_{k}", expose(chip, t, rng)) for k in range(frames)] for t in exposures_s}
+
+
+def dark_series(chip: Chip, exposures_s: Sequence[float], frames: int, rng: np.random.Generator) -> list[Series]:
+    """Measure `frames` darks of each exposure."""
+    return [measure_series(named, Conditions("dark", t)) for t, named in darks(chip, exposures_s, frames, rng).items()]
+
+
+def flat_series(
+    chip: Chip,
+    photons: float,
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    level: int = 0,
+    exposure_s: float = 0.1,
+    stated: bool = True,
+) -> Series:
+    """Measure flats of one light level, which is stated in photons per pixel or not."""
+    named = [(f"flat_{level}_{k}", expose(chip, exposure_s, rng, photons)) for k in range(frames)]
+    return measure_series(named, Conditions("flat", exposure_s, level, photons if stated else None))
 
 
 def specimen(seed: int, **changes: object) -> tuple[Chip, np.random.Generator]:

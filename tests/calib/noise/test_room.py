@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import DTypeLike, NDArray
 
-from faintfield.calib.noise import Conditions, Series, SeriesSums, calibrate
+from faintfield.calib.noise import Conditions, SeriesSums, calibrate
 from faintfield.calib.noise.room import maps_by, release
-from tests.calib.noise.darkroom import Chip, darks, expose, specimen
+from tests.calib.noise.darkroom import dark_series, flat_series, specimen
 
 SHAPE = (300, 400)
 
@@ -24,11 +24,11 @@ def in_files(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 def peak_bytes(frames: int) -> int:
     """Return the most memory that the sums of so many frames take, those frames not counted."""
     rng = np.random.default_rng(frames)
-    taken = [rng.normal(500, 5, SHAPE).astype(np.uint16) for _ in range(frames)]
+    stack = [rng.normal(500, 5, SHAPE).astype(np.uint16) for _ in range(frames)]
     tracemalloc.start()
     try:
         sums = SeriesSums(Conditions("dark", 1.0))
-        for index, frame in enumerate(taken):
+        for index, frame in enumerate(stack):
             sums.add(str(index), frame)
         sums.series()
         return tracemalloc.get_traced_memory()[1]
@@ -36,7 +36,7 @@ def peak_bytes(frames: int) -> int:
         tracemalloc.stop()
 
 
-def test_memory_does_not_grow_by_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_memory_does_not_grow_with_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of each frame only a sample of its pixels and the means of its rows and columns are kept."""
     monkeypatch.setattr("faintfield.calib.noise.series.statistics.SAMPLE_PX", 100)
     peak_bytes(2)  # what is compiled and imported at first is not counted
@@ -45,33 +45,17 @@ def test_memory_does_not_grow_by_frames(monkeypatch: pytest.MonkeyPatch) -> None
     assert many - few < 20 * 0.1 * of_frame
 
 
-def taken(chip: Chip, rng: np.random.Generator) -> list[Series]:
-    """Return darks of two exposures and flats of three levels."""
-
-    def reduced(frames: list[tuple[str, NDArray[Any]]], conditions: Conditions) -> Series:
-        sums = SeriesSums(conditions)
-        for name, frame in frames:
-            sums.add(name, frame)
-        return sums.series()
-
-    series = [reduced(frames, Conditions("dark", t)) for t, frames in darks(chip, (0.1, 20.0), 6, rng).items()]
-    for level, light in enumerate((2000.0, 8000.0, 20000.0)):
-        frames = [(f"flat_{level}_{k}", expose(chip, 0.1, rng, light)) for k in range(6)]
-        series.append(reduced(frames, Conditions("flat", 0.1, level, light)))
-    return series
-
-
 def test_maps_in_files_are_those_in_memory() -> None:
-    in_memory: list[Any] = []
-    in_file: list[Any] = []
-    for found, allocate in ((in_memory, np.empty), (in_file, in_files)):
+    results = []
+    for allocate in (np.empty, in_files):
         chip, rng = specimen(11, prnu=0.01, hot_fraction=0.003)
         with maps_by(allocate):
-            series = taken(chip, rng)
+            series = dark_series(chip, (0.1, 20.0), 6, rng)
+            series += [flat_series(chip, light, 6, rng, level=k) for k, light in enumerate((2000.0, 8000.0, 20000.0))]
             release()
-            result = calibrate(series, 65535.0)
+            results.append(calibrate(series, 65535.0))
             release()
-        found += [result.estimates, result.maps, series]
-    assert in_memory[0] == in_file[0]
+    in_memory, in_file = results
+    assert in_memory.estimates == in_file.estimates
     for name in ("offset_dn", "read_noise_e", "dark_current_e_per_s", "relative_response", "unusable"):
-        np.testing.assert_array_equal(getattr(in_memory[1], name), getattr(in_file[1], name))
+        np.testing.assert_array_equal(getattr(in_memory.maps, name), getattr(in_file.maps, name))
