@@ -1,5 +1,6 @@
 """Poses by transforms.json and by tables: axes checked by hand on one point, round trips, and what is refused."""
 
+import contextlib
 import json
 import math
 from collections.abc import Callable
@@ -9,10 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from faintfield.calib.lens import Lens
+from faintfield.pipelines.errors import InputError
+from faintfield.pipelines.formats.exchange.camera_to_world import rt_cam_world
 from faintfield.pipelines.formats.exchange.nerfstudio import read_transforms
+from faintfield.pipelines.formats.exchange.pose_table import PoseTable
 from faintfield.pipelines.formats.sets.elemental_set import load_set
 from tests.pipelines.conftest import Command, Edit
 from tests.pipelines.refusals import assert_refused
@@ -233,3 +240,20 @@ class TestPoseTables:
         path = self.table(tmp_path, text)
         assert_refused(faintfield("import", "poses", path, tmp_path / "set", "--fx-px", 20), "BadValue", words)
         assert not (tmp_path / "set").exists()
+
+    @settings(max_examples=30)
+    @given(text=st.text(alphabet='name,xyz;\t\n"#0123456789.-eqw_m', max_size=80))
+    def test_any_text_is_a_table_or_refused(self, text: str, tmp_path_factory: pytest.TempPathFactory) -> None:
+        path = self.table(tmp_path_factory.mktemp("table"), "name,x,y,z\n" + text)
+        with contextlib.suppress(InputError):
+            model = PoseTable(path).posed(Lens((16, 12), 20.0, 20.0, 7.5, 5.5), path.parent)
+            assert 1 <= len(model.images) <= len(text)
+            assert all(np.isfinite(image.rt_cam_world).all() for image in model.images)
+
+
+@pytest.mark.parametrize("element", [1e308, 2.1])
+def test_impossible_rotation_is_refused_before_overflow(element: float) -> None:
+    turn = np.eye(3)
+    turn[1, 2] = element
+    with pytest.raises(ValueError, match="not finite, or has columns"):
+        rt_cam_world(turn, np.zeros(3))
