@@ -137,13 +137,13 @@ class ArraySweeps:
         if self._geometry.valid.size:
             counts = counts * self._geometry.valid.reshape(-1, counts.size)[view]
         return [
-            sparse.csr_array(sparse.diags_array(counts * through) @ one)
-            for one, through in zip(bilinear, self._transmission(bilinear), strict=True)
+            sparse.csr_array(sparse.diags_array(counts * through) @ matrix)
+            for matrix, through in zip(bilinear, self._transmission(bilinear), strict=True)
         ]
 
     def _transmission(self, bilinear: list[sparse.csr_array]) -> list[Image]:
         """Return what nearer planes leave of each plane's light, for each pixel."""
-        through: list[Image] = [np.ones(one.shape[0]) for one in bilinear]
+        through: list[Image] = [np.ones(matrix.shape[0]) for matrix in bilinear]
         if not self._hiding.opacities.size:
             return through
         alphas = np.split(self._hiding.opacities, self._geometry.layout[1:, 0])
@@ -265,8 +265,8 @@ def _check_scene(
         np.testing.assert_array_equal(array, before, "what a sweep reads is left as it is")
 
 
-def _close(found: Image, wanted: Image, tolerance: float) -> None:
-    np.testing.assert_allclose(found.reshape(-1), wanted.reshape(-1), rtol=tolerance, atol=tolerance * wanted.max())
+def _close(actual: Image, desired: Image, tolerance: float) -> None:
+    np.testing.assert_allclose(actual.reshape(-1), desired.reshape(-1), rtol=tolerance, atol=tolerance * desired.max())
 
 
 def _own_reach(geometry: kernels.SceneGeometry) -> kernels.SceneGeometry:

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""Which part of a surface each detector pixel of a view meets: the surface drawn into the view, with a depth buffer."""
+"""The part of a surface that each detector pixel of a view meets: the surface drawn into the view by a depth buffer."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -31,7 +31,7 @@ _NEAREST = 1e-6
 
 
 class Relief(NamedTuple):
-    """How much nearer than a depth each pixel of each view meets a surface.
+    """Inverse depth, relative to an origin, at which each pixel of each view meets a surface.
 
     Attributes
     ----------

@@ -192,7 +192,7 @@ class SceneOperator:
 
     @cached_property
     def _binary_response(self) -> bool:
-        """Whether each pixel's response is 1 or 0: then Hᵀ H 1 = Hᵀ 1."""
+        """Return whether each pixel's response is 1 or 0: then Hᵀ H 1 = Hᵀ 1."""
         response = self.response()
         return bool(((response == 0) | (response == 1)).all())
 

@@ -104,6 +104,18 @@ def simulated_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sweep of five planes, to be read only."""
+
+    def make(folder: Path) -> None:
+        words = ("--out", folder / "out", "--sweep-mm", "500:700:5", "--method", "backprojection")
+        with drawing_nothing():
+            assert run([str(word) for word in ("reconstruct", simulated_scene, *words)]) == 0
+
+    return made_once(tmp_path_factory, "sweep-for-export", make) / "out"
+
+
+@pytest.fixture(scope="session")
 def recorded_session(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A captured session without results, bright enough for its views to agree; to be read only."""
     text = rig_toml(camera="unlit_photons_per_s = 20000.0")

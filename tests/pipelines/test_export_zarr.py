@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import tifffile
 
-from faintfield.pipelines.cli import run
-from tests.pipelines.conftest import Command, drawing_nothing, made_once
+from tests.pipelines.conftest import Command
 from tests.pipelines.refusals import assert_refused
 
 zarr = pytest.importorskip("zarr")
@@ -34,18 +33,6 @@ def _scales(multiscale: Any) -> list[tuple[list[float], list[float]]]:
 def _planes(out: Path) -> list[dict[str, Any]]:
     planes: list[dict[str, Any]] = json.loads((out / "reconstruction.json").read_text())["planes"]
     return planes
-
-
-@pytest.fixture(scope="module")
-def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of five planes, to be read only."""
-
-    def make(folder: Path) -> None:
-        words = ("--out", folder / "out", "--sweep-mm", "500:700:5", "--method", "backprojection")
-        with drawing_nothing():
-            assert run([str(word) for word in ("reconstruct", simulated_scene, *words)]) == 0
-
-    return made_once(tmp_path_factory, "sweep-for-export", make) / "out"
 
 
 def test_sweep_is_in_mm_and_milliradians(sweep: Path, tmp_path: Path, done: Command) -> None:

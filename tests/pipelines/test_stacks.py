@@ -11,8 +11,7 @@ import pytest
 import tifffile
 from numpy.typing import NDArray
 
-from faintfield.pipelines.cli import run
-from tests.pipelines.conftest import Command, drawing_nothing, made_once
+from tests.pipelines.conftest import Command
 
 
 def _calibration(path: Path) -> tuple[dict[str, Any], float, NDArray[Any]]:
@@ -25,18 +24,6 @@ def _calibration(path: Path) -> tuple[dict[str, Any], float, NDArray[Any]]:
         assert page.tags["YResolution"].value == (count, over)
         assert page.tags["ResolutionUnit"].value == 1  # none: the description names the unit
         return {**file.imagej_metadata, "axes": file.series[0].axes}, over / count, file.asarray()
-
-
-@pytest.fixture(scope="module")
-def sweep(simulated_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A sweep of five planes, to be read only."""
-
-    def make(folder: Path) -> None:
-        words = ("--out", folder / "out", "--sweep-mm", "500:700:5", "--method", "backprojection")
-        with drawing_nothing():
-            assert run([str(word) for word in ("reconstruct", simulated_scene, *words)]) == 0
-
-    return made_once(tmp_path_factory, "sweep-for-export", make) / "out"
 
 
 def test_sweep_is_imagej_stack_of_angles(sweep: Path) -> None:
