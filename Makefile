@@ -10,6 +10,8 @@ SAMPLE ?= 300
 MODULES ?= recon calib rig/session rig/capture rig/stages
 
 SHELL := bash
+# Without stored byte code, each command that a test starts compiles all sources again.
+unexport PYTHONDONTWRITEBYTECODE
 TIMEFORMAT = %R s elapsed, %U s + %S s of CPU (budget: 180 s, 330 s in all; CONTRIBUTING.md)
 
 .PHONY: demo test deep lint bench mutants results lock clean help
