@@ -1,4 +1,4 @@
-"""The network in plain numpy: the numbers that tests/pipelines/test_learned_prior.py compares OpenCV's with."""
+"""The network in plain numpy: reference numbers for the test of the learned prior."""
 
 import argparse
 from pathlib import Path

@@ -173,7 +173,7 @@ def test_impossible_numbers_are_refused(
     assert names_in(tmp_path) == ["src"]
 
 
-STORED = Path(__file__).parent / "colmap"
+STORED = Path(__file__).parents[1] / "colmap"
 
 
 def seen_by(model: ColmapModel, points: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

@@ -24,8 +24,8 @@ from faintfield.pipelines.formats.sets.stated import plane_stem, rounded_depth
 from faintfield.pipelines.formats.units import DepthUnit, LightUnit, StatedUnits, Units, json_of, record_of
 from faintfield.pipelines.pages.napari_layers import show_planes
 from tests.pipelines.conftest import SMALL, Command
+from tests.pipelines.formats.results.test_golden import KINDS
 from tests.pipelines.forms import GOLDEN
-from tests.pipelines.test_golden import KINDS
 
 BRIGHT = ("--snr", 60, "--position-error-mm", 0, "--rotation-error-mrad", 0, "--objects", "surfaces")
 

@@ -15,9 +15,9 @@ from faintfield.pipelines.formats.frames import read_frame
 from faintfield.pipelines.formats.image_files import write_frame
 from faintfield.pipelines.reconstruction import surface, surface_files
 from tests.pipelines.conftest import Command
+from tests.pipelines.formats.results.test_golden import GOLDEN
 from tests.pipelines.forms import form_of_result, read_record
 from tests.pipelines.surfaces import FOUND_CONFIDENCE, FOUND_MM, Searches
-from tests.pipelines.test_golden import GOLDEN
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 

@@ -12,7 +12,7 @@ import tifffile
 
 from faintfield.rig.simulation.sensor import SimulatedSensor
 from tests.pipelines.conftest import Command
-from tests.pipelines.test_noise_set import FITTED
+from tests.pipelines.formats.sets.test_noise_set import FITTED
 
 type Predict = Callable[..., dict[str, Any]]
 
