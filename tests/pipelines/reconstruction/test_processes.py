@@ -133,7 +133,8 @@ def test_compiling_is_announced_once_for_all_processes(monkeypatch: pytest.Monke
 
 def test_processes_end_with_command_that_is_killed(tmp_path: Path) -> None:
     script = (
-        "from functools import partial; from pathlib import Path; from tests.pipelines.reconstruction import test_processes as t\n"
+        "from functools import partial; from pathlib import Path\n"
+        "from tests.pipelines.reconstruction import test_processes as t\n"
         f"if __name__ == '__main__': list(t.in_processes(2, partial(t._sleep_for_good, Path({str(tmp_path)!r})), 'ab'))"
     )
     command = subprocess.Popen([sys.executable, "-c", script])
