@@ -44,7 +44,9 @@ def visible(text: str) -> str:
     >>> visible("name\n\x1b[2Kdone")
     'name\\n\\x1b[2Kdone'
     """
-    return "".join(it if it.isprintable() else it.encode("unicode_escape").decode() for it in text)
+    return "".join(
+        character if character.isprintable() else character.encode("unicode_escape").decode() for character in text
+    )
 
 
 def conceal(secret: str) -> None:

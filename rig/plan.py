@@ -133,7 +133,11 @@ class CaptureStep(Struct, frozen=True, forbid_unknown_fields=True):
     at: Literal["grid", "centre"] = "grid"
 
     def __post_init__(self) -> None:
-        if not self.exposure_s or not all(it > 0.0 for it in self.exposure_s) or self.frames_per_node < 1:
+        if (
+            not self.exposure_s
+            or not all(exposure_s > 0.0 for exposure_s in self.exposure_s)
+            or self.frames_per_node < 1
+        ):
             raise ValueError(f"a step needs exposure times above 0 s and at least one frame; got {self}")
         if max(self.exposure_s) > MAX_EXPOSURE_S:
             raise ValueError(f"exposure_s = {max(self.exposure_s):g}; an exposure lasts {MAX_EXPOSURE_S:g} s at most")

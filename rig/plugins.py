@@ -169,10 +169,10 @@ def checked_options[T](options: Mapping[str, Any], kind: type[T], place: str) ->
 def _entry_points(group: str, name: str) -> list[EntryPoint]:
     """Return the entry points `name` of a group; raises `UnknownPlugin` if there are none."""
     installed = entry_points(group=group)
-    found = [it for it in installed if it.name == name]
+    found = [plugin for plugin in installed if plugin.name == name]
     if not found:
         key, built_in = _BUILT_IN[group]
-        names = sorted({it.name for it in installed})
+        names = sorted({plugin.name for plugin in installed})
         near = difflib.get_close_matches(name, [*built_in, *names], n=1, cutoff=0.5)
         others = f"or of the plug-ins {', '.join(map(repr, names))}" if names else "no plug-in is installed"
         raise UnknownPlugin(
@@ -185,7 +185,7 @@ def _entry_points(group: str, name: str) -> list[EntryPoint]:
 def _load[T](group: str, name: str, kind: type[T]) -> T:
     """Return what the entry point `name` of a group holds, which must be a `kind`."""
     found, key = _entry_points(group, name), _BUILT_IN[group][0]
-    packages = sorted({_package(it) for it in found})
+    packages = sorted({_package(plugin) for plugin in found})
     if len(packages) > 1:
         raise UnknownPlugin(f"{key} = {name!r} is offered by {' and '.join(packages)}; uninstall all but one")
     try:

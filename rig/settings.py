@@ -228,7 +228,7 @@ class RigSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if not self.board and any(step.kind == "charuco" for step in self.step):
             raise ValueError("there is a charuco step but no [[board]]; describe the printed boards")
         nodes = self.grid.rows * self.grid.columns
-        check_frame_count(sum(it.frames_per_stop() * (nodes if it.at == "grid" else 1) for it in self.steps()))
+        check_frame_count(sum(step.frames_per_stop() * (nodes if step.at == "grid" else 1) for step in self.steps()))
 
     @property
     def mosaic(self) -> Mosaic | None:

@@ -107,8 +107,8 @@ def _compare(tables: Tables, chance: Tables, pooled: bool) -> Axes:
         for transposed, opposed in product((False, True), (False, True) if both else (False,))
     ]
     best = max(answers, key=lambda it: float(it.score.mean()))
-    others = [it for it in answers if it.transposed != best.transposed]
-    contrary = [it for it in answers if it.transposed == best.transposed and it.opposed != best.opposed]
+    others = [answer for answer in answers if answer.transposed != best.transposed]
+    contrary = [answer for answer in answers if answer.transposed == best.transposed and answer.opposed != best.opposed]
     by_chance = max(
         (_answer(chance, transposed, opposed, pooled) for transposed, opposed in product((False, True), repeat=2)),
         key=lambda it: float(it.score.mean()),

@@ -23,7 +23,7 @@ def block_disparities(table: Table, chance: Table, shifts_px: NDArray[np.floatin
     shifts_px : array (shift,)
         Disparities.
     """
-    rows, by_chance = (it.reshape(-1, it.shape[2]) for it in (table, chance))
+    rows, by_chance = (scores.reshape(-1, scores.shape[2]) for scores in (table, chance))
     by_chance = by_chance[np.isfinite(by_chance).all(axis=1)]
     found = np.full(len(rows), np.nan)
     if not len(by_chance):
@@ -56,7 +56,7 @@ def span_px(disparities_px: NDArray[np.float64]) -> tuple[float, float]:
 
 def pooled_span_px(table: Table, chance: Table, shifts_px: NDArray[np.floating]) -> tuple[float, float] | None:
     """Return least and largest disparity at which all blocks together agree beyond chance; None if there is none."""
-    usable, by_chance = (it[np.isfinite(it).all(axis=(1, 2))] for it in (table, chance))
+    usable, by_chance = (scores[np.isfinite(scores).all(axis=(1, 2))] for scores in (table, chance))
     level = usable.mean(axis=(0, 1))
     limit = float(by_chance.mean(axis=(0, 1)).max())
     above = np.flatnonzero(level > max(limit, 0.25 * float(level.max())))

@@ -105,7 +105,7 @@ def compare_neighbours(pictures: Mapping[Node, Picture], range_px: tuple[float, 
 
 def _steps_to_next(pictures: Mapping[Node, Picture], node: Node, number: int) -> int | None:
     """Return the steps along a number to the next view that is there, None if none is near."""
-    return next((it for it in range(1, _MOST_STEPS + 1) if neighbour(node, number, it) in pictures), None)
+    return next((steps for steps in range(1, _MOST_STEPS + 1) if neighbour(node, number, steps) in pictures), None)
 
 
 def compare_pair(
@@ -159,7 +159,7 @@ def _sub_pixel(response: NDArray[np.float32], peak: tuple[int, int], axis: int) 
     at = peak[0] if axis == 0 else peak[1]
     if not 0 < at < len(line) - 1:
         return float(at)
-    before, here, after = (float(it) for it in line[at - 1 : at + 2])
+    before, here, after = (float(score) for score in line[at - 1 : at + 2])
     bend = before - 2 * here + after
     return at + (0.5 * (before - after) / bend if bend < 0 else 0.0)
 

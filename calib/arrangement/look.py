@@ -129,7 +129,7 @@ def look(nodes: Sequence[Node], read: Callable[[int], Picture], given: Orientati
     blank = _nothing_seen(views, given or Orientation(), same, light)
     if len(numbers) < 2:
         return replace(blank, unseen="single")
-    if all(not np.ptp(it) for it in views.light.values()):
+    if all(not np.ptp(view) for view in views.light.values()):
         return replace(blank, unseen="even")
     if min(views.fine[numbers[0]].shape) < MIN_SIDE_PX:
         return replace(blank, unseen="small")

@@ -109,7 +109,7 @@ def _errors(
     }
     found = {}
     for axis, pair in sides.items():
-        if not all(it in pictures for it in pair):
+        if not all(node in pictures for node in pair):
             continue
         scale = distance * (1.0 if axis == 0 else 1.0 / ratio)
         both = []
@@ -128,7 +128,7 @@ def _disparities(pairs: Sequence[tuple[Errors, Errors]]) -> NDArray[np.intp]:
     total = sum(
         np.stack(
             [
-                np.minimum(*(cv2.blur(it, (_WINDOW_PX, _WINDOW_PX)) for it in layers))
+                np.minimum(*(cv2.blur(layer, (_WINDOW_PX, _WINDOW_PX)) for layer in layers))
                 for layers in zip(*pair, strict=True)
             ]
         )
@@ -178,11 +178,11 @@ def _values(
     reach = _REACH_PX
     offsets = np.arange(-2 * reach, 2 * reach + 1)
     left, right = index[rows, columns - reach], index[rows, columns + reach]
-    blurred = [_along_edges(it) for it in (before, after)]
+    blurred = [_along_edges(view) for view in (before, after)]
     place = rows[:, np.newaxis], columns[:, np.newaxis] + offsets
     # Errors (edge, offset) if all of the window had the left disparity, or all of it the right one
-    by_left = [it[left[:, np.newaxis], *place] for it in blurred]
-    by_right = [it[right[:, np.newaxis], *place] for it in blurred]
+    by_left = [view[left[:, np.newaxis], *place] for view in blurred]
+    by_right = [view[right[:, np.newaxis], *place] for view in blurred]
     split, gain = _split(np.minimum(*by_left), np.minimum(*by_right))
     sign = np.sign(shifts_px[right] - shifts_px[left])[:, np.newaxis]
     band_px = np.clip(np.abs(shifts_px[right] - shifts_px[left]), 1, _MAX_BAND_PX).round()[:, np.newaxis]

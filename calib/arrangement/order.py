@@ -75,9 +75,13 @@ def check_order(pictures: Mapping[Node, Picture], axes: Axes, largest_px: float)
     found = {0: _Exchanges(), 1: _Exchanges()}
     for node in spread(list(pictures), _VIEWS):
         _exchange(found, _View(pictures, node, axes, shifts_px), generator)
-    told = [(float(np.mean(it.worse)), repeats) for it in found.values() if (repeats := it.repeats()) > 0]
+    told = [
+        (float(np.mean(exchanges.worse)), repeats)
+        for exchanges in found.values()
+        if (repeats := exchanges.repeats()) > 0
+    ]
     if not told:
-        return Order("open" if max(it.free for it in found.values()) >= _LEAST else "few", 1.0)
+        return Order("open" if max(exchanges.free for exchanges in found.values()) >= _LEAST else "few", 1.0)
     fits = all(share > _FITS * repeats for share, repeats in told)
     return Order("fits" if fits else "denied", min(share for share, _ in told))
 
@@ -92,7 +96,7 @@ class _Exchanges:
     @property
     def free(self) -> int:
         """Number of scores that may differ."""
-        return sum(len(it) - 1 for it in self.scores)
+        return sum(len(line) - 1 for line in self.scores)
 
     def repeats(self) -> float:
         """Return the correlation of the scores of both halves of the blocks, 0 if it may be chance."""

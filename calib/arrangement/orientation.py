@@ -36,5 +36,5 @@ def counted(nodes: Sequence[Node]) -> list[Node]:
     """Return numbers counted from zero in their common steps: every second view is a grid of its own."""
     numbers = np.array(nodes, int)
     numbers = numbers - numbers.min(axis=0)
-    steps = [gcd(*(int(it) for it in numbers[:, axis])) or 1 for axis in (0, 1)]
+    steps = [gcd(*(int(number) for number in numbers[:, axis])) or 1 for axis in (0, 1)]
     return [(int(row), int(column)) for row, column in numbers // steps]

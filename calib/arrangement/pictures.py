@@ -85,8 +85,10 @@ def prepare(nodes: Sequence[Node], read: Callable[[int], Picture]) -> Views:
         scales = picture.shape[1] / small.shape[1], picture.shape[1] / tiny.shape[1]
         fine[node], coarse[node] = _without_brightness(small), _without_brightness(tiny)
         light[node] = small / np.float32(means[node] or 1.0)
-    texture = float(np.median([(it - cv2.GaussianBlur(it, (0, 0), _SHADES_PX)).std() for it in light.values()])) or 1.0
-    light = {node: it / np.float32(texture) for node, it in light.items()}
+    texture = (
+        float(np.median([(view - cv2.GaussianBlur(view, (0, 0), _SHADES_PX)).std() for view in light.values()])) or 1.0
+    )
+    light = {node: view / np.float32(texture) for node, view in light.items()}
     return Views(fine, coarse, light, *scales, means, float(np.median(contrasts)), float(np.median(noises)))
 
 

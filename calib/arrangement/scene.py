@@ -68,7 +68,7 @@ def find_roughly(views: Views) -> tuple[Axes | None, float]:
     assert axes is not None
     assert tables is not None
     assert chance is not None
-    table, by_chance = (combined(it, axes.transposed, axes.opposed, axes.ratio) for it in (tables, chance))
+    table, by_chance = (combined(scores, axes.transposed, axes.opposed, axes.ratio) for scores in (tables, chance))
     sure = sure_disparities(table, by_chance, shifts_px)
     if len(sure) >= MIN_BLOCKS:
         span = span_px(sure)
@@ -171,9 +171,11 @@ def measure(fine: FineMatch, orientation: Orientation, rough_ratio: float) -> Me
     """Return the views in an orientation, with their disparities measured there."""
     order = orientation.of(fine.views.nodes)
     pictures = dict(zip(order, fine.views.fine.values(), strict=True))
-    tables, chance = (_oriented_tables(it, orientation) for it in (fine.tables, fine.chance))
+    tables, chance = (_oriented_tables(scores, orientation) for scores in (fine.tables, fine.chance))
     ratio = pitch_ratio(tables, chance, rough_ratio, NO_SIGN_PX / fine.views.fine_scale)
-    table, by_chance = (combined(it, transposed=False, opposed=False, ratio=ratio[0]) for it in (tables, chance))
+    table, by_chance = (
+        combined(scores, transposed=False, opposed=False, ratio=ratio[0]) for scores in (tables, chance)
+    )
     if (1, 0) not in tables.along:  # a single column: disparities are those along y
         table, by_chance = tables.along[0, 1], chance.along[0, 1]
     sure = sure_disparities(table, by_chance, fine.shifts_px)

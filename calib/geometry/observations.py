@@ -91,7 +91,7 @@ class Observations:
     def view_name(self, view: int) -> str:
         """Return the name of a view in messages."""
         target = self.targets[self.target_of[view]]
-        sweep = f", sweep {target.sweep}" if len({one.sweep for one in self.targets}) > 1 else ""
+        sweep = f", sweep {target.sweep}" if len({node.sweep for node in self.targets}) > 1 else ""
         return f"node {self.nodes[self.node_of[view]]}, board '{target.board}'{sweep}"
 
 

@@ -64,8 +64,8 @@ def calibrate(series: Sequence[Series], saturation_dn: float = np.inf) -> NoiseC
         The likelihood has no maximum.
     """
     series, warmth = settle_temperature(series)
-    darks = [one for one in series if one.conditions.kind == "dark"]
-    flats = [one for one in series if one.conditions.kind == "flat"]
+    darks = [item for item in series if item.conditions.kind == "dark"]
+    flats = [item for item in series if item.conditions.kind == "flat"]
     check_series(darks, [])
     check_flat_levels(darks, flats)
     saturation = find_saturation(darks, flats, saturation_dn)
@@ -203,9 +203,9 @@ def _points(fitted: SeriesFit) -> tuple[TransferPoint, ...]:
         strict=True,
     )
     points = []
-    for one, mean, within, *model in rows:
-        degrees = max((one.frames - 1) * fitted.moments.freedom, 1.0)
-        measured = within / degrees if one.frames > 1 else np.nan
+    for flat, mean, within, *model in rows:
+        degrees = max((flat.frames - 1) * fitted.moments.freedom, 1.0)
+        measured = within / degrees if flat.frames > 1 else np.nan
         numbers = map(float, (mean, measured, measured * np.sqrt(2 / degrees), *model))
-        points.append(TransferPoint(one.conditions.kind, one.conditions.exposure_s, one.frames, *numbers))
+        points.append(TransferPoint(flat.conditions.kind, flat.conditions.exposure_s, flat.frames, *numbers))
     return tuple(points)

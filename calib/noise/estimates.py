@@ -185,7 +185,7 @@ def _in_dn(fitted: SeriesFit, quantile: float, levels_quantile: float) -> dict[s
 
 def _unit(fit: NoiseFit, name: str) -> NDArray[np.float64]:
     """Return the gradient of one parameter."""
-    return np.array([1.0 if it == name else 0.0 for it in fit.values])
+    return np.array([1.0 if parameter == name else 0.0 for parameter in fit.values])
 
 
 def _spreads(fitted: SeriesFit, gain: Estimate, quantile: float) -> dict[str, Estimate]:
@@ -210,8 +210,8 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
         unknown = Estimate(None, why="the likelihood of single values has no part for it; it needs Gaussian darks")
         return dict.fromkeys(("frame_jitter_dn", "row_noise_dn", "column_noise_dn"), unknown)
     rows, columns = darks[0].pattern_dn.shape
-    noise = np.array(dark_variances_dn2(fit.values, np.array([one.conditions.dark_time_s for one in darks])))
-    freedom = np.array([one.frames - 1.0 for one in darks])
+    noise = np.array(dark_variances_dn2(fit.values, np.array([dark.conditions.dark_time_s for dark in darks])))
+    freedom = np.array([dark.frames - 1.0 for dark in darks])
 
     def shared(variances: Sequence[float], along: int, across: int) -> Estimate:
         excess = float(np.average(np.array(variances) - noise / along, weights=freedom))
@@ -223,8 +223,8 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
     jitter_se = fit.standard_error("jitter_dn2") or chance
     return {
         "frame_jitter_dn": root(fit.values["jitter_dn2"], jitter_se, quantile),
-        "row_noise_dn": shared([one.row_noise_dn2 for one in darks], columns, rows),
-        "column_noise_dn": shared([one.column_noise_dn2 for one in darks], rows, columns),
+        "row_noise_dn": shared([dark.row_noise_dn2 for dark in darks], columns, rows),
+        "column_noise_dn": shared([dark.column_noise_dn2 for dark in darks], rows, columns),
     }
 
 
@@ -251,9 +251,9 @@ def _from_flats(fitted: SeriesFit, gain: Estimate, response: Response | None, qu
     if gain.value is not None:
         odd = {index for index, _ in fitted.moments.flats.light.odd}
         means_dn = fitted.moments.flats.mean_dn
-        even = [(one, mean) for j, (one, mean) in enumerate(zip(fitted.flats, means_dn, strict=True)) if j not in odd]
-        charges = [_light_e(fitted.fit, one, mean) for one, mean in even]
-        found = quantum_efficiency([one for one, _ in even], charges, fitted.fit.standard_error("log_gain"))
+        even = [(flat, mean) for j, (flat, mean) in enumerate(zip(fitted.flats, means_dn, strict=True)) if j not in odd]
+        charges = [_light_e(fitted.fit, flat, mean) for flat, mean in even]
+        found = quantum_efficiency([flat for flat, _ in even], charges, fitted.fit.standard_error("log_gain"))
         if found is not None:
             efficiency = interval(*found, quantile, positive=True)
     elif fitted.flats:

@@ -235,9 +235,9 @@ def collect_counts(darks: Sequence[Series], used: NDArray[np.bool_]) -> Counts:
 
 def _shared_noise_dn2(darks: Sequence[Series], gaussian: NoiseFit) -> float:
     """Return the variance of the noise that pixels of a frame, row or column share, in the quietest series."""
-    noise = dark_variances_dn2(gaussian.values, np.array([one.conditions.dark_time_s for one in darks]))
+    noise = dark_variances_dn2(gaussian.values, np.array([dark.conditions.dark_time_s for dark in darks]))
     variance, quietest = min(
-        (float(v), j) for j, (v, one) in enumerate(zip(noise, darks, strict=True)) if one.frames > 1
+        (float(v), j) for j, (v, dark) in enumerate(zip(noise, darks, strict=True)) if dark.frames > 1
     )
     dark = darks[quietest]
     rows, columns = dark.pattern_dn.shape

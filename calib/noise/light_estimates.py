@@ -37,14 +37,14 @@ def why_noise_denies(fitted: SeriesFit) -> str | None:
     if not fitted.flats:
         return None
     series = series_goodness(fitted.fit, fitted.moments, fitted.darks, fitted.flats)
-    for one in series:
+    for item in series:
         # Darks have the scatter of their pixels' means beside them, which pickup may set against their noise.
-        if one.noise_excess is None or one.noise_se is None or one.series.conditions.kind == "dark":
+        if item.noise_excess is None or item.noise_se is None or item.series.conditions.kind == "dark":
             continue
-        if abs(one.noise_excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * one.noise_se):
+        if abs(item.noise_excess) > max(_MAX_DEPARTURE, _MIN_SIGMAS * item.noise_se):
             return (
-                f"the noise of the {one.series.conditions} is {one.noise_excess:+.1%} off the model's in variance "
-                f"({abs(one.noise_excess) / one.noise_se:.0f} standard errors); record it again or leave it out"
+                f"the noise of the {item.series.conditions} is {item.noise_excess:+.1%} off the model's in variance "
+                f"({abs(item.noise_excess) / item.noise_se:.0f} standard errors); record it again or leave it out"
             )
     scatter = float(np.sqrt(fitted.moments.excess.variance2))
     if scatter > MAX_NOISE_ERROR:
@@ -150,8 +150,10 @@ def _capacity(fitted: SeriesFit, saturation: Saturation, gain: Estimate, efficie
 
 def _full_well(saturation: Saturation, efficiency: Estimate) -> Estimate:
     """Return the capacity from the photons of the noisiest series and its neighbours."""
-    flats = sorted((*saturation.kept, *(one for one, _ in saturation.left_out)), key=lambda one: one.levels_dn.mean())
-    means = [float(one.levels_dn.mean()) for one in flats]
+    flats = sorted(
+        (*saturation.kept, *(flat for flat, _ in saturation.left_out)), key=lambda flat: flat.levels_dn.mean()
+    )
+    means = [float(flat.levels_dn.mean()) for flat in flats]
     at = int(np.argmin(np.abs(np.array(means) - (saturation.level_dn or 0.0))))
     photons = [flats[k].conditions.photons for k in (at, max(at - 1, 0), min(at + 1, len(flats) - 1))]
     if efficiency.value is None or efficiency.se is None or not all(photons):

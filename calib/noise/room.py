@@ -40,5 +40,5 @@ def new_map(shape: tuple[int, ...], dtype: DTypeLike = np.float32) -> NDArray[An
 
 def release() -> None:
     """Take out of memory what the files of all maps hold; it is read again when it is needed."""
-    for one in list(_mapped):
-        one.madvise(mmap.MADV_DONTNEED)
+    for mapping in list(_mapped):
+        mapping.madvise(mmap.MADV_DONTNEED)

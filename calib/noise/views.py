@@ -231,7 +231,7 @@ def estimate_view_noise(
     NotIdentifiable
         Too few blocks, or blocks of too few brightnesses, show the noise.
     """
-    parts = [(one.mean_dn, one.variance_dn2, one.texture) for one in blocks] or [(np.zeros(0),) * 3]
+    parts = [(block.mean_dn, block.variance_dn2, block.texture) for block in blocks] or [(np.zeros(0),) * 3]
     joined = ViewBlocks(*map(np.concatenate, zip(*parts, strict=True)))
     groups = _groups(joined, flattest)
     if len(groups) < _MIN_POINTS:
@@ -252,7 +252,7 @@ def estimate_view_noise(
     found = _line(mean_dn, variance, counts, gain_dn, in_the_dark)
     generator = np.random.default_rng(1)
     drawn = [curve([generator.choice(group, len(group)) for group in groups]) for _ in range(_DRAWS)]
-    lines = np.array([_line(mean_dn, one, counts, gain_dn, in_the_dark) for one in drawn])
+    lines = np.array([_line(mean_dn, variances, counts, gain_dn, in_the_dark) for variances in drawn])
     gain, read = (_estimate(value, draws) for value, draws in zip(found, lines.T, strict=True))
     return ViewNoise(gain, read, mean_dn, variance, int(counts.sum()))
 

@@ -101,12 +101,14 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
     _check_alike(paths[0], records[0], paths[1], records[1])
     quantities = list(_quantities(*records))
     maps = list(_maps(paths[0], records[0], paths[1], records[1]))
-    count = sum(it.sigma is not None for it in quantities) + sum(it[1] is not None for it in maps)
+    count = sum(quantity.sigma is not None for quantity in quantities) + sum(
+        quantity[1] is not None for quantity in maps
+    )
     level = CHANCE / max(count, 1)
-    judged = [_judged(it, level) for it in quantities]
-    judged_maps = [_judged_map(it, probability, level) for it, probability in maps]
-    changed = [(it.plane, it.name) for it in judged if it.verdict == "changed"]
-    changed += [(it.plane, f"{it.name} map") for it in judged_maps if it.verdict == "changed"]
+    judged = [_judged(quantity, level) for quantity in quantities]
+    judged_maps = [_judged_map(change, probability, level) for change, probability in maps]
+    changed = [(row.plane, row.name) for row in judged if row.verdict == "changed"]
+    changed += [(row.plane, f"{row.name} map") for row in judged_maps if row.verdict == "changed"]
     return NoiseComparison(
         str(paths[0]),
         str(paths[1]),
@@ -123,13 +125,16 @@ def compare_noise(first: Path, second: Path) -> NoiseComparison:
 def _check_alike(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> None:
     """Refuse records of sensors of different sizes or colour filters."""
     if one.size_px != other.size_px:
-        sizes = [" x ".join(map(str, it.size_px)) + " px" if it.size_px else "of no stated size" for it in (one, other)]
+        sizes = [
+            " x ".join(map(str, record.size_px)) + " px" if record.size_px else "of no stated size"
+            for record in (one, other)
+        ]
         raise WrongSize(
             f"{second}: is {sizes[1]}, {first} is {sizes[0]}: they are not of one camera in one mode; name two "
             "measurements of the same"
         )
     if (one.mosaic or None) != (other.mosaic or None):
-        filters = ["/".join(it.mosaic) if it.mosaic else "none" for it in (one, other)]
+        filters = ["/".join(record.mosaic) if record.mosaic else "none" for record in (one, other)]
         raise BadValue(
             f"{second}: has the colour filters {filters[1]}, {first} has {filters[0]}: they are not of one camera; "
             "name two measurements of the same"
@@ -167,13 +172,15 @@ def _measured(quantities: Quantities) -> dict[str, Measured]:
     found = {name: getattr(quantities, name) for name in Quantities.__struct_fields__}
     found |= {name: getattr(fit, name) if fit else lacking for name in _OF_FIT}
     found |= {name: getattr(emva, name) if emva else lacking for name in _OF_EMVA}
-    return {name: it if isinstance(it, Measured) else Measured(it) for name, it in found.items()}
+    return {name: value if isinstance(value, Measured) else Measured(value) for name, value in found.items()}
 
 
 def _change(name: str, plane: str, first: Measured, second: Measured) -> Change:
     """Return one quantity of both."""
     whys = [
-        f"{which}: {it.why or 'no reason stated'}" for which, it in (("A", first), ("B", second)) if it.value is None
+        f"{which}: {quantity.why or 'no reason stated'}"
+        for which, quantity in (("A", first), ("B", second))
+        if quantity.value is None
     ]
     if first.value is None or second.value is None:
         if first.value is None and second.value is None and first.why == second.why:
@@ -208,7 +215,7 @@ def _limit_sigma(level: float) -> float:
 
 def _pixel_change(kind: str, one: NoiseRecord, other: NoiseRecord) -> PixelChange:
     """Return how the unusable pixels of a kind differ."""
-    first, second = (set(map(tuple, getattr(it, f"{kind}_pixels"))) for it in (one, other))
+    first, second = (set(map(tuple, getattr(record, f"{kind}_pixels"))) for record in (one, other))
     return PixelChange(kind, len(first - second), len(second - first), len(first & second))
 
 
@@ -221,16 +228,16 @@ def _maps(first: Path, one: NoiseRecord, second: Path, other: NoiseRecord) -> It
     maps = [
         read_maps(path.with_name(NOISE_MAPS), record, shape, names) for path, record in ((first, one), (second, other))
     ]
-    lacking = [which for which, it in zip("AB", maps, strict=True) if set(it) != set(names)]
+    lacking = [which for which, names_of_maps in zip("AB", maps, strict=True) if set(names_of_maps) != set(names)]
     if lacking:
         why = f"{' and '.join(lacking)}: no offset map with its errors lies beside {NOISE_FILE}"
         yield MapChange(name, 0, None, None, "not comparable", why=why), None
         return
     period = mosaic_period(one.mosaic or None)
     usable = ~(maps[0]["mask"].astype(bool) | maps[1]["mask"].astype(bool))
-    for plane, phase in [(_name(it), it.phase) for it in one.planes or []] or [("", (0, 0))]:
+    for plane, phase in [(_name(plane), plane.phase) for plane in one.planes or []] or [("", (0, 0))]:
         used = at_phase(usable, phase, period)
-        values = [_of(it[key], phase, period, used) for it in maps for key in names[:2]]
+        values = [_of(maps_of[key], phase, period, used) for maps_of in maps for key in names[:2]]
         if used.sum() < 2:
             yield MapChange(name, 0, None, None, "not comparable", plane, "no pixel is usable in both"), None
             continue
@@ -255,7 +262,7 @@ def _judged_map(change: MapChange, probability: float | None, level: float) -> M
 
 def _notes(one: NoiseRecord, other: NoiseRecord) -> Iterator[str]:
     """Yield what else differs between the measurements, which may be the reason for a change."""
-    warmth = [it.temperature_c.mean if it.temperature_c else None for it in (one, other)]
+    warmth = [record.temperature_c.mean if record.temperature_c else None for record in (one, other)]
     if None in warmth:
         yield "a temperature is not stated: dark current may have changed by 10 % per kelvin"
     elif warmth[0] != warmth[1]:

@@ -86,7 +86,10 @@ class EmvaMeasurement:
         """Return the part of noise.json."""
         return EmvaRecord(
             dark_noise_exposure_s=self.exposure_s,
-            **{name: Measured(it.value, it.se, it.ci95, it.why) for name, it in self.estimates.items()},
+            **{
+                name: Measured(estimate.value, estimate.se, estimate.ci95, estimate.why)
+                for name, estimate in self.estimates.items()
+            },
             dark_image=self.dark.record() if self.dark else None,
             bright_image=self.bright.record() if self.bright else None,
         )
@@ -96,7 +99,7 @@ def measure_emva(
     phase: MosaicPhase, calibration: NoiseCalibration, temperature_c: Mapping[str, float]
 ) -> EmvaMeasurement:
     """Return the quantities of EMVA 1288 of one phase; `temperature_c` is that of each frame by its name."""
-    darks = [one for one in phase.series if one.conditions.kind == "dark"]
+    darks = [item for item in phase.series if item.conditions.kind == "dark"]
     exposure_s = _exposure_s(calibration)
     dark, bright = _dark_image(darks, calibration, exposure_s), _bright_image(darks, calibration)
     inputs = gather_inputs(
@@ -119,13 +122,13 @@ def _charge_error(calibration: NoiseCalibration) -> float:
     se, kept = calibration.estimates["nonlinearity_per_dn"].se, calibration.saturation.kept
     if se is None or not kept:
         return 0.0
-    brightest = max(float(one.levels_dn.mean()) for one in kept) - (calibration.estimates["offset_dn"].value or 0.0)
+    brightest = max(float(flat.levels_dn.mean()) for flat in kept) - (calibration.estimates["offset_dn"].value or 0.0)
     return 0.5 * se * brightest
 
 
 def _exposure_s(calibration: NoiseCalibration) -> float:
     """Return the exposure of the flats if they share one, else 0, as EMVA 1288 extrapolates to."""
-    exposures = {one.conditions.exposure_s for one in calibration.saturation.kept}
+    exposures = {flat.conditions.exposure_s for flat in calibration.saturation.kept}
     return exposures.pop() if len(exposures) == 1 else 0.0
 
 
@@ -134,11 +137,11 @@ def _dark_image(
 ) -> MeanImage | None:
     """Return the mean of the darks of the most frames, of several those nearest to an exposure; or the nearest ones."""
     used = ~calibration.maps.unusable
-    several = [one for one in darks if one.frames > 1]
+    several = [dark for dark in darks if dark.frames > 1]
     if not several or not used.any():
         return None
-    most = 0 if nearest else max(one.frames for one in several)
-    enough = [one for one in several if one.frames >= most]
+    most = 0 if nearest else max(item.frames for item in several)
+    enough = [dark for dark in several if dark.frames >= most]
     dark = min(enough, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
     mean = map_of(dark.mean_of, used.shape, np.float64)
     offset = calibration.estimates["offset_dn"].value or 0.0
@@ -148,7 +151,7 @@ def _dark_image(
 def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanImage | None:
     """Return the mean of the flats nearest to half of saturation, over its mean; dark and vignetting are taken out."""
     used, offset = ~calibration.maps.unusable, calibration.estimates["offset_dn"].value or 0.0
-    several = [one for one in calibration.saturation.kept if one.frames > 1]
+    several = [flat for flat in calibration.saturation.kept if flat.frames > 1]
     if not several or not used.any():
         return None
     span = _end_dn(calibration) - offset
@@ -188,7 +191,7 @@ def _end_dn(calibration: NoiseCalibration) -> float:
     level = calibration.saturation.level_dn
     if level is not None:
         return level
-    brightest = max(float(one.levels_dn.mean()) for one in calibration.saturation.kept)
+    brightest = max(float(flat.levels_dn.mean()) for flat in calibration.saturation.kept)
     return calibration.saturation_dn if np.isfinite(calibration.saturation_dn) else brightest
 
 
@@ -213,7 +216,7 @@ def _prnu(bright: MeanImage | None, calibration: NoiseCalibration) -> dict[str, 
 
 def _doubling(darks: list[Series], temperature_c: Mapping[str, float]) -> Estimate:
     """Return over which temperature difference the dark current doubles."""
-    level = np.concatenate([one.levels_dn for one in darks])
-    exposure = np.concatenate([np.full(one.frames, one.conditions.exposure_s) for one in darks])
-    warmth = np.array([temperature_c.get(name, np.nan) for one in darks for name in one.names])
+    level = np.concatenate([dark.levels_dn for dark in darks])
+    exposure = np.concatenate([np.full(dark.frames, dark.conditions.exposure_s) for dark in darks])
+    warmth = np.array([temperature_c.get(name, np.nan) for dark in darks for name in dark.names])
     return dark_current_doubling(level, exposure, warmth)

@@ -18,8 +18,8 @@ def fit_record(calibration: NoiseCalibration) -> FitRecord:
     bends = None
     if response is not None:
         bends = ResponseRecord([float(bend) for bend in response.bends_per_dn], float(response.up_to_dn))
-    series = [_goodness(one) for one in calibration.goodness]
-    series += [_left_out(one, why) for one, why in saturation.left_out]
+    series = [_goodness(goodness) for goodness in calibration.goodness]
+    series += [_left_out(item, why) for item, why in saturation.left_out]
     names = ("saturation_e", "linearity_error", "noise_error", "drift_dn", "light_error", "lamp_flicker")
     return FitRecord(
         saturation=SaturationRecord(saturation.limit, saturation.level_dn, saturation.interval_dn),

@@ -79,7 +79,7 @@ def _live_order(
     depths = [*(depth_mm or []), *([] if sweep_mm is None else swept("--live-sweep-mm", sweep_mm, "400:900:16"))]
     noise, geometry, fx_px = known
     if not depths:
-        if any(it is not None for it in known):
+        if any(value is not None for value in known):
             raise WrongUsage("--noise, --geometry and --fx-px are of live planes; give --live-depth-mm, too")
         return None
     if min(depths) <= 0:

@@ -137,7 +137,7 @@ def _inform_of_comparison(found: "NoiseComparison") -> None:
 
     inform(f"A: {found.first}")
     inform(f"B: {found.second}")
-    names = [f"{it.plane}: {it.name}" if it.plane else it.name for it in found.quantities]
+    names = [f"{quantity.plane}: {quantity.name}" if quantity.plane else quantity.name for quantity in found.quantities]
     wide = max(map(len, names))
     inform(f"{'':{wide}}  {'A':>12} {'B':>12} {'B - A':>12} {'in sigma':>9}  verdict")
     for name, change in zip(names, found.quantities, strict=True):
@@ -146,8 +146,10 @@ def _inform_of_comparison(found: "NoiseComparison") -> None:
         )
         sigma = "-" if change.sigma is None else f"{change.sigma:+.1f}"
         inform(f"{name:{wide}}  {numbers} {sigma:>9}  {change.verdict}{f': {change.why}' if change.why else ''}")
-    for it in found.pixels:
-        inform(f"{it.kind} pixels: {it.both} in both, {it.only_first} in A only, {it.only_second} in B only")
+    for count in found.pixels:
+        inform(
+            f"{count.kind} pixels: {count.both} in both, {count.only_first} in A only, {count.only_second} in B only"
+        )
     for difference in found.maps:
         _inform_of_map(difference)
     for note in found.notes:

@@ -111,7 +111,7 @@ def plan(
     stated = StatedNoise(read_noise_e, dark_current_e_per_s, quantum_efficiency)
     sensor = known_sensor(settings, rig, noise, stated)
     lens = known_lens(settings, rig, sensor, geometry, fx_px)
-    exposures_s = [1e-3 * it for it in exposures_ms or []]
+    exposures_s = [1e-3 * exposure_ms for exposure_ms in exposures_ms or []]
     exposure_s, view = scene_view(settings, exposures_s)
     frame_exposure_s = None if frame_exposure_ms is None else 1e-3 * frame_exposure_ms
     given = GivenLight(light_e, light_e_per_s, flat, test_frame, frame_exposure_s, region_px)

@@ -165,7 +165,7 @@ def conform(connection: Connection = Connection()) -> list[Check]:
         for check in check_conformance(stage):
             inform(f"tried: {check.name}")
             mark = "[green]passed[/]" if check.passed else "[bold red]FAILED[/]"
-            table.add_row(mark, *(Text(visible(it)) for it in (check.name, check.measured, check.limit)))
+            table.add_row(mark, *(Text(visible(text)) for text in (check.name, check.measured, check.limit)))
             checks.append(check)
     console.print(table)
     failed = [check for check in checks if not check.passed]

@@ -101,7 +101,10 @@ def count_pages(file: BufferedReader) -> int:
             except IndexError:
                 break
             if (page.shape, page.dtype) != (first.shape, first.dtype):
-                if any((it.shape, it.dtype) == (first.shape, first.dtype) for it in tiff.pages[count + 1 : _MAX_PAGES]):
+                if any(
+                    (page.shape, page.dtype) == (first.shape, first.dtype)
+                    for page in tiff.pages[count + 1 : _MAX_PAGES]
+                ):
                     raise ValueError(f"picture {count + 1} has another size or type than those around it")
                 break
             count += 1

@@ -71,7 +71,9 @@ def encoded_film(frames: Sequence[Picture], frame_ms: int) -> bytes | None:
     if not hasattr(cv2, "imencodeanimation"):
         return None
     film = cv2.Animation(0)
-    film.frames = [cv2.cvtColor(one, cv2.COLOR_GRAY2BGR if one.ndim == 2 else cv2.COLOR_RGB2BGR) for one in frames]
+    film.frames = [
+        cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR if frame.ndim == 2 else cv2.COLOR_RGB2BGR) for frame in frames
+    ]
     film.durations = [frame_ms] * len(frames)
     try:
         done, content = cv2.imencodeanimation(".webp", film, [cv2.IMWRITE_WEBP_QUALITY, _FILM_QUALITY])

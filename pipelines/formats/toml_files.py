@@ -144,7 +144,9 @@ def _better_key(kind: type, place: str, key: str) -> str:
 
 def _better_value(kind: type, place: str, value: str) -> str:
     """Return the choices at `place`, and the one most like `value`."""
-    choices = [repr(it) for table in _tables(kind).values() for it in table.get(_name(place), {}).get("enum", [])]
+    choices = [
+        repr(choice) for table in _tables(kind).values() for choice in table.get(_name(place), {}).get("enum", [])
+    ]
     near = difflib.get_close_matches(value, choices, n=1, cutoff=0.5)
     return f"choose from {', '.join(choices)}" + (f"; did you mean {near[0]}?" if near else "")
 

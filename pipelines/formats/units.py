@@ -147,7 +147,9 @@ def record_of[Record](content: bytes, kind: type[Record]) -> Record:
         stated = whole.get("units") if isinstance(whole, dict) else None
         names = _names(msgspec.convert(stated, StatedUnits)) if stated is not None else ({}, {})
         if any(names):
-            return msgspec.convert(_renamed(whole, *({new: old for old, new in one.items()} for one in names)), kind)
+            return msgspec.convert(
+                _renamed(whole, *({new: old for old, new in pairs.items()} for pairs in names)), kind
+            )
     return msgspec.json.decode(content, type=kind)
 
 

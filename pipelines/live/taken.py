@@ -34,16 +34,20 @@ class TakenFrames:
     def at(self, step: int, node: tuple[int, int]) -> list[TakenFrame]:
         """Return the frames of a step at a node, in the order of the plan."""
         planned = self._session.frames
-        found = [it for it in self._valid() if planned[it.frame].step == step and planned[it.frame].stop.node == node]
-        return [self._taken(it) for it in sorted(found, key=lambda it: it.frame)]
+        found = [
+            frame
+            for frame in self._valid()
+            if planned[frame.frame].step == step and planned[frame.frame].stop.node == node
+        ]
+        return [self._taken(frame) for frame in sorted(found, key=lambda frame: frame.frame)]
 
     def of_dark_scene(self) -> tuple[LiveFrame, ...]:
         """Return the frames of the dark scene, in the order of the plan."""
         planned = self._session.frames
-        found = [it for it in self._valid() if planned[it.frame].kind == "dark_scene"]
+        found = [frame for frame in self._valid() if planned[frame.frame].kind == "dark_scene"]
         return tuple(
-            LiveFrame(it.intent, it.file, planned[it.frame].stop.node, planned[it.frame].exposure_s)
-            for it in sorted(found, key=lambda it: it.frame)
+            LiveFrame(frame.intent, frame.file, planned[frame.frame].stop.node, planned[frame.frame].exposure_s)
+            for frame in sorted(found, key=lambda frame: frame.frame)
         )
 
     def _valid(self) -> list[CommittedFrame]:

@@ -69,7 +69,7 @@ class TerminalView:
                 inform(line)
         if status is not None:
             title = [status.title] if self._panel.unattended else []
-            for line in (*title, *(f"warning: {it}" for it in status.warnings)):
+            for line in (*title, *(f"warning: {warning}" for warning in status.warnings)):
                 if line not in self._printed:
                     self._printed.add(line)
                     inform(line)

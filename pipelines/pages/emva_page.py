@@ -110,7 +110,7 @@ class Part:
 
 def emva_page(name: str, record: NoiseRecord, measured: Sequence[EmvaMeasurement]) -> str:
     """Return the page about a sensor, with one part for each phase of its mosaic."""
-    parts = [Part(one.name, one, table_of(one), drawings(one)) for one in measured]
+    parts = [Part(plane.name, plane, table_of(plane), drawings(plane)) for plane in measured]
     return template("emva1288.html").render(name=name, record=record, parts=parts, standard=STANDARD, sub=symbols.html)
 
 

@@ -39,21 +39,23 @@ class Levels:
 
 def levels_of(measured: EmvaMeasurement, kind: str) -> Levels:
     """Return the levels of all series of a kind; the variance of one that has a single frame is NaN."""
-    series = sorted((one for one in measured.series if one.conditions.kind == kind), key=lambda it: it.levels_dn.mean())
+    series = sorted(
+        (item for item in measured.series if item.conditions.kind == kind), key=lambda item: item.levels_dn.mean()
+    )
     calibration, used = measured.calibration, measured.used
     offset = calibration.estimates["offset_dn"].value or 0.0
-    kept = {id(one) for one in calibration.saturation.kept}
+    kept = {id(flat) for flat in calibration.saturation.kept}
     pixels = int(used.sum())
     share = max(pixels - sum(used.shape) + 1, 1) / max(pixels, 1)
-    freedom = np.array([max((one.frames - 1) * pixels * share, 1) for one in series])
-    variance = np.array([_variance(one, used, share) for one in series])
+    freedom = np.array([max((item.frames - 1) * pixels * share, 1) for item in series])
+    variance = np.array([_variance(item, used, share) for item in series])
     return Levels(
-        signal_dn=np.array([one.levels_dn.mean() - offset for one in series]),
+        signal_dn=np.array([item.levels_dn.mean() - offset for item in series]),
         variance_dn2=variance,
         error_dn2=variance * np.sqrt(2 / freedom),
-        exposure_s=np.array([one.conditions.exposure_s for one in series]),
-        photons=np.array([one.conditions.photons or np.nan for one in series]),
-        kept=np.array([kind == "dark" or id(one) in kept for one in series], bool),
+        exposure_s=np.array([item.conditions.exposure_s for item in series]),
+        photons=np.array([item.conditions.photons or np.nan for item in series]),
+        kept=np.array([kind == "dark" or id(item) in kept for item in series], bool),
     )
 
 
@@ -126,8 +128,8 @@ def _light(measured: EmvaMeasurement, flats: Levels) -> tuple[NDArray[np.float64
     """Return the light of the flats with its name and unit, None if it is not known up to one factor."""
     if flats.photons.size and np.isfinite(flats.photons).all():
         return flats.photons, "μ_p", "photons/pixel"
-    series = [one for one in measured.series if one.conditions.kind == "flat"]
-    if series and len({one.conditions.level for one in series}) == 1 and (known_light(series).group >= 0).all():
+    series = [item for item in measured.series if item.conditions.kind == "flat"]
+    if series and len({item.conditions.level for item in series}) == 1 and (known_light(series).group >= 0).all():
         return flats.exposure_s, "exposure", "s"
     return None
 
@@ -203,7 +205,7 @@ def _snr(measured: EmvaMeasurement) -> Drawing:
 
     def draw(axes: "Axes") -> None:
         grid = np.geomspace(0.5, top, 300)
-        dsnu, prnu = (measured.estimates[f"{it}"].value for it in ("dsnu_total_e", "prnu_total"))
+        dsnu, prnu = (measured.estimates[f"{name}"].value for name in ("dsnu_total_e", "prnu_total"))
         axes.plot(grid * per_e, snr(grid, k, sigma_e), color=MODEL, label="linear model")
         if dsnu is not None and prnu is not None:
             total = snr(grid, k, sigma_e, dsnu, prnu)

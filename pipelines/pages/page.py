@@ -102,10 +102,10 @@ def svg(figure: "Figure") -> str:
 
 def ink(*axes: Any) -> None:
     """Give axes the colour `INK`, and remove the frame above and to the right."""
-    for one in axes:
-        one.tick_params(which="both", colors=INK)
-        one.spines[:].set_color(INK)
-        one.spines[["top", "right"]].set_visible(False)
-        one.yaxis.get_offset_text().set_color(INK)
-        for label in (one.xaxis.label, one.yaxis.label, one.title):
+    for axis in axes:
+        axis.tick_params(which="both", colors=INK)
+        axis.spines[:].set_color(INK)
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.yaxis.get_offset_text().set_color(INK)
+        for label in (axis.xaxis.label, axis.yaxis.label, axis.title):
             label.set_color(INK)

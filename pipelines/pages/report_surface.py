@@ -180,5 +180,5 @@ def _verdict(held_out: HeldOutRecord | None, predictions: Sequence[Prediction]) 
             if gain < _SIGNIFICANT * held_out.standard_error:
                 return "The surface predicts them no better than planes do: the views do not show its shapes."
         return "The surface predicts them best: its depths explain what other cameras see."
-    best = next(one.by for one in predictions if one.best)
+    best = next(prediction.by for prediction in predictions if prediction.best)
     return f"They are predicted better by {best}: take the depths with caution."

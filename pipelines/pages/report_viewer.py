@@ -139,7 +139,7 @@ def viewer_of(planes: Sequence[Plane], shown: PlaneSections, the_set: SetSection
         "places": [words[place] for place in places],
         "quantity": units.quantity,
         "length": units.length or "(unit of the poses)",
-        "binned": any(one["bins"] > 1 for one in numbers),
+        "binned": any(picture["bins"] > 1 for picture in numbers),
         "first": _first(planes, shown, places, pictures),
     }
 
@@ -159,7 +159,7 @@ def _first(
 
     def index_of(column: str) -> int | None:
         """Return the index of the picture of a column at the place of the best one."""
-        keys = [(one["kind"], one["title"], one["place"]) for one in pictures]
+        keys = [(picture["kind"], picture["title"], picture["place"]) for picture in pictures]
         key = ("light", titles[column], places.index(lead.place))
         return keys.index(key) if key in keys else None
 

@@ -69,7 +69,7 @@ class GivenLight:
         InputError
             The frame cannot be used, or shows no light.
         """
-        given = [it for it in (self.e, self.e_per_s, self.flat, self.test_frame) if it is not None]
+        given = [statement for statement in (self.e, self.e_per_s, self.flat, self.test_frame) if statement is not None]
         if len(given) != 1:
             raise WrongUsage(
                 f"{len(given)} lights are given, and one is wanted; give --light-e, --light-e-per-s, --flat or "

@@ -233,7 +233,7 @@ class Predictor:
             black = {"side_px": side_px, "difference_e": light_e, "blur_px": blur_px}
             return depth_sigma_mm(depth.value or 0.0, self.lens.f_px.value or 0.0, centres_mm, information, **black)
 
-        unknown = next((it for it in (depth, self.lens.f_px) if it.value is None), None)
+        unknown = next((quantity for quantity in (depth, self.lens.f_px) if quantity.value is None), None)
         if unknown is None and len(np.unique(centres_mm[response > 0], axis=0)) < 2:
             unknown = Measured(None, why="one view tells no depth")
         if unknown is None and contrast.value is not None and contrast.value > 1:
@@ -341,7 +341,7 @@ class Predictor:
             return unknown, unknown, None
         plan = msgspec.structs.replace(plan, settle_s=self.settings.settle.wait_s, readout_s=pace.readout_s)
         scene = msgspec.structs.replace(plan, steps=tuple(step for step in plan.steps if step.kind == "dark_scene"))
-        whole, part = (Measured(it.duration_s(pace.motion, pace.feed_mm_per_s)) for it in (plan, scene))
+        whole, part = (Measured(schedule.duration_s(pace.motion, pace.feed_mm_per_s)) for schedule in (plan, scene))
         return whole, part, _why_not(plan, pace)
 
 
@@ -377,10 +377,10 @@ def _finite(snr: Measured) -> Measured:
 
 def _with(compute: Callable[..., float], first: Measured, *others: Measured) -> Measured:
     """Return a number computed from others, with the interval that the first one's gives it; unknown if any is."""
-    for it in (first, *others):
-        if it.value is None:
-            return it
-    rest = [it.value for it in others]
+    for estimate in (first, *others):
+        if estimate.value is None:
+            return estimate
+    rest = [estimate.value for estimate in others]
     value = compute(first.value, *rest)
     if first.ci95 is None:
         return Measured(value)

@@ -90,7 +90,7 @@ def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
     storing = Lock()
 
     def room_for(frame: Frame) -> NDArray[Any] | None:
-        kept_bytes = sum(one.pixels_dn.nbytes for one in kept.values())
+        kept_bytes = sum(frame.pixels_dn.nbytes for frame in kept.values())
         folder.mkdir(parents=True, exist_ok=True)
         needed_bytes = kept_bytes + frame.pixels_dn.nbytes
         if len(kept) == _MOST_KEPT or needed_bytes > SHARE_OF_DISK * (kept_bytes + disk_usage(folder).free):

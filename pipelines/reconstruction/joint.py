@@ -95,7 +95,7 @@ def _with_occlusion(
     first = joint[0].record
     settings = replace(settings, penalty_weight=first.penalty_weight)
     try:
-        occluded = factory.of_scene(grids, [opacity(one.plane) for one in joint])
+        occluded = factory.of_scene(grids, [opacity(solution.plane) for solution in joint])
     except GeometryMismatch:
         unchanged = done or with_prior(objective, joint, settings, others=others)
         return _without_occlusion(unchanged, "a plane would be hidden from all views")
@@ -107,7 +107,7 @@ def _with_occlusion(
     if objectives[0] >= objectives[1]:
         unchanged = done or with_prior(objective, joint, settings, others=others)
         return _without_occlusion(unchanged, "it explains the images no better")
-    return [_of_opaque_part(one, first) for one in with_prior(behind, better, settings, others=others)]
+    return [_of_opaque_part(solution, first) for solution in with_prior(behind, better, settings, others=others)]
 
 
 def _of_opaque_part(one: Solution, first: SolveRecord) -> Solution:
@@ -129,5 +129,6 @@ def _without_occlusion(joint: list[Solution], reason: str) -> list[Solution]:
     """Return the planes unchanged, and inform the user."""
     inform(f"occlusion is left out: {reason}; the planes are those of joint")
     return [
-        replace(one, record=structs.replace(one.record, occlusion=False, occlusion_left_out=reason)) for one in joint
+        replace(solution, record=structs.replace(solution.record, occlusion=False, occlusion_left_out=reason))
+        for solution in joint
     ]

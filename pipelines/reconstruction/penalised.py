@@ -105,7 +105,7 @@ def with_sigma(
         likelihood and penalty by default.
     """
     operator, weight = objective.posed.operator, solutions[0].record.penalty_weight or 0.0
-    samples = operator.samples_of([one.plane for one in solutions])
+    samples = operator.samples_of([solution.plane for solution in solutions])
     generator = np.random.default_rng(_SEED)
     fits = local_fits(operator, objective.posed.fit(objective.level_e), samples)
     sigmas = []
@@ -116,7 +116,8 @@ def with_sigma(
             problem = LocalProblem(local, weight, objective.penalty)
             sigmas.append(error_of_answers(answers(index, problem), generator))
     return [
-        replace(one, sidecars=one.sidecars | {"sigma": sigma}) for one, sigma in zip(solutions, sigmas, strict=True)
+        replace(solution, sidecars=solution.sidecars | {"sigma": sigma})
+        for solution, sigma in zip(solutions, sigmas, strict=True)
     ]
 
 

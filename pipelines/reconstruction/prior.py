@@ -38,15 +38,15 @@ def with_prior(
     if settings.prior == "tv":
         found, answers = list(solutions), None
     elif len(operator.seeing_views) < MIN_VIEWS:
-        found, answers = [_without(one, "too few views to hold some out") for one in solutions], None
+        found, answers = [_without(solution, "too few views to hold some out") for solution in solutions], None
     else:
-        samples = operator.samples_of([one.plane for one in solutions])
+        samples = operator.samples_of([solution.plane for solution in solutions])
         evidences = evidence_of_planes(operator, objective.posed.images, samples, others=others)
         why_not = _contradiction(objective, samples, evidences)
         made = None if why_not else _about_proposals(objective, solutions, evidences, settings, others=others)
         if made is None:
             why_not = why_not or "total variation predicts held-out views best"
-            found, answers = [_without(one, why_not) for one in solutions], None
+            found, answers = [_without(solution, why_not) for solution in solutions], None
         else:
             found, answers = made
     return with_sigma(objective, found, answers) if settings.uncertainty else found
@@ -56,7 +56,7 @@ def _contradiction(objective: Objective, samples: Image, evidences: Sequence[Evi
     """Return how the views contradict planes by more than noise, None if they do not."""
     operator, images = objective.posed.operator, objective.posed.images
     regions = [regions_of(*of_plane) for of_plane in zip(operator.planes_of(samples), evidences, strict=True)]
-    found = next((one for one in misfits(operator, images, samples, regions) if one.contradicts), None)
+    found = next((misfit for misfit in misfits(operator, images, samples, regions) if misfit.contradicts), None)
     if found is None:
         return None
     return (
@@ -77,13 +77,13 @@ def _about_proposals(
     """Return the planes about their proposals, and how each answers to noise; None if nothing is proposed."""
     operator, first = objective.posed.operator, solutions[0].record
     weight = first.penalty_weight or 0.0
-    samples = operator.samples_of([one.plane for one in solutions])
+    samples = operator.samples_of([solution.plane for solution in solutions])
     no_network = _why_no_network(evidences) if settings.prior != "patches" else None
     candidates = _candidates(settings.prior if no_network is None else "patches")
     proposals = propose(objective.posed, samples, evidences, weight, candidates, others=others)
-    if all(weights.get("tv") == 1 for one in proposals for weights in one.mixture.values()):
+    if all(weights.get("tv") == 1 for proposal in proposals for weights in proposal.mixture.values()):
         return None
-    proposed = operator.samples_of([one.picture for one in proposals])
+    proposed = operator.samples_of([proposal.picture for proposal in proposals])
     dual = replace(objective.posed.dual(), proposal=proposed)
     record, found = certified(objective, np.maximum(proposed, 1e-3 * objective.start), weight, dual, settings)
     record = structs.replace(
@@ -98,7 +98,8 @@ def _about_proposals(
         return ProposalAnswers(problem, proposals[index], solutions[index].plane)
 
     return [
-        _solution(plane, record, one.sidecars, proposal, settings, no_network) for plane, one, proposal in planes
+        _solution(plane, record, solution.sidecars, proposal, settings, no_network)
+        for plane, solution, proposal in planes
     ], answers
 
 

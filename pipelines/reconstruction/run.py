@@ -182,22 +182,30 @@ def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) 
 
 def _warn(loaded: ElementalSet, records: list[PlaneRecord]) -> None:
     """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
-    certificates = [one.certificate for one in records if one.certificate and one.certificate.oscillates is not UNSET]
-    swings = [one.relative_change for one in certificates if one.oscillates and one.relative_change is not UNSET]
+    certificates = [
+        record.certificate for record in records if record.certificate and record.certificate.oscillates is not UNSET
+    ]
+    swings = [
+        certificate.relative_change
+        for certificate in certificates
+        if certificate.oscillates and certificate.relative_change is not UNSET
+    ]
     if swings:
         inform(
             f"the one-step-late iteration does not settle on {len(swings)} of {len(certificates)} planes: it swings by "
             f"up to {max(swings):.1%} per pass (see reconstruction.json). A few percent hide little; a smaller "
             "--penalty-weight calms it, and leaves more noise."
         )
-    certificates = [one.certificate for one in records if one.certificate and one.certificate.is_bound]
-    missed = [one.value for one in certificates if not one.reached and one.value is not UNSET]
+    certificates = [record.certificate for record in records if record.certificate and record.certificate.is_bound]
+    missed = [
+        certificate.value for certificate in certificates if not certificate.reached and certificate.value is not UNSET
+    ]
     if missed:
         inform(
             f"pmlem stopped before its certificate on {len(missed)} of {len(certificates)} planes: up to "
             f"{max(missed):.1%} from the optimum instead of {certificates[0].tolerance:.0%}; allow more --passes"
         )
-    without = [one.prior.left_out for one in records if one.prior and one.prior.left_out]
+    without = [record.prior.left_out for record in records if record.prior and record.prior.left_out]
     if without:
         inform(
             f"the prior is left out of {len(without)} of {len(records)} planes, total variation's stay: {without[0]}"

@@ -242,17 +242,17 @@ def _maps(
     sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
     slope = np.abs(in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
     light = light_per_e(loaded)
-    proposed = all("proposal" in one.sidecars for one in lights)
+    proposed = all("proposal" in solution.sidecars for solution in lights)
     return SurfaceMaps(
         grid=grid,
-        picture=_colours([light * one.plane for one in lights]),
-        picture_sigma=_colours([light * one.sidecars["sigma"] for one in lights]),
-        picture_proposal=_colours([light * one.sidecars["proposal"] for one in lights]) if proposed else None,
-        picture_moved=_colours([one.sidecars["moved"] for one in lights]) if proposed else None,
+        picture=_colours([light * solution.plane for solution in lights]),
+        picture_sigma=_colours([light * solution.sidecars["sigma"] for solution in lights]),
+        picture_proposal=_colours([light * solution.sidecars["proposal"] for solution in lights]) if proposed else None,
+        picture_moved=_colours([solution.sidecars["moved"] for solution in lights]) if proposed else None,
         depth=np.where(known, depth, np.nan),
         depth_sigma=np.where(known, sigma * slope, np.nan),
         depth_confidence=confidence,
-        visibility=np.mean([one.sidecars["visibility"] for one in lights], axis=0),
+        visibility=np.mean([solution.sidecars["visibility"] for solution in lights], axis=0),
         inverse_depth=inverse_depth,
         aperture_mm=aperture_of(loaded.poses_rt_cam_ref),
     )

@@ -61,17 +61,17 @@ def hiding_of(occluders: Occluders | None, grids: Sequence[PlaneGrid], dtype: np
     if occluders is None:
         return Hiding(np.zeros(0, dtype), np.zeros(0, np.intp), np.zeros(0))
     opacities, depths_mm = occluders
-    if [one.shape for one in opacities] != [grid.shape for grid in grids] or len(depths_mm) != len(grids):
+    if [opacity.shape for opacity in opacities] != [grid.shape for grid in grids] or len(depths_mm) != len(grids):
         raise GeometryMismatch(
-            f"opacities of shapes {[one.shape for one in opacities]} and {len(depths_mm)} depths do not fit "
+            f"opacities of shapes {[opacity.shape for opacity in opacities]} and {len(depths_mm)} depths do not fit "
             f"planes of {[grid.shape for grid in grids]} samples; give one of each for each plane"
         )
-    if not all(((one >= 0) & np.isfinite(one)).all() for one in opacities):
+    if not all(((opacity >= 0) & np.isfinite(opacity)).all() for opacity in opacities):
         raise GeometryMismatch("an opacity is negative or not a finite number; give numbers from 0 to 1")
-    samples = np.concatenate([np.ascontiguousarray(one, dtype).reshape(-1) for one in opacities])
+    samples = np.concatenate([np.ascontiguousarray(opacity, dtype).reshape(-1) for opacity in opacities])
     # The farthest plane hides nothing
     hides = [depth < max(depths_mm) for depth in depths_mm]
-    columns = [_opaque_columns(one * nearer) for one, nearer in zip(opacities, hides, strict=True)]
+    columns = [_opaque_columns(opacity * nearer) for opacity, nearer in zip(opacities, hides, strict=True)]
     return Hiding(samples, np.concatenate(columns).reshape(-1), np.array(depths_mm, np.float64))
 
 

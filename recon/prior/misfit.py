@@ -71,7 +71,9 @@ def _misfit(squares: Image, variances: Image, spreads: Image, regions: dict[str,
     """Return the misfit of one plane from back-projected squares, variances, and variances of squares of its views."""
 
     def ratio(share: Image) -> tuple[float, float]:
-        total, expected, spread = (float(np.sum(it * share, dtype=np.float64)) for it in (squares, variances, spreads))
+        total, expected, spread = (
+            float(np.sum(terms * share, dtype=np.float64)) for terms in (squares, variances, spreads)
+        )
         return (total / expected, np.sqrt(max(spread, 0.0)) / expected) if expected > 0 else (1.0, 0.0)
 
     (detail, of_detail), (smooth, of_smooth) = ratio(regions["light, detail"]), ratio(regions["light, smooth"])

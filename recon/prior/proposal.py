@@ -150,7 +150,7 @@ def _fold_scores(
     operator, images = problem.operator, problem.images
     training = np.setdiff1d(operator.seeing_views, held_out)
     known = evidence_of_planes(operator, images, planes, training, others=others)
-    made = [list(candidates(one).values()) for one in known]
+    made = [list(candidates(evidence).values()) for evidence in known]
     truths = evidence_of_planes(operator, images, planes, held_out)
     return [
         [scores(pictures, truth.picture, truth.coverage * share) for share in shares.values()]

@@ -112,7 +112,7 @@ class MicroManagerCamera:
         """Return the temperature of the sensor, None if there is no such property, or none that is a number."""
         label = self._core.getCameraDevice()
         present = set(self._core.getDevicePropertyNames(label))
-        name = next((it for it in _TEMPERATURES if it in present), None)
+        name = next((name for name in _TEMPERATURES if name in present), None)
         try:
             found_c = math.nan if name is None else float(self._core.getProperty(label, name))
         except ValueError:

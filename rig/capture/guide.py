@@ -227,7 +227,7 @@ class Dialogue:
         """Show the state of the capture, which is `doing` something for `frame`."""
         session = self._session
         missing, steps = session.missing(), session.plan.steps
-        to_check = {it.step for it in missing if steps[it.step].at == "grid"}
+        to_check = {frame.step for frame in missing if steps[frame.step].at == "grid"}
         self.operator.show_status(
             Status(
                 doing=doing,

@@ -134,8 +134,8 @@ class Capture:
 
     def _handle_untimed_check(self, failure: DriftUnknown) -> None:
         """Record frames about which a check says nothing, and ask whether to take them again."""
-        doubtful = [it for it in failure.suspect if isinstance(it, CommittedFrame)]
-        self._session.journal.event("suspect", message=str(failure), intents=[it.intent for it in doubtful])
+        doubtful = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
+        self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in doubtful])
         self._dialogue.warn(str(failure))
         self._untimed_checks += 1
         unattended: Answer = "retake" if self._untimed_checks < MAX_UNATTENDED_TRIES else "stop"
@@ -224,9 +224,9 @@ class Capture:
     def _mark_unchecked(self, event: str) -> None:
         """Mark the frames at nodes that no drift check will confirm, since `event` came before it."""
         session = self._session
-        steps = [session.plan.steps[it.step] for it in session.frames]
-        marked = {intent for it in session.journal.details("suspect", Suspect) for intent in it.intents}
-        unchecked = [it.intent for it in unchecked_frames(session.journal) if steps[it.frame].at == "grid"]
+        steps = [session.plan.steps[frame.step] for frame in session.frames]
+        marked = {intent for suspect in session.journal.details("suspect", Suspect) for intent in suspect.intents}
+        unchecked = [frame.intent for frame in unchecked_frames(session.journal) if steps[frame.frame].at == "grid"]
         if not marked.issuperset(unchecked):
             message = f"{event} before {len(unchecked)} frames were checked for drift; they stay as suspect"
             session.journal.event("suspect", message=message, intents=unchecked)

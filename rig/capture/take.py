@@ -86,8 +86,8 @@ class DriftChecks:
 
     def _handle_drift(self, failure: PositionDrifted) -> None:
         """Record which frames are suspect, and ask whether to take them again."""
-        suspect = [it for it in failure.suspect if isinstance(it, CommittedFrame)]
-        self._session.journal.event("suspect", message=str(failure), intents=[it.intent for it in suspect])
+        suspect = [frame for frame in failure.suspect if isinstance(frame, CommittedFrame)]
+        self._session.journal.event("suspect", message=str(failure), intents=[frame.intent for frame in suspect])
         self._dialogue.warn(str(failure))
         self._failures += 1
         unattended: Answer = "retake" if self._failures < MAX_UNATTENDED_TRIES else "stop"
@@ -216,9 +216,9 @@ class FrameTaker:
                 {}, ("the file cannot be decoded here, so nothing was checked; look at it with the camera's program",)
             )
         earlier_sharpness = [
-            it.record.checks["sharpness"]
-            for it in self._session.valid().values()
-            if self._session.frames[it.frame].step == frame.step and "sharpness" in it.record.checks
+            committed.record.checks["sharpness"]
+            for committed in self._session.valid().values()
+            if self._session.frames[committed.frame].step == frame.step and "sharpness" in committed.record.checks
         ]
         return check_frame(pixels, frame.kind, self._settings.checks, self._settings.board, earlier_sharpness)
 

@@ -151,7 +151,7 @@ def _leaves(content: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 def _is_of_tables(content: object) -> bool:
     """Return whether `content` is a list of tables."""
-    return isinstance(content, Sequence) and bool(content) and all(isinstance(it, dict) for it in content)
+    return isinstance(content, Sequence) and bool(content) and all(isinstance(item, dict) for item in content)
 
 
 def _in_words(value: object) -> str:

@@ -77,15 +77,15 @@ def unchecked_frames(journal: Journal) -> list[CommittedFrame]:
     if not homed or any(check.id > homed[-1].id for check in journal.events("drift_check")):
         return []
     first_intent = journal.details("homed", Homed)[-1].first_intent
-    return [it for it in journal.committed() if it.void is None and it.intent >= first_intent]
+    return [frame for frame in journal.committed() if frame.void is None and frame.intent >= first_intent]
 
 
 def homing_groups(journal: Journal) -> HomingGroups:
     """Return the homing groups that a journal records."""
     homings = journal.details("homed", Homed)
     groups = {
-        it.intent: max((homed.group for homed in homings if homed.first_intent <= it.intent), default=None)
-        for it in journal.committed()
+        frame.intent: max((homed.group for homed in homings if homed.first_intent <= frame.intent), default=None)
+        for frame in journal.committed()
     }
     away_mm = [check.away_mm for check in journal.details("drift_check", DriftCheck)]
     return HomingGroups(groups, _spread_mm(away_mm), len(away_mm))

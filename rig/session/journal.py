@@ -204,7 +204,7 @@ class Journal:
         """Record events of a kind, all or none."""
         if details:
             with self._transaction():
-                self._add("event", *((None, _now(), kind, None, _to_json(it)) for it in details))
+                self._add("event", *((None, _now(), kind, None, _to_json(detail)) for detail in details))
 
     def intend(self, frame: int) -> int:
         """Record that `frame` will be taken now, and return the number of the exposure."""

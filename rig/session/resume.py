@@ -86,7 +86,7 @@ def _begin(folder: Path, plan: FrozenPlan | None) -> None:
     """Write the plan, the first file of a session besides the lock."""
     if plan is None:
         raise SessionCorrupt(f"{folder}: holds no session; name another folder, or begin one from a rig.toml")
-    others = [it for it in list_names(folder) if it not in ("lock", PLAN + PART)]
+    others = [name for name in list_names(folder) if name not in ("lock", PLAN + PART)]
     if others:
         raise SessionCorrupt(f"{folder}: holds {others[0]} and no session; name a new or empty folder")
     write_new(folder / PLAN, msgspec.json.format(msgspec.json.encode(plan)) + b"\n")
@@ -108,22 +108,22 @@ def _check_plan_hash(folder: Path, journal: Journal, digest: str, *, begun: bool
 def _reconcile(session: Session, names: list[str], progress: Progress) -> None:
     """Set aside files that are not in the journal; declare frames void whose file is altered or missing."""
     folder, journal = session.folder, session.journal
-    committed = {it.file for it in journal.committed()}
+    committed = {frame.file for frame in journal.committed()}
     present = set(names)
     for name in names:
         if name not in committed:
             moved = set_aside(folder / FRAMES / name, folder / ASIDE)
             journal.event("set_aside", file=_printable(name), to=moved.name, why="not committed")
-    for it in progress(list(session.valid().values())):
-        path = session.path_of(it)
-        if it.file not in present:
-            journal.event("gone", frame=it.frame, file=it.file)
-        elif not _is_intact(path, it.sha256):
+    for frame in progress(list(session.valid().values())):
+        path = session.path_of(frame)
+        if frame.file not in present:
+            journal.event("gone", frame=frame.frame, file=frame.file)
+        elif not _is_intact(path, frame.sha256):
             moved = set_aside(path, folder / ASIDE)
-            journal.event("set_aside", frame=it.frame, file=path.name, to=moved.name, why="altered")
+            journal.event("set_aside", frame=frame.frame, file=path.name, to=moved.name, why="altered")
         else:
             continue
-        session.void([it], "altered or gone")
+        session.void([frame], "altered or gone")
 
 
 def _is_intact(path: Path, digest: str) -> bool:

@@ -98,7 +98,7 @@ class Session:
 
     def missing(self) -> list[PlannedFrame]:
         """Return the frames still to be taken, in order, without those skipped since the session was opened."""
-        return [it for it in self.frames if it.number not in self._valid and it.number not in self._skipped]
+        return [frame for frame in self.frames if frame.number not in self._valid and frame.number not in self._skipped]
 
     def skipped(self) -> list[PlannedFrame]:
         """Return the frames that were skipped since the session was opened."""
@@ -144,10 +144,10 @@ class Session:
 
     def void(self, frames: Iterable[CommittedFrame], why: str) -> None:
         """Declare frames void: their files stay, and the frames are missing again."""
-        voided = [it for it in frames if self._valid.get(it.frame) == it]
-        self.journal.void([it.intent for it in voided], why)
-        for it in voided:
-            del self._valid[it.frame]
+        voided = [frame for frame in frames if self._valid.get(frame.frame) == frame]
+        self.journal.void([frame.intent for frame in voided], why)
+        for frame in voided:
+            del self._valid[frame.frame]
 
     def path_of(self, committed: CommittedFrame) -> Path:
         """Return the path of a frame's file."""
@@ -159,9 +159,9 @@ class Session:
         Skipped frames are left out for good, as the journal records.
         """
         self.journal.event("sealed", skipped=sorted(self._skipped), frames=len(self._valid))
-        committed = {it.file for it in self.journal.committed()}
+        committed = {frame.file for frame in self.journal.committed()}
         self.journal.close()
-        names = [PLAN, JOURNAL, *(f"{FRAMES}/{it}" for it in list_names(self.folder / FRAMES) if it in committed)]
+        names = [PLAN, JOURNAL, *(f"{FRAMES}/{name}" for name in list_names(self.folder / FRAMES) if name in committed)]
         with translate_errors(self.folder):
             lines = [f"{sha256(self.folder / name)}  {name}\n" for name in names]
         write_new(self.folder / SUMS, "".join(lines).encode())
@@ -237,15 +237,15 @@ def open_journal(folder: Path, frozen: FrozenPlan, *, create: bool = False, read
 def find_strangers(frames: Sequence[PlannedFrame], committed: Iterable[CommittedFrame]) -> Iterator[str]:
     """Yield how entries of a journal disagree with the plan, one line each."""
     taken: dict[int, str] = {}
-    for it in committed:
-        if it.frame >= len(frames):
-            yield f"{FRAMES}/{it.file}: is frame {it.frame} of a plan of {len(frames)} frames"
-        elif it.file.partition(".")[0] != exposure_name(frames[it.frame], it.intent):
-            yield f"{FRAMES}/{it.file}: is not a frame of the plan"
-        elif it.record.exposure_s != frames[it.frame].exposure_s:
-            yield f"{FRAMES}/{it.file}: has another exposure time than in the plan"
-        elif it.void is None and taken.setdefault(it.frame, it.file) != it.file:
-            yield f"{FRAMES}/{it.file}: is the same frame as {taken[it.frame]}"
+    for frame in committed:
+        if frame.frame >= len(frames):
+            yield f"{FRAMES}/{frame.file}: is frame {frame.frame} of a plan of {len(frames)} frames"
+        elif frame.file.partition(".")[0] != exposure_name(frames[frame.frame], frame.intent):
+            yield f"{FRAMES}/{frame.file}: is not a frame of the plan"
+        elif frame.record.exposure_s != frames[frame.frame].exposure_s:
+            yield f"{FRAMES}/{frame.file}: has another exposure time than in the plan"
+        elif frame.void is None and taken.setdefault(frame.frame, frame.file) != frame.file:
+            yield f"{FRAMES}/{frame.file}: is the same frame as {taken[frame.frame]}"
 
 
 def exposure_name(frame: PlannedFrame, intent: int) -> str:
@@ -266,7 +266,7 @@ def valid_frames(
     entries = list(committed)
     for problem in find_strangers(frames, entries):
         raise SessionCorrupt(f"{folder / JOURNAL}: {problem}; restore the journal from a copy")
-    return {it.frame: it for it in entries if it.void is None}
+    return {frame.frame: frame for frame in entries if frame.void is None}
 
 
 def has_session(folder: Path) -> bool:
@@ -287,4 +287,8 @@ def taken_frames(folder: Path) -> list[tuple[PlannedFrame, CommittedFrame, Path]
     with open_journal(folder, frozen, read_only=True) as journal:
         valid = valid_frames(folder, frames, journal.committed())
     list_names(folder / FRAMES)  # refuses a link that leads elsewhere
-    return [(it, valid[it.number], folder / FRAMES / valid[it.number].file) for it in frames if it.number in valid]
+    return [
+        (frame, valid[frame.number], folder / FRAMES / valid[frame.number].file)
+        for frame in frames
+        if frame.number in valid
+    ]

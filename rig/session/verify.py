@@ -98,7 +98,7 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
         uncommitted = journal.uncommitted()
     names = list_names(folder / FRAMES)
     digests = {path.name: _digest(path) for path in progress([folder / FRAMES / name for name in names])}
-    interrupted = find_interrupted(frames, uncommitted, set(names) - {it.file for it in committed})
+    interrupted = find_interrupted(frames, uncommitted, set(names) - {frame.file for frame in committed})
     problems: list[str] = []
     if begun != [plan_sha256] and (begun or committed or uncommitted):  # else it was interrupted as it began
         problems.append(f"{PLAN}: is not the plan that the session was begun with")
@@ -106,21 +106,21 @@ def _verify(folder: Path, progress: Callable[[Iterable[Path]], Iterable[Path]]) 
     problems += _compare(committed, digests, set(interrupted))
     if is_sealed(folder):
         problems += _compare_sums(folder, committed, digests)
-    valid = {it.frame: it for it in committed if it.void is None}
+    valid = {frame.frame: frame for frame in committed if frame.void is None}
     left_out = {number for numbers in sealed[-1:] for number in numbers}
-    open_frames = [it for it in frames if it.number not in valid]
-    missing = tuple(it.name for it in open_frames if it.number not in left_out)
+    open_frames = [frame for frame in frames if frame.number not in valid]
+    missing = tuple(frame.name for frame in open_frames if frame.number not in left_out)
     if is_sealed(folder):
         problems += [f"{name}: is missing although the session is complete" for name in missing]
     return Verdict(
         problems=tuple(problems),
         interrupted=interrupted,
         planned=len(frames),
-        present=sum(digests.get(it.file) == it.sha256 for it in valid.values()),
+        present=sum(digests.get(frame.file) == frame.sha256 for frame in valid.values()),
         missing=missing,
-        left_out=tuple(it.name for it in open_frames if it.number in left_out),
-        superseded=sum(it.void is not None and it.file in digests for it in committed),
-        suspect=tuple(it.file for it in valid.values() if it.intent in suspects),
+        left_out=tuple(frame.name for frame in open_frames if frame.number in left_out),
+        superseded=sum(frame.void is not None and frame.file in digests for frame in committed),
+        suspect=tuple(frame.file for frame in valid.values() if frame.intent in suspects),
         sealed=is_sealed(folder),
     )
 
@@ -151,15 +151,15 @@ def _compare(
     committed: list[CommittedFrame], digests: dict[str, str | _Unreadable], interrupted: Set[str]
 ) -> Iterator[str]:
     """Yield the disagreements between journal and files."""
-    for it in committed:
-        match digests.get(it.file):
+    for frame in committed:
+        match digests.get(frame.file):
             case _Unreadable(why=why):
-                yield f"{FRAMES}/{it.file}: cannot be read ({why})"
-            case None if it.void is None:
-                yield f"{FRAMES}/{it.file}: is missing"
-            case str(digest) if it.void is None and digest != it.sha256:
-                yield f"{FRAMES}/{it.file}: was altered"
-    for name in sorted(digests.keys() - {it.file for it in committed} - interrupted):
+                yield f"{FRAMES}/{frame.file}: cannot be read ({why})"
+            case None if frame.void is None:
+                yield f"{FRAMES}/{frame.file}: is missing"
+            case str(digest) if frame.void is None and digest != frame.sha256:
+                yield f"{FRAMES}/{frame.file}: was altered"
+    for name in sorted(digests.keys() - {frame.file for frame in committed} - interrupted):
         yield f"{FRAMES}/{name}: is not in the journal"
 
 
@@ -170,7 +170,11 @@ def _compare_sums(
     with translate_read_errors(folder / SUMS):
         lines = read_regular(folder / SUMS, _MAX_SUMS_BYTES).decode(errors="backslashreplace").splitlines()
     stated = {name: digest for digest, _, name in (line.partition("  ") for line in lines)}
-    frames = {f"{FRAMES}/{it.file}": digests.get(it.file) for it in committed if it.void is None or it.file in digests}
+    frames = {
+        f"{FRAMES}/{frame.file}": digests.get(frame.file)
+        for frame in committed
+        if frame.void is None or frame.file in digests
+    }
     actual = frames | {name: _digest(folder / name) for name in (PLAN, JOURNAL)}
     for name in sorted(stated.keys() | actual.keys()):
         if stated.get(name) != actual.get(name):

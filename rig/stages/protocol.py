@@ -253,7 +253,7 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
         if of_url and scheme not in _URL_SCHEMES:
             raise ValueError(
                 f"stage.port = {self.port!r}; give a serial device, or a URL that begins with "
-                f"{' or '.join(f'{it}://' for it in _URL_SCHEMES)}"
+                f"{' or '.join(f'{scheme}://' for scheme in _URL_SCHEMES)}"
             )
         if self.axes[0] == self.axes[1] or not set(self.axes) <= set("XYZ"):
             raise ValueError(f"stage.axes must be two different letters of X, Y, Z; got {', '.join(self.axes)}")

@@ -49,7 +49,7 @@ class TemporalNoise:
 
     def scaled(self, factor: float) -> "TemporalNoise":
         """Return the variances of an image that is multiplied by √factor."""
-        return TemporalNoise(*(getattr(self, it.name) * factor for it in fields(self)))
+        return TemporalNoise(*(getattr(self, field.name) * factor for field in fields(self)))
 
     def __add__(self, other: "TemporalNoise") -> "TemporalNoise":
         """Return the variances of a sum or difference of images."""
@@ -207,8 +207,8 @@ def accumulated_histogram(image: NDArray[Any], used: Mask) -> AccumulatedHistogr
     steps = np.linspace(0.0, deviation.max(), min(_MAX_STEPS, deviation.size))
     parts = np.array_split(deviation, max(deviation.size // _CHUNK_PX, 1))
     reached = np.zeros(steps.size + 1, np.int64)
-    for it in parts:
-        reached += np.bincount(np.searchsorted(steps, it, side="right"), minlength=reached.size)
+    for part in parts:
+        reached += np.bincount(np.searchsorted(steps, part, side="right"), minlength=reached.size)
     beyond = np.cumsum(reached[::-1])[-2::-1]
     # Half of a normal law lies within 0.6745 standard deviations
     sigma = float(np.median(deviation, overwrite_input=True)) / 0.6745

@@ -89,8 +89,8 @@ class MarginalLikelihood:
         self._floor_dn = counts.floor_dn
         self._offsets = np.arange(-half_width * self._per_dn, half_width * self._per_dn + 1) / self._per_dn
         relative = [values - self._anchor for values in counts.values_dn]
-        self._values = [np.arange(one.min(), one.max() + 1) for one in relative]
-        self._counts = _count([one - one.min() for one in relative], [one.size for one in self._values])
+        self._values = [np.arange(values.min(), values.max() + 1) for values in relative]
+        self._counts = _count([values - values.min() for values in relative], [values.size for values in self._values])
         charge = np.exp(start["log_dark_e_per_s"]) * np.array(counts.exposure_s) * (1 + 3 * start["dcnu"])
         self._masses = [
             mass_function(self._grid(values), t, 1.5 * largest, exact=exact, spread=spread)

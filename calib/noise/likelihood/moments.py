@@ -142,14 +142,14 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
     rows, columns = used.shape
     pixels = float(used.sum())
     freedom = max(pixels - rows - columns + 1.0, 1.0)
-    mean_dn = [_mean_dn(one, used) for one in (*darks, *flats)]
+    mean_dn = [_mean_dn(item, used) for item in (*darks, *flats)]
     floor_dn = min(mean_dn[: len(darks)])
-    noise = tuple(group_noise(one, used, floor_dn, (BLOCKS, BLOCKS)) for one in (*darks, *flats))
+    noise = tuple(group_noise(item, used, floor_dn, (BLOCKS, BLOCKS)) for item in (*darks, *flats))
     roundings = dark_roundings(darks, used)
 
     def work(strip: slice) -> NDArray[np.float64]:
         at = used[strip]
-        patterns = np.array([one.pattern_dn[strip][at] for one in darks], np.float64)
+        patterns = np.array([dark.pattern_dn[strip][at] for dark in darks], np.float64)
         return patterns @ patterns.T
 
     return Moments(
@@ -161,18 +161,18 @@ def gather_moments(darks: Sequence[Series], flats: Sequence[Series], used: NDArr
             mean_dn=np.array(mean_dn[: len(darks)]),
             within_dn2=np.array(
                 [
-                    one.within_dn2 - rounding.excess_dn2 * (one.frames - 1) * freedom
-                    for one, rounding in zip(noise, roundings, strict=False)
+                    group.within_dn2 - rounding.excess_dn2 * (group.frames - 1) * freedom
+                    for group, rounding in zip(noise, roundings, strict=False)
                 ]
             ),
             level_scatter_dn2=np.array([series.levels_dn.var() * series.frames for series in darks]),
             scatter_dn2=total_of(work, used.shape),
-            rounding2=np.array([one.error**2 for one in roundings]),
+            rounding2=np.array([rounding.error**2 for rounding in roundings]),
         ),
         flats=FlatMoments(
             frames=np.array([series.frames for series in flats], np.float64),
             mean_dn=np.array(mean_dn[len(darks) :]),
-            within_dn2=np.array([one.within_dn2 for one in noise[len(darks) :]]),
+            within_dn2=np.array([group.within_dn2 for group in noise[len(darks) :]]),
             evenness=np.array([_evenness(series, darks[0], used) for series in flats]),
             exposure_s=np.array([series.conditions.dark_time_s for series in flats]),
             light=known_light(flats),

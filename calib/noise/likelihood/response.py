@@ -96,12 +96,12 @@ class Light:
 
 def known_light(flats: Sequence[Series]) -> Light:
     """Return the light of flats: their photons if all state them, else the exposures at each light level."""
-    photons = [one.conditions.photons for one in flats]
+    photons = [flat.conditions.photons for flat in flats]
     if flats and all(photons):
         amount, group = np.array(photons, float), np.zeros(len(flats), int)
     else:
-        amount = np.array([one.conditions.exposure_s for one in flats], float)
-        group = np.unique([one.conditions.level for one in flats], return_inverse=True)[1].astype(int)
+        amount = np.array([flat.conditions.exposure_s for flat in flats], float)
+        group = np.unique([flat.conditions.level for flat in flats], return_inverse=True)[1].astype(int)
     for index in np.unique(group):
         among = amount[group == index]
         if np.unique(among).size < 3 or among.min() <= 0 or among.max() < _MIN_SPAN * among.min():

@@ -63,15 +63,15 @@ def flat_rounding(series: Series, used: NDArray[np.bool_]) -> Rounding:
 
 def dark_roundings(darks: Sequence[Series], used: NDArray[np.bool_]) -> list[Rounding]:
     """Return the rounding of every dark series; the arguments are as for `flat_rounding`."""
-    roundings = [flat_rounding(one, used) for one in darks]
-    if max(one.error for one in roundings) < _NEGLIGIBLE:
+    roundings = [flat_rounding(dark, used) for dark in darks]
+    if max(rounding.error for rounding in roundings) < _NEGLIGIBLE:
         return roundings
-    weight = np.array([one.frames for one in darks], np.float64)
+    weight = np.array([dark.frames for dark in darks], np.float64)
     phase = np.zeros(int(used.sum()))
-    for one, share in zip(darks, weight / weight.sum(), strict=True):
-        mean = one.mean_dn[used]
+    for dark, share in zip(darks, weight / weight.sum(), strict=True):
+        mean = dark.mean_dn[used]
         phase += share * (mean - mean.mean())
-    measured = [_dark_rounding(one, phase, float(weight.sum()), used) for one in darks]
+    measured = [_dark_rounding(dark, phase, float(weight.sum()), used) for dark in darks]
     return [min(both, key=lambda rounding: rounding.error) for both in zip(roundings, measured, strict=True)]
 
 

@@ -83,15 +83,15 @@ def photon_transfer(
         shot = gain * np.maximum(charge_dn(values, signal), 0.0) / slope2
         return shot, shot + np.square(read_dn[rows], dtype=np.float64) / slope2 + ROUNDING_DN2
 
-    kept = [kept_of(lambda rows, one=one: noise(one, rows)[1], ~one.suspect) for one in flats]  # type: ignore[misc]
+    kept = [kept_of(lambda rows, flat=flat: noise(flat, rows)[1], ~flat.suspect) for flat in flats]  # type: ignore[misc]
 
     def work(rows: slice) -> tuple[Array, Array]:
         found, information = np.zeros((2, *offset_dn[rows].shape))
-        for one, of_strip in zip(flats, kept, strict=True):
-            shot, variance = noise(one, rows)
+        for flat, of_strip in zip(flats, kept, strict=True):
+            shot, variance = noise(flat, rows)
             share = shot / variance
-            weight = 0.5 * (one.frames - 1) * share
-            found += weight * (one.within_dn2[rows] / ((one.frames - 1) * of_strip(rows, variance)) - 1)
+            weight = 0.5 * (flat.frames - 1) * share
+            found += weight * (flat.within_dn2[rows] / ((flat.frames - 1) * of_strip(rows, variance)) - 1)
             information += weight * share
         return found / np.maximum(information, 1e-12), information
 

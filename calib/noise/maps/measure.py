@@ -189,18 +189,18 @@ def _response(fitted: SeriesFit, levels: PixelLevels, usable: NDArray[np.bool_],
 
     def work(rows: slice) -> Array:
         charge, sums = np.zeros(total[rows].shape), []
-        for one in flats:
-            signal = one.mean_of(rows) - levels.offset_dn[rows]
+        for flat in flats:
+            signal = flat.mean_of(rows) - levels.offset_dn[rows]
             sums.append(signal.sum())
             charge += charge_dn(values, signal)
-            charge -= levels.dark_signal_dn_per_s[rows] * one.conditions.dark_time_s
+            charge -= levels.dark_signal_dn_per_s[rows] * flat.conditions.dark_time_s
         total[rows] = charge if relative_gain is None else charge / relative_gain[rows]
         return np.array(sums)
 
     means = total_of(work, shape) / usable.size
     noise = (
-        v / one.frames * float(charge_slope(values, mean) ** 2)
-        for v, one, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
+        v / flat.frames * float(charge_slope(values, mean) ** 2)
+        for v, flat, mean in zip(fitted.flat_noise_dn2, flats, means, strict=True)
     )
     return measure_response(total, sum(noise), usable)
 
@@ -210,6 +210,6 @@ def _offset_seams(
 ) -> tuple[Seam, ...]:
     """Return regions whose offsets differ notably."""
     read_dn = float(np.median(read.read_noise_dn))
-    spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(one.frames for one in fitted.darks)
+    spread_dn2 = max(fitted.fit.values["dsnu_dn2"], 0.0) + read_dn**2 / sum(dark.frames for dark in fitted.darks)
     seams = find_seams(levels.offset_dn, usable, 1 / spread_dn2)
     return tuple(seam for seam in seams if seam.difference > _NOTABLE_STEP * read_dn)

@@ -130,7 +130,7 @@ def _why_colour(raw: Map, usable: Mask) -> str:
     middle = [float(np.median(raw[at][usable[at]])) for at in phases if usable[at].any()]
     if max(middle) <= _MAX_ALTERNATE * max(min(middle), 1e-6):
         return ""
-    found = ", ".join(f"{it:.2f}" for it in middle)
+    found = ", ".join(f"{value:.2f}" for value in middle)
     return (
         f"pixels of even and odd rows and columns respond by {found} of the mean (a ratio of {_MAX_ALTERNATE:g} is the "
         'limit), as colour filters make them: state them, for example mosaic = ["RG", "GB"]'
@@ -196,7 +196,7 @@ def _surface(response: Map, usable: Mask) -> Callable[[slice], Array]:
     """
     of_rows, of_columns = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 4) for size in usable.shape)
     low = np.add.outer(np.arange(5), np.arange(5)) <= 4
-    products = [np.einsum("pi,pk->pik", one, one).reshape(len(one), 25) for one in (of_rows, of_columns)]
+    products = [np.einsum("pi,pk->pik", basis, basis).reshape(len(basis), 25) for basis in (of_rows, of_columns)]
 
     def work(rows: slice) -> Array:
         counted = usable[rows].astype(np.float64)

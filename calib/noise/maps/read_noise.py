@@ -206,7 +206,9 @@ def _measure(
     # may by chance (Akaike, IEEE Transactions on Automatic Control 19, 716, 1974).
     even = _LineFactor(np.zeros(kept.shape[0]), np.zeros(kept.shape[1]), np.exp)
     ways = [(even, 0)]
-    ways += [(it, number) for it, number in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if it.varies]
+    ways += [
+        (grouping, number) for grouping, number in ((region, _MAX_REGIONS), (lines, sum(kept.shape))) if grouping.varies
+    ]
     fits = [_population(squares, ratio, factor, read_dn2, usable) for factor, _ in ways]
     best = int(np.argmax([fit.log_likelihood - number for fit, (_, number) in zip(fits, ways, strict=True)]))
     factor, posterior = ways[best][0], _posterior(fits[best], shot_dn2, freedom)
@@ -378,7 +380,7 @@ def _posterior(population: _Population, shot_dn2: Array, freedom: Array) -> Call
     # About the likeliest step little is lost in single precision, which is fast
     centre = int(population.share.argmax())
     slope, constant = -0.5 / variances, np.log(np.maximum(population.share, 1e-300)) - 0.5 * freedom @ np.log(variances)
-    slope, constant = (it - it[..., centre, None] for it in (slope, constant))
+    slope, constant = (term - term[..., centre, None] for term in (slope, constant))
     middle = float(population.share @ sigma)
     moments = np.power.outer(sigma - middle, np.arange(3)).astype(np.float32)
     finest = (0.5 * (grid[1] - grid[0])) ** 2 / 12  # of the mean squared: no finer than the grid tells

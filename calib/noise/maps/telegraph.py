@@ -42,7 +42,7 @@ def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: S
     noise_dn2 : sequence of float
         v_j, the pixel noise of each series by the fit.
     """
-    frames = np.array([one.frames for one in darks])
+    frames = np.array([dark.frames for dark in darks])
     if not read.resolved or frames.sum() < _MIN_FRAMES:
         return np.zeros(read.read_noise_dn.shape, bool)
     typical = np.median(read.read_noise_dn)
@@ -50,7 +50,7 @@ def telegraph_pixels(darks: Sequence[Series], read: PixelReadNoise, noise_dn2: S
 
     def work(rows: slice) -> NDArray[np.bool_]:
         powers = [
-            np.sum([getattr(one, name)[rows] for one in darks], axis=0, dtype=np.float64)
+            np.sum([getattr(dark, name)[rows] for dark in darks], axis=0, dtype=np.float64)
             for name in ("within_dn2", "cubes_dn3", "fourths_dn4")
         ]
         skew2, kurtosis = _shape(*(power / frames.sum() for power in powers))

@@ -39,23 +39,23 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     if not darks:
         raise NotIdentifiable("no dark frames: the offset cannot be told from the light; record darks, lens covered")
     seen: dict[bytes, str] = {}
-    for one in (*darks, *flats):
-        for digest, name in zip(one.digests, one.names, strict=True):
+    for item in (*darks, *flats):
+        for digest, name in zip(item.digests, item.names, strict=True):
             if digest in seen:
                 raise CopiedFrame(
                     f"{name} and {seen[digest]}: the same frame twice, pixel for pixel; noise never repeats: record "
                     "it again, or leave one out"
                 )
             seen[digest] = name
-    if all(one.frames < 2 for one in darks):
+    if all(dark.frames < 2 for dark in darks):
         raise TooFewFrames(
             f"{darks[0].names[0]}: the only one of the {darks[0].conditions}, and no exposure has two dark frames, so "
             "that noise and pattern cannot be told apart; record at least 2 of one exposure, better 10 of each"
         )
-    for one in flats:
-        if one.frames < 2:
+    for flat in flats:
+        if flat.frames < 2:
             raise TooFewFrames(
-                f"{one.names[0]}: the only one of the {one.conditions}; photon transfer needs 2 frames at least of "
+                f"{flat.names[0]}: the only one of the {flat.conditions}; photon transfer needs 2 frames at least of "
                 "each light level: record another or leave it out"
             )
     pixels = darks[0].pattern_dn.size
@@ -69,9 +69,9 @@ def check_series(darks: Sequence[Series], flats: Sequence[Series]) -> None:
 def frame_warnings(fitted: SeriesFit) -> list[str]:
     """Return warnings about lone frames and values that are cut off."""
     warnings = [
-        f"{one.names[0]}: the only one of the {one.conditions}; it tells the mean but no noise: record at least 2"
-        for one in fitted.darks
-        if one.frames < 2
+        f"{dark.names[0]}: the only one of the {dark.conditions}; it tells the mean but no noise: record at least 2"
+        for dark in fitted.darks
+        if dark.frames < 2
     ]
     if fitted.likelihood is NoiseLikelihood.CENSORED:
         warnings.append(
@@ -96,7 +96,7 @@ def scatter_warnings(fitted: SeriesFit) -> list[str]:
     """Return warnings about scatter between series by which intervals have grown, and about light that is not known."""
     excess, warnings = fitted.moments.excess, []
     read_dn = float(np.exp(0.5 * fitted.fit.values["log_read_dn2"]))
-    noise, drift, light = (float(np.sqrt(it)) for it in (excess.variance2, excess.drift_dn2, excess.light2))
+    noise, drift, light = (float(np.sqrt(variance)) for variance in (excess.variance2, excess.drift_dn2, excess.light2))
     if noise > _NOTABLE_FRACTION:
         warnings.append(
             f"the noise of the series scatters by {noise:.1%} in variance about the model beyond chance; the intervals "
@@ -171,7 +171,7 @@ def noise_warning(fitted: SeriesFit, points: Sequence[TransferPoint]) -> str | N
     if fitted.likelihood is NoiseLikelihood.CENSORED:
         return None
     darks, flats = fitted.moments.darks, fitted.moments.flats
-    rounding2 = [np.zeros(one.frames.size) if one.rounding2 is None else one.rounding2 for one in (darks, flats)]
+    rounding2 = [np.zeros(item.frames.size) if item.rounding2 is None else item.rounding2 for item in (darks, flats)]
     several = [
         (point, error2) for point, error2 in zip(points, np.concatenate(rounding2), strict=True) if point.frames > 1
     ]

@@ -52,10 +52,10 @@ def _dispersion(noise: Sequence[SeriesNoise], variances_dn2: Iterable[Array | fl
 
     What the blocks of all series have in common is a difference between pixels, not chance, and is taken out.
     """
-    several = [(one, v) for one, v in zip(noise, variances_dn2, strict=True) if one.frames > 1]
+    several = [(group, v) for group, v in zip(noise, variances_dn2, strict=True) if group.frames > 1]
     if len(several) < 2:
         return 1.0
-    ratios, freedoms = zip(*(one.scatter(one.blocks, v) for one, v in several), strict=True)
+    ratios, freedoms = zip(*(item.scatter(item.blocks, v) for item, v in several), strict=True)
     ratio, weight = np.array(ratios), np.array(freedoms) / 2
     ratio = ratio / np.average(ratio, axis=1, weights=weight[0])[:, None]
     rest = ratio - np.average(ratio, axis=0, weights=weight[:, 0])
@@ -75,7 +75,7 @@ def measure_excess(fit: NoiseFit, moments: Moments, darks: Sequence[Series]) -> 
     of_darks, of_flats = moments.noise[: len(darks)], moments.noise[len(darks) :]
     excess = Excess(
         darks=_dispersion(of_darks, dark_noise),
-        flats=_dispersion(of_flats, (flat_variances_of_nodes(fit, one) for one in of_flats)),
+        flats=_dispersion(of_flats, (flat_variances_of_nodes(fit, group) for group in of_flats)),
     )
     variance2, noise_known = _noise_scatter(fit, moments, excess)
     drift_dn2, drift_known = _drift(fit, moments, trend_dn2(darks))
@@ -124,7 +124,7 @@ def _noise_scatter(fit: NoiseFit, moments: Moments, excess: Excess) -> tuple[flo
     freedom = np.concatenate(noise_freedom(moments))
     wider = np.concatenate([np.full(darks.frames.size, excess.darks), np.full(flats.frames.size, excess.flats)])
     use = freedom > 0
-    rounding2 = [np.zeros(one.frames.size) if one.rounding2 is None else one.rounding2 for one in (darks, flats)]
+    rounding2 = [np.zeros(item.frames.size) if item.rounding2 is None else item.rounding2 for item in (darks, flats)]
     chance = 2 * wider[use] / freedom[use] + np.concatenate(rounding2)[use]
     target, columns = (measured - ROUNDING_DN2)[use] / noise[use], design[use] / noise[use][:, None]
     left = target.size - int(np.linalg.matrix_rank(columns / np.maximum(np.abs(columns).max(0), 1e-300)))
@@ -143,14 +143,14 @@ def trend_dn2(darks: Sequence[Series]) -> float:
 
     It goes on from series to series, where it may pass for dark current.
     """
-    several = [one for one in darks if one.frames > 1]
+    several = [dark for dark in darks if dark.frames > 1]
     if len(several) < 3:
         return 0.0
-    rises = np.array([np.polyfit(np.arange(one.frames), one.levels_dn, 1)[0] for one in several])
+    rises = np.array([np.polyfit(np.arange(item.frames), item.levels_dn, 1)[0] for item in several])
     error = float(rises.std(ddof=1)) / np.sqrt(rises.size)
     if 2 * stats.t.sf(abs(float(rises.mean())) / max(error, 1e-300), rises.size - 1) > _MAX_TREND_CHANCE:
         return 0.0
-    return float(rises.mean() * np.mean([one.frames for one in several])) ** 2
+    return float(rises.mean() * np.mean([item.frames for item in several])) ** 2
 
 
 def _drift(fit: NoiseFit, moments: Moments, trend2: float) -> tuple[float, Known]:
@@ -195,12 +195,12 @@ def fit_with_excess(moments: Moments, darks: Sequence[Series], bends: int) -> tu
             break
         fit = problem.fit(excess, fit.values)
     sources = []
-    for name, it in known.items():
-        if (value := getattr(moments.excess, name)) > 0 and it.freedom > 0:
+    for name, known_part in known.items():
+        if (value := getattr(moments.excess, name)) > 0 and known_part.freedom > 0:
             grown = replace(moments.excess, **{name: 1.1 * value})
             # Residuals tell the whole of these variances, not only the excess.
-            change = (problem.covariance(fit.values, grown) - fit.covariance) / (0.1 * it.share)
-            sources.append((change, it.freedom))
+            change = (problem.covariance(fit.values, grown) - fit.covariance) / (0.1 * known_part.share)
+            sources.append((change, known_part.freedom))
     plain = problem.covariance(fit.values, NO_EXCESS)
     return replace(fit, sources=tuple(sources), plain_covariance=plain), moments
 

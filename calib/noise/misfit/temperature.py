@@ -45,8 +45,8 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
 
     Nothing changes if they state no temperature, or already state their dark current.
     """
-    darks = [one for one in series if one.conditions.kind == "dark" and one.conditions.temperature_c is not None]
-    warmth = np.array([one.conditions.temperature_c for one in darks], np.float64)
+    darks = [item for item in series if item.conditions.kind == "dark" and item.conditions.temperature_c is not None]
+    warmth = np.array([dark.conditions.temperature_c for dark in darks], np.float64)
     if np.unique(warmth).size < 2:
         return series, Warmth()
     range_k, found = float(np.ptp(warmth)), _doubling(darks)
@@ -60,13 +60,13 @@ def settle_temperature(series: Sequence[Series]) -> tuple[Sequence[Series], Warm
             f"darks at one temperature ({found.why})"
         )
         return series, Warmth(found, range_k, (why,))
-    frames = np.array([one.frames for one in darks])
+    frames = np.array([dark.frames for dark in darks])
     reference_c = float(np.average(warmth, weights=frames))
     note = (
         f"dark_current_doubling_k is not stated: the dark current of these darks doubles every {found.value:.3g} ± "
         f"{found.se:.2g} K, by which it is taken to that at {reference_c:.1f} °C"
     )
-    return [_at(one, reference_c, found.value) for one in series], Warmth(found, range_k, (note,))
+    return [_at(item, reference_c, found.value) for item in series], Warmth(found, range_k, (note,))
 
 
 def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series], warmth: Warmth) -> NoiseFit:
@@ -75,7 +75,7 @@ def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series]
         return fit
     error = 0.5 * _USUAL_PER_K * warmth.range_k * fit.values["dark_signal_dn_per_s"]
     if warmth.doubling.value is not None and warmth.doubling.se is not None:
-        doublings = np.log2([one.conditions.dark_factor for one in darks]) * warmth.doubling.value
+        doublings = np.log2([dark.conditions.dark_factor for dark in darks]) * warmth.doubling.value
         ends = [warmth.doubling.value + sign * warmth.doubling.se for sign in (-1, 1)]
         slopes = [_slope(moments, 2.0 ** (doublings / end), darks) for end in ends]
         error = 0.5 * (slopes[1] - slopes[0])
@@ -87,15 +87,15 @@ def with_doubling_error(fit: NoiseFit, moments: Moments, darks: Sequence[Series]
 
 def _slope(moments: Moments, factor: NDArray[np.float64], darks: Sequence[Series]) -> float:
     """Return the slope of the dark levels over the exposure times at given factors of the dark current."""
-    times = factor * [one.conditions.exposure_s for one in darks]
+    times = factor * [dark.conditions.exposure_s for dark in darks]
     return float(np.polyfit(times, moments.darks.mean_dn, 1, w=np.sqrt(moments.darks.frames))[0])
 
 
 def _doubling(darks: Sequence[Series]) -> Estimate:
     """Return the kelvins over which the dark current of the darks doubles."""
-    exposures, warmth = ([getattr(one.conditions, of) for one in darks] for of in ("exposure_s", "temperature_c"))
-    frames = [one.frames for one in darks]
-    levels = np.concatenate([one.levels_dn for one in darks])
+    exposures, warmth = ([getattr(dark.conditions, of) for dark in darks] for of in ("exposure_s", "temperature_c"))
+    frames = [dark.frames for dark in darks]
+    levels = np.concatenate([dark.levels_dn for dark in darks])
     return dark_current_doubling(levels, np.repeat(exposures, frames), np.repeat(np.array(warmth, float), frames))
 
 

@@ -20,18 +20,18 @@ def check_flat_levels(darks: Sequence[Series], flats: Sequence[Series]) -> None:
     BadFrame
         The levels within a series differ by far more than the lamp flickers.
     """
-    dark = min(float(one.levels_dn.mean()) for one in darks)
-    several = [one for one in flats if one.frames > 1 and one.levels_dn.mean() > dark]
-    range_dn = np.array([np.ptp(one.levels_dn) for one in several])
-    signal_dn = np.array([one.levels_dn.mean() - dark for one in several])
+    dark = min(float(item.levels_dn.mean()) for item in darks)
+    several = [flat for flat in flats if flat.frames > 1 and flat.levels_dn.mean() > dark]
+    range_dn = np.array([np.ptp(item.levels_dn) for item in several])
+    signal_dn = np.array([item.levels_dn.mean() - dark for item in several])
     # The black level jitters in darks, too; dim flats would take it for flicker.
-    jitter_dn = max((float(np.ptp(one.levels_dn)) for one in darks), default=0.0)
+    jitter_dn = max((float(np.ptp(dark.levels_dn)) for dark in darks), default=0.0)
     share = np.maximum(range_dn - _TIMES_FLICKER * jitter_dn, 0.0) / np.maximum(signal_dn, 1e-9)
-    for index, one in enumerate(several):
+    for index, item in enumerate(several):
         others = np.delete(share, index)
         limit = max(_MIN_RANGE, _TIMES_FLICKER * float(np.median(others))) if others.size > 1 else _LONE_RANGE
         if share[index] > limit:
-            raise BadFrame(_message(one, float(range_dn[index] / signal_dn[index]), limit))
+            raise BadFrame(_message(item, float(range_dn[index] / signal_dn[index]), limit))
 
 
 def _message(one: Series, share: float, limit: float) -> str:

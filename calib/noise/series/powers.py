@@ -49,7 +49,7 @@ class Moments:
         tuple of (float, int, int)
             Squares of the rest, and numbers of values at `top` or above and one below it; all of regular pixels.
         """
-        mean, sums = self.mean[rows], [one[rows] for one in self.sums]
+        mean, sums = self.mean[rows], [power_sum[rows] for power_sum in self.sums]
         if len(sums) == 1:
             return _add_two(frame, regular, of_rows, of_columns, float(frames), mean, sums[0], top)
         return _add_four(frame, regular, of_rows, of_columns, float(frames), mean, *sums), 0, 0

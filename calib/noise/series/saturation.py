@@ -72,7 +72,7 @@ def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation
         No flat is left.
     """
     ceiling = _ceiling_dn(flats, saturation_dn)
-    clipped = np.array([one.clipped_share(ceiling) for one in flats])
+    clipped = np.array([flat.clipped_share(ceiling) for flat in flats])
     peak = _noisiest(flats)
     if peak is not None and clipped[peak[1] :].max(initial=0.0) <= _MAX_CLIPPED_SHARE:
         odd = _odd_one(flats, *peak)
@@ -90,9 +90,9 @@ def find_saturation(darks: Sequence[Series], flats: Sequence[Series], saturation
 def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
     """Return the end of the range: the highest value where many values stand on it, else the stated one."""
     modes = [
-        one.top_dn
-        for one in flats
-        if one.at_top > max(_MIN_MODE_SHARE * one.counted, _MIN_MODE_VALUES * one.frames, one.below_top)
+        flat.top_dn
+        for flat in flats
+        if flat.at_top > max(_MIN_MODE_SHARE * flat.counted, _MIN_MODE_VALUES * flat.frames, flat.below_top)
     ]
     return min(float(max(modes, default=np.inf)), saturation_dn)
 
@@ -100,10 +100,10 @@ def _ceiling_dn(flats: Sequence[Series], saturation_dn: float) -> float:
 def _converter_end(flats: Sequence[Series], clipped: NDArray[np.float64], ceiling: float) -> Saturation:
     """Return the flats that the end of the converter's range does not clip."""
     over = clipped > _MAX_CLIPPED_SHARE
-    kept = tuple(one for one, out in zip(flats, over, strict=True) if not out)
+    kept = tuple(flat for flat, out in zip(flats, over, strict=True) if not out)
     left_out = tuple(
-        (one, f"{share:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range")
-        for one, share, out in zip(flats, clipped, over, strict=True)
+        (flat, f"{share:.2%} of the flat's pixels stand at {ceiling:g} DN, the end of the range")
+        for flat, share, out in zip(flats, clipped, over, strict=True)
         if out
     )
     if not left_out:
@@ -119,7 +119,7 @@ def _noise_dn2(one: Series) -> tuple[float, float]:
 
 def _by_level(flats: Sequence[Series]) -> list[int]:
     """Return the places of the flats of several frames, from dim to bright."""
-    return [j for j in np.argsort([one.levels_dn.mean() for one in flats]).tolist() if flats[j].frames > 1]
+    return [j for j in np.argsort([flat.levels_dn.mean() for flat in flats]).tolist() if flats[j].frames > 1]
 
 
 def _falls(flats: Sequence[Series], order: list[int]) -> tuple[int, bool]:
@@ -147,35 +147,36 @@ def _odd_one(flats: Sequence[Series], order: list[int], at: int) -> int | None:
     The noise of a single series may be anything: its frames may be of different light, or the readout has failed.
     """
     ways = [order[at], *(j for j in reversed(order) if j != order[at])]
-    return next((j for j in ways if not _falls(flats, [it for it in order if it != j])[1]), None)
+    return next((j for j in ways if not _falls(flats, [index for index in order if index != j])[1]), None)
 
 
 def _without_odd(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int, odd: int) -> Saturation:
     """Return the flats that can be relied on if one series alone has noise that may be that of a full well."""
     if odd == order[at]:
         why = "its noise is larger than that of brighter flats, and it is the only one; record it again"
-        kept = tuple(one for j, one in enumerate(flats) if j != odd)
+        kept = tuple(flat for j, flat in enumerate(flats) if j != odd)
         return Saturation("not reached", None, None, kept, ((flats[odd], why),))
     found = _full_well(darks, flats, order, at)
     why = (
         f"the noise of the flats of {flats[odd].levels_dn.mean():.1f} DN alone is less than that of dimmer ones, as "
         "beyond a full well; record two more levels as bright"
     )
-    return Saturation("not reached", None, None, found.kept, tuple((one, why) for one, _ in found.left_out))
+    return Saturation("not reached", None, None, found.kept, tuple((flat, why) for flat, _ in found.left_out))
 
 
 def _full_well(darks: Sequence[Series], flats: Sequence[Series], order: list[int], at: int) -> Saturation:
     """Return the flats in which no well is full."""
     level = [float(flats[j].levels_dn.mean()) for j in order]
-    dark = min(float(one.levels_dn.mean()) for one in darks)
+    dark = min(float(item.levels_dn.mean()) for item in darks)
     highest = dark + _MAX_FILLED * (level[at] - dark)
     kept = {j for j, mean in zip(order, level, strict=True) if mean <= highest}
     left_out = tuple(
         (
-            one,
-            f"its mean of {one.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, {level[at]:.1f} DN",
+            flat,
+            f"its mean of {flat.levels_dn.mean():.1f} DN is over {_MAX_FILLED:.0%} of the full well, "
+            f"{level[at]:.1f} DN",
         )
-        for j, one in enumerate(flats)
+        for j, flat in enumerate(flats)
         if j not in kept
     )
     around = (level[max(at - 1, 0)], level[at + 1])

@@ -295,7 +295,7 @@ def measure_series(
 
 def any_suspect(series: Sequence[Series]) -> NDArray[np.bool_]:
     """Return the pixels (row, column) that are suspect in any series."""
-    return np.asarray(np.logical_or.reduce([one.suspect for one in series]))
+    return np.asarray(np.logical_or.reduce([item.suspect for item in series]))
 
 
 def sample_index(shape: tuple[int, ...]) -> NDArray[np.int64]:

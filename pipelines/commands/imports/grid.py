@@ -144,7 +144,7 @@ def import_grid(
         read = partial(grey_picture, size_px=(width, height))
         result = arranged(found.grid, given, white=white, aligned_stated=bool(disparity_px), read=read)
         # What was found of the files, then what the pictures say
-        for words in [*found.said, *(it for it in result.grid.said if it not in found.said)]:
+        for words in [*found.said, *(line for line in result.grid.said if line not in found.said)]:
             inform(words)
         show_arrangement(result)
         gauge = _gauge(result.arrangement, float(width), pitch_mm, fx_px, disparity_px or 0.0)

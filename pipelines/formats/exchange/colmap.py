@@ -87,8 +87,8 @@ def read_posed_images(folder: Path, images: Path) -> PosedModel:
     model = read_model(folder)
     files = list(model_files(folder))
     posed = [
-        PosedImage(inside(images, it.name, f"{files[1]}: name"), model.lenses[it.camera], it.rt_cam_world)
-        for it in model.images
+        PosedImage(inside(images, image.name, f"{files[1]}: name"), model.lenses[image.camera], image.rt_cam_world)
+        for image in model.images
     ]
     return PosedModel(files, posed)
 

@@ -97,7 +97,7 @@ def _expression(pattern: str) -> re.Pattern[str]:
         if name not in _FIELDS or (digits and _FIELDS[name] != _WHOLE) or name in used:
             raise BadValue(
                 f"--pattern '{pattern}': {field[0]} is no field, or is there twice; use each of "
-                f"{', '.join(f'{{{it}}}' for it in _FIELDS)} at most once, and * for anything"
+                f"{', '.join(f'{{{field}}}' for field in _FIELDS)} at most once, and * for anything"
             )
         used.append(name)
         parts.append(f"(?P<{name}>{f'[0-9]{{{digits}}}' if digits else _FIELDS[name]})")
@@ -125,7 +125,9 @@ def places_by_habit(names: Sequence[str]) -> list[Place]:
     for expression in (*_WITH_POSITIONS, *_LETTERED):
         found = [expression.search(stem) for stem in stems]
         if all(found):
-            return [_place(name, it.groupdict()) for name, it in zip(names, found, strict=True) if it is not None]
+            return [
+                _place(name, match.groupdict()) for name, match in zip(names, found, strict=True) if match is not None
+            ]
     numbers = [re.findall(_WHOLE, stem) for stem in stems]
     lacking = next((name for name, its in zip(names, numbers, strict=True) if not its), None)
     if lacking is not None:
@@ -134,7 +136,8 @@ def places_by_habit(names: Sequence[str]) -> list[Place]:
         if len(varying) == 2:
             row, column = varying
             return [
-                _place(name, {"row": it[row], "column": it[column]}) for name, it in zip(names, numbers, strict=True)
+                _place(name, {"row": numbers_of_name[row], "column": numbers_of_name[column]})
+                for name, numbers_of_name in zip(names, numbers, strict=True)
             ]
         return _places_of_one_number(names, stems, numbers, varying[0])
     if min(map(len, numbers)) == 1:

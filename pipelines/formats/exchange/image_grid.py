@@ -215,7 +215,7 @@ def _in_order(folder: Path, paths: list[Path], rows: int, columns: int, said: li
     if len(paths) != rows * columns:
         raise MissingFile(
             f"{folder}: holds {len(paths)} pictures, a grid of {rows} x {columns} needs {rows * columns}; "
-            "correct --rows and --columns, or add the missing ones" + "".join(f" ({it})" for it in said)
+            "correct --rows and --columns, or add the missing ones" + "".join(f" ({remark})" for remark in said)
         )
     in_order = sorted(paths, key=lambda path: by_number(path.name))
     return ImageGrid(dict(zip(grid_nodes(rows, columns), in_order, strict=True)), said=said, ordered=True)

@@ -228,6 +228,8 @@ def _variance_words(gain_dn: float, read_noise_dn: float, tone: Tone) -> str:
 
 def _origin(found: "ViewNoise") -> NoiseOrigin:
     """Return the record of an estimate."""
-    gain, read = (Measured(one.value, one.se, one.ci95) for one in (found.gain_dn, found.read_noise_dn))
+    gain, read = (
+        Measured(estimate.value, estimate.se, estimate.ci95) for estimate in (found.gain_dn, found.read_noise_dn)
+    )
     curve = tuple(found.mean_dn.tolist()), tuple(found.variance_dn2.tolist())
     return NoiseOrigin("estimated", None, gain, read, *curve, found.blocks)

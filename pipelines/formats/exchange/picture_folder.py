@@ -131,4 +131,6 @@ def picture_named(folder: Path, name: str, key: str) -> Path:
     if is_file(path):
         return path
     named = [path.with_name(path.name + suffix) for suffix in sorted(IMAGE_SUFFIXES)] if path.name else []
-    return next((it for it in named if is_file(inside(folder, str(it.relative_to(folder)), key))), path)
+    return next(
+        (candidate for candidate in named if is_file(inside(folder, str(candidate.relative_to(folder)), key))), path
+    )

@@ -69,7 +69,7 @@ class PoseTable:
         if twice is not None:
             raise BadValue(f"{path}: has two columns {twice}; keep one of them")
         name = next((word for word in _NAMES if word in self._columns), None)
-        unit = next((it for it in _UNITS if all(axis + it in self._columns for axis in "xyz")), None)
+        unit = next((unit for unit in _UNITS if all(axis + unit in self._columns for axis in "xyz")), None)
         turned = [word for word in _QUATERNION if word in self._columns]
         if name is None or unit is None or len(turned) not in (0, 4):
             raise BadValue(

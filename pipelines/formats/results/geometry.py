@@ -88,10 +88,10 @@ class CameraPoses(Struct, frozen=True, kw_only=True):
         waiting = [before]
         while waiting:
             here = waiting.pop()
-            for one in self.homings or ():
-                for start, end, sign in ((one.before, one.after, 1.0), (one.after, one.before, -1.0)):
+            for homing in self.homings or ():
+                for start, end, sign in ((homing.before, homing.after, 1.0), (homing.after, homing.before, -1.0)):
                     if start == here and end not in known:
-                        known[end] = known[here] + sign * np.array(one.shift_mm)
+                        known[end] = known[here] + sign * np.array(homing.shift_mm)
                         waiting.append(end)
         if after not in known:
             return None

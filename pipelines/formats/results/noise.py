@@ -208,7 +208,7 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
     record = read_noise(path)
     values = _numbers(path, record)
     shape = size_px[::-1]
-    outside = [it for it in record.hot_pixels if not (0 <= it[0] < shape[0] and 0 <= it[1] < shape[1])]
+    outside = [pixel for pixel in record.hot_pixels if not (0 <= pixel[0] < shape[0] and 0 <= pixel[1] < shape[1])]
     if outside:
         raise BadValue(
             f"{path}: hot pixel {list(outside[0])} is not one of {shape}; it seems to be another camera's; "
@@ -230,7 +230,7 @@ def read_fitted_noise(path: Path, size_px: tuple[int, int]) -> FittedNoise:
             )
     stated = {name: getattr(record, name) for name in ("quantum_efficiency", "saturation_dn")}
     # Either number may be written with or without its error.
-    stated = {name: it.value if isinstance(it, Measured) else it for name, it in stated.items()}
+    stated = {name: value.value if isinstance(value, Measured) else value for name, value in stated.items()}
     known = {name: value for name, value in stated.items() if value is not None}
     try:
         model = NoiseModel(**(values | maps), **known, response=_response(record, shape))
@@ -248,8 +248,8 @@ def _response(record: NoiseRecord, shape: tuple[int, int]) -> BentResponse | Non
     if not bent or not record.mosaic:
         return None
     period = len(record.mosaic), len(record.mosaic[0])
-    bends = [np.zeros(shape) for _ in range(max(len(one.bends_per_dn) for one in bent))]
-    up_to_dn = np.full(shape, max(one.up_to_dn for one in bent))
+    bends = [np.zeros(shape) for _ in range(max(len(response.bends_per_dn) for response in bent))]
+    up_to_dn = np.full(shape, max(response.up_to_dn for response in bent))
     for plane in planes:
         if plane.fit and plane.fit.response:
             at_phase(up_to_dn, plane.phase, period)[...] = plane.fit.response.up_to_dn

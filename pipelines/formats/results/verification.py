@@ -148,9 +148,9 @@ def verify_results(
     if find_inputs is not None:
         work.look_for_inputs(find_inputs)
     named = work.named
-    for one, path in zip(named, progress([one.folder / one.name for one in named]), strict=True):
-        work.compare(one, path, hashed)
-    inputs = sum(one.is_input for one in named)
+    for entry, path in zip(named, progress([entry.folder / entry.name for entry in named]), strict=True):
+        work.compare(entry, path, hashed)
+    inputs = sum(entry.is_input for entry in named)
     return ResultVerdict(
         records=len(work.content),
         files=len(named) - inputs,
@@ -263,10 +263,10 @@ def inputs_around(record: Path, inputs: Mapping[str, str]) -> Path | None:
             return candidate
     beside: list[Path] = []
     with suppress(OSError):  # a folder around it that may not be listed
-        beside = [one for level in around[1:] for one in sorted(level.iterdir()) if one.is_dir()]
+        beside = [place for level in around[1:] for place in sorted(level.iterdir()) if place.is_dir()]
     # Several sets may be described alike: the one whose files are the same, too, is meant
     for name, digest in inputs.items():
-        same = [one for one in beside if problem_of_file(one / name, one, digest) is None]
+        same = [place for place in beside if problem_of_file(place / name, place, digest) is None]
         beside = same or ([] if name == described_in else beside)
         if len(beside) < 2:
             break

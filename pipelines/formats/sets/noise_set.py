@@ -154,12 +154,14 @@ def _by_temperature(
 ) -> dict[Conditions, list[Path]]:
     """Return the series, darks of different temperatures apart, with what their dark current was."""
     known = [frame.temperature_c for frame in settings.frame if frame.temperature_c is not None]
-    warmth = [it.temperature_c for it in settings.frame if it.kind == "dark" and it.temperature_c is not None]
+    warmth = [
+        frame.temperature_c for frame in settings.frame if frame.kind == "dark" and frame.temperature_c is not None
+    ]
     several, doubling_k = bool(warmth) and np.ptp(warmth) > _STEADY_K, settings.dark_current_doubling_k
     found: dict[Conditions, list[Path]] = {}
     for conditions, frames in groups.items():
         for part in _alike(frames) if several and conditions.kind == "dark" else [frames]:
-            of_part, own = [it for _, it in part if it is not None], conditions
+            of_part, own = [pixels for _, pixels in part if pixels is not None], conditions
             if of_part and several:
                 own = replace(own, temperature_c=float(np.mean(of_part)))
             if of_part and doubling_k is not None:
@@ -175,15 +177,15 @@ def _alike(frames: list[tuple[Path, float | None]]) -> list[list[tuple[Path, flo
     A part ends at a gap, or where a slow drift would make its dark current differ. Frames without a temperature are one
     part.
     """
-    known = sorted({it for _, it in frames if it is not None})
+    known = sorted({frame for _, frame in frames if frame is not None})
     firsts: list[float] = []
     for index, warmth in enumerate(known):
         if index == 0 or warmth - known[index - 1] > _STEADY_K or warmth - firsts[-1] > _NEAR_SCENE_K:
             firsts.append(warmth)
     parts: dict[float | None, list[tuple[Path, float | None]]] = {}
-    for path, it in frames:
-        first = None if it is None else max(first for first in firsts if first <= it)
-        parts.setdefault(first, []).append((path, it))
+    for path, frame in frames:
+        first = None if frame is None else max(first for first in firsts if first <= frame)
+        parts.setdefault(first, []).append((path, frame))
     return list(parts.values())
 
 
@@ -219,12 +221,18 @@ def scene_temperature_warnings(folder: Path, settings: NoiseSet) -> list[str]:
     """
     if not has_session(folder) or is_file(folder / FILE_NAME):
         return []
-    temperatures = [it.record.temperature_c for frame, it, _ in taken_frames(folder) if frame.kind == "dark_scene"]
+    temperatures = [
+        entry.record.temperature_c for frame, entry, _ in taken_frames(folder) if frame.kind == "dark_scene"
+    ]
     scene = [found for found in temperatures if found is not None]
     if not scene:
         return []
     scene_c = float(np.median(scene))
-    darks = [(it.file, it.temperature_c) for it in settings.frame if it.kind == "dark" and it.temperature_c is not None]
+    darks = [
+        (frame.file, frame.temperature_c)
+        for frame in settings.frame
+        if frame.kind == "dark" and frame.temperature_c is not None
+    ]
     away = [(file, found) for file, found in darks if abs(found - scene_c) > _NEAR_SCENE_K]
     if not away:
         return []

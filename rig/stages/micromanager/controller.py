@@ -197,8 +197,8 @@ class MicroManagerController:
         """Return the name of the stage, and those of its properties that can be set."""
         core, label = self._core, self._label
         name = f"Micro-Manager {core.getDeviceLibrary(label)} {core.getDeviceName(label)} ({core.getVersionInfo()})"
-        names = [it for it in core.getDevicePropertyNames(label) if not core.isPropertyReadOnly(label, it)]
-        return name, {it: core.getProperty(label, it) for it in names}
+        names = [prop for prop in core.getDevicePropertyNames(label) if not core.isPropertyReadOnly(label, prop)]
+        return name, {prop: core.getProperty(label, prop) for prop in names}
 
     def _home(self, bound_s: float) -> None:
         """Home and wait."""
