@@ -1,1 +1,1 @@
-"""What the camera is: its noise, its lens, its poses, and the homographies of a plane."""
+"""Calibration of the camera: noise, lens, poses, and the homographies of a plane."""

@@ -1,4 +1,4 @@
-"""Who wants to know that kernels are being compiled; importing this loads no compiler."""
+"""Callbacks that run before kernels are compiled; importing this loads no compiler."""
 
 from collections.abc import Callable
 

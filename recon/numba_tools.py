@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
-"""What compiled functions share: their options, pointers into arrays, and fast elementary functions.
+"""Common parts of compiled functions: options, pointers into arrays, and fast elementary functions.
 
 An array is a counted reference: passing one to a function that works on 64 numbers costs more than the work itself. A
 pointer is indexed like an array, `pointer[k]`, and costs nothing; whoever makes one must keep the array alive.

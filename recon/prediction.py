@@ -1,4 +1,4 @@
-"""What a capture will show, before it is made: the noise of a sample, the smallest contrast, and how sure a depth is.
+"""Prediction of a capture: the noise of a sample, the smallest contrast, and how sure a depth is.
 
 All of it follows from the Fisher information of one pixel about its light, added up over the views. Light and noise are
 those of one view: where a view is the sum of several frames, so are they.

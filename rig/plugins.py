@@ -27,7 +27,7 @@ _COMMON = ("mosaic", *CoolingSettings.__struct_fields__)
 
 @dataclass(frozen=True)
 class CameraPlugin[T: Struct]:
-    """What an entry point of the group `faintfield.cameras` names.
+    """Factory named by an entry point of the group `faintfield.cameras`.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class CameraPlugin[T: Struct]:
 
 @dataclass(frozen=True)
 class StagePlugin[T: Struct]:
-    """What an entry point of the group `faintfield.stages` names.
+    """Factory named by an entry point of the group `faintfield.stages`.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What the pictures of a grid of views say of their arrangement."""
+"""Arrangement of a grid of views, as its pictures show it."""

@@ -1,4 +1,7 @@
-"""Which number of a name is the row, and whether both numbers run the same way: every point has one disparity."""
+"""Axes of a grid: which number of a name is the row, and whether both run the same way.
+
+Every point has one disparity.
+"""
 
 from dataclasses import dataclass
 from itertools import product
@@ -17,7 +20,7 @@ SURE = 5.0
 
 @dataclass(frozen=True)
 class Axes:
-    """What the disparities along both numbers say.
+    """Disparities along both numbers of the names.
 
     Attributes
     ----------

@@ -30,7 +30,7 @@ _ROUNDS = 8
 
 @dataclass(frozen=True)
 class Fits:
-    """What pairs of neighbours say of each view.
+    """Agreement of each view with its neighbours.
 
     Attributes
     ----------

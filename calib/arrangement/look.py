@@ -1,4 +1,4 @@
-"""What the pictures of a grid say: rows, columns, their directions, disparities, and views that do not fit."""
+"""Inspection of the pictures of a grid: rows, columns, their directions, disparities, and views that do not fit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +28,7 @@ type Unseen = Literal["small", "single", "even", "apart", "dark"]
 
 @dataclass(frozen=True)
 class Look:
-    """What was found.
+    """Result of the inspection.
 
     Attributes
     ----------

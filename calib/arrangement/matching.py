@@ -1,4 +1,4 @@
-"""How well blocks of a view agree with its neighbours, displaced along x and along y."""
+"""Agreement of blocks of a view with its neighbours, displaced along x and along y."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

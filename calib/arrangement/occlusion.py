@@ -1,4 +1,4 @@
-"""Which side of a depth edge is far: it is hidden from one of the two neighbours, the near side from neither.
+"""Far side of a depth edge: it is hidden from one of the two neighbours, the near side from neither.
 
 At an edge where the disparity changes from d₁ to d₂ the near surface covers the far one in the view on one side: the
 one before if the disparity grows along the axis, the one after if it shrinks, whichever of both is near. Only the place

@@ -1,4 +1,4 @@
-"""Whether the neighbours by the names fit one another better than other pictures of the set do in their places."""
+"""Test whether neighbours by name fit one another better than other pictures of the set do in their places."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -39,7 +39,7 @@ type Verdict = Literal["fits", "denied", "open", "few"]
 
 @dataclass(frozen=True)
 class Order:
-    """What exchanging neighbours for other pictures says of the names.
+    """Test of the names by exchanging neighbours for other pictures.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How the two numbers of a name become row and column."""
+"""Orientation of a grid: the two numbers of a name become row and column."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from faintfield.calib.arrangement.pictures import Node
 
 @dataclass(frozen=True)
 class Orientation:
-    """How the two numbers of a name become row and column: swapped first, then reversed."""
+    """Map from the two numbers of a name to row and column: swapped first, then reversed."""
 
     transpose: bool = False
     flip_rows: bool = False

@@ -1,4 +1,4 @@
-"""Where the camera was at every node, what its lens does, and how well both are known."""
+"""Poses of the camera at every node and its lens, with their uncertainty."""
 
 from faintfield.calib.geometry.acceptance import rms_over_views, transfer_sigma_at
 from faintfield.calib.geometry.calibrate import GeometrySettings, calibrate_geometry

@@ -53,7 +53,7 @@ class MapDifference:
 
     @property
     def grown(self) -> bool:
-        """Whether the rms exceeds what is expected by more than these errors are known."""
+        """Return whether the rms exceeds what is expected by more than these errors are known."""
         return self.rms > (1 + _MIN_GROWTH) * self.expected
 
 

@@ -101,12 +101,12 @@ class SeriesFit:
 
     @property
     def light_unknown(self) -> bool:
-        """Whether nothing but an allowance stands for the bend of the response."""
+        """Return whether nothing but an allowance stands for the bend of the response."""
         return self.moments.flats.bend_se == UNKNOWN_BEND_SE
 
     @property
     def rounding_hides_noise(self) -> bool:
-        """Whether the read noise is too small for the Gaussian, and the drift of the level too large for the values."""
+        """Return whether the read noise is too small for the Gaussian, and the drift too large for the values."""
         rounding2 = self.moments.darks.rounding2
         if self.likelihood is not NoiseLikelihood.GAUSSIAN or rounding2 is None:
             return False

@@ -1,4 +1,4 @@
-"""What the flats say of saturation and response, and how far the series scatter about the model."""
+"""Saturation and response from the flats, and the scatter of the series about the model."""
 
 import numpy as np
 from numpy.typing import NDArray

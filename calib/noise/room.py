@@ -1,4 +1,4 @@
-"""Where maps of large sensors lie: in files, so that memory holds only the strips that are worked on."""
+"""Storage for maps of large sensors: in files, so that memory holds only the strips that are worked on."""
 
 import mmap
 from collections.abc import Callable, Iterator

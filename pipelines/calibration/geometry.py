@@ -1,4 +1,4 @@
-"""Where the camera was, from a board set: corners found, lens and poses solved; the record and files of the result."""
+"""Camera poses from a board set: corners found, lens and poses solved; the record and files of the result."""
 
 import io
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ _MAX_NODES_NAMED = 8
 
 @dataclass(frozen=True)
 class MeasuredGeometry:
-    """What a board set says of the camera and its stage.
+    """Calibration of the camera and its stage from a board set.
 
     Attributes
     ----------

@@ -51,7 +51,7 @@ class MeanImage:
 
 @dataclass(frozen=True)
 class EmvaMeasurement:
-    """What the report of one phase of the mosaic shows.
+    """Content of the report of one phase of the mosaic.
 
     Attributes
     ----------

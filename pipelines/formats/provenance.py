@@ -1,4 +1,4 @@
-"""What every result records of its making (command, options, inputs, versions), and whether it is still current."""
+"""Provenance of every result (command, options, inputs, versions), and whether it is still current."""
 
 import platform
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ _PACKAGES = ("faintfield", "numpy", "scipy", "numba", "opencv-contrib-python-hea
 
 
 class Provenance[Options](msgspec.Struct, frozen=True, kw_only=True):
-    """How a result was made: the last keys of its JSON file.
+    """Provenance of a result: the last keys of its JSON file.
 
     Attributes
     ----------

@@ -65,7 +65,7 @@ class StatedUnits(msgspec.Struct, frozen=True):
 
     @property
     def quantity(self) -> str:
-        """What tells planes apart: depth or disparity."""
+        """Coordinate of planes: depth or disparity."""
         return "disparity" if self.depth == "disparity_px" else "depth"
 
     @property
@@ -75,7 +75,7 @@ class StatedUnits(msgspec.Struct, frozen=True):
 
     @property
     def quantity_label(self) -> str:
-        """What tells planes apart, with its unit, for axes and table heads."""
+        """Coordinate of planes with its unit, for axes and table heads."""
         return f"{self.quantity}, {self.length or 'relative'}"
 
     @property
@@ -85,7 +85,7 @@ class StatedUnits(msgspec.Struct, frozen=True):
 
     @property
     def light_in_words(self) -> str:
-        """What the values of a plane are."""
+        """Quantity of the values of a plane."""
         return {
             "electrons": "expected electrons per detector pixel of the reference view",
             "dn": "expected DN above the dark level per detector pixel of the reference view",

@@ -1,4 +1,4 @@
-"""What the capture tells the process of live planes, and what that tells the page."""
+"""Messages from the capture to the process of live planes, and from there to the page."""
 
 import re
 from typing import Literal, get_args
@@ -19,7 +19,7 @@ _PICTURE_NAME = re.compile(r"plane_(\d{3})_(?:view|mean|pmlem)\.png|node_r\d{1,6
 
 
 class LiveOrder(Struct, frozen=True, forbid_unknown_fields=True):
-    """What live planes are asked for: the first line that their process reads.
+    """Request for live planes: the first line that their process reads.
 
     Parameters
     ----------

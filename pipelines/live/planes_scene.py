@@ -1,4 +1,4 @@
-"""What live planes know of the scene before it is complete: nodes, lens, poses and noise, and where these are from."""
+"""Scene of live planes before it is complete: nodes, lens, poses and noise, and where these are from."""
 
 from dataclasses import dataclass
 from pathlib import Path

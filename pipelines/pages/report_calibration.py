@@ -67,7 +67,7 @@ class Section:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseSection(Section):
-    """What the page says of the sensor's noise."""
+    """Section of the page about the sensor's noise."""
 
     record: NoiseRecord
     rows: list[NoiseRow]
@@ -76,7 +76,7 @@ class NoiseSection(Section):
 
 @dataclass(frozen=True, kw_only=True)
 class GeometrySection(Section):
-    """What the page says of where the camera was."""
+    """Section of the page about the poses of the camera."""
 
     record: GeometryRecord
     rows: "list[Row]"

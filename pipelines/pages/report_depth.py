@@ -1,4 +1,4 @@
-"""What a report shows of a depth map."""
+"""Depth map in a report."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -49,7 +49,7 @@ class Sigmas:
 
 
 class Proposed(NamedTuple):
-    """What a prior proposed for a plane, and how far the data moved it, as data URIs."""
+    """Proposal of a prior for a plane and its change by the data, as data URIs."""
 
     title: str
     proposal: str
@@ -73,7 +73,7 @@ class SliderColumn(TypedDict):
 
 @dataclass(frozen=True, kw_only=True)
 class PlaneSections:
-    """What the page shows of the planes, by default of none; the names are those of the template.
+    """Part of the page about the planes, by default without any; the names are those of the template.
 
     Attributes
     ----------

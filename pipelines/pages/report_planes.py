@@ -185,7 +185,7 @@ def plane_words(units: StatedUnits, depth: float, name: str) -> str:
 
 @dataclass(frozen=True)
 class ErrorSections:
-    """What the page shows of errors; the names are those of the template.
+    """Part of the page about errors; the names are those of the template.
 
     Attributes
     ----------

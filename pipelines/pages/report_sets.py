@@ -52,7 +52,7 @@ class PhotonBudget:
 
 @dataclass(frozen=True)
 class SetSection:
-    """What the page shows of one set.
+    """Part of the page about one set.
 
     Attributes
     ----------

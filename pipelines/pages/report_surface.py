@@ -1,4 +1,4 @@
-"""What a report shows of a surface: its pictures, how much of it is known, and how well it predicts views left out."""
+"""Surface in a report: its pictures, how much of it is known, and how well it predicts views left out."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Prediction:
-    """How well one way predicts the views that were left out."""
+    """Prediction of the left-out views by one way."""
 
     by: str
     deviance: float
@@ -42,7 +42,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class SurfaceSection:
-    """What the page shows of one surface.
+    """Part of the page about one surface.
 
     Attributes
     ----------

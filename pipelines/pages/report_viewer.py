@@ -1,4 +1,4 @@
-"""What the viewer of a report shows: numbers packed in lossless pictures that the page's script decodes, and scales."""
+"""Data of a report's viewer: numbers packed in lossless pictures that the page's script decodes, and scales."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -95,7 +95,7 @@ class Scale(TypedDict):
 
 
 class Viewer(TypedDict):
-    """What the viewer shows; JSON for the page's script.
+    """Data of the viewer; JSON for the page's script.
 
     `first` are the indices of the two pictures that it opens with, `length` is the unit of lengths on the planes, and
     `binned` says whether any plane is.

@@ -48,7 +48,7 @@ _BOARD_SWEEPS = 6
 
 @dataclass(frozen=True)
 class DemoSize:
-    """How much is captured: nodes along each side of the grid, their pitch, pixels, and dark and flat frames."""
+    """Size of the capture: nodes along each side of the grid, their pitch, pixels, and dark and flat frames."""
 
     nodes: int
     pitch_mm: float

@@ -1,1 +1,1 @@
-"""What a capture will show, before it is made."""
+"""Prediction of a capture before it is made."""

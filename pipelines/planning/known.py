@@ -1,4 +1,4 @@
-"""What is known of a rig before a capture: its sensor, its lens, and how fast it is."""
+"""Knowledge of a rig before a capture: its sensor, its lens, and how fast it is."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -42,7 +42,7 @@ _simulated_experiment = lru_cache(maxsize=1)(lab_experiment)
 
 @dataclass(frozen=True)
 class Sensor:
-    """What is known of the noise.
+    """Known noise.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ def _simulated_sensor(settings: SimulatedSettings) -> Sensor:
 
 @dataclass(frozen=True)
 class KnownLens:
-    """What is known of the lens.
+    """Known lens.
 
     Attributes
     ----------
@@ -251,7 +251,7 @@ def known_lens(
 
 @dataclass(frozen=True)
 class KnownPace:
-    """How fast stage and camera are, and where the stage may go.
+    """Speeds of stage and camera, and the travel of the stage.
 
     Attributes
     ----------

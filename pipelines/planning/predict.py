@@ -42,7 +42,7 @@ _NO_DEPTH = "no depth; give --depth-mm, or depth_mm under [scene] of the rig.tom
 
 
 class View(NamedTuple):
-    """What is added up to one view: all frames of a node."""
+    """Frames of a node, which add up to one view."""
 
     exposure_s: float
     frames: int
@@ -50,7 +50,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked for.
+    """Request for a prediction.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""How the views of a set agree at each of some depths, in bins of pixels: what autofocus compares."""
+"""Agreement of the views of a set at each of some depths, in bins of pixels: what autofocus compares."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

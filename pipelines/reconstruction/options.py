@@ -22,7 +22,7 @@ OF_PLANES = (
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to reconstruct, and how.
+    """Options of a reconstruction.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ _PMLEM_CERTIFICATE = (
 
 @dataclass(frozen=True)
 class Objective:
-    """What PMLEM minimises, except for the penalty's weight.
+    """Objective that PMLEM minimises, without the penalty's weight.
 
     Attributes
     ----------

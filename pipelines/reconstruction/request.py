@@ -1,4 +1,4 @@
-"""What `reconstruct` and `run` are asked for: their options select planes, are checked, and are resolved for a set."""
+"""Request to `reconstruct` and `run`: their options select planes, are checked, and are resolved for a set."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -48,7 +48,7 @@ _BLACK_E = 1e-5
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What a reconstruction gives: the result of `faintfield reconstruct`, which adds the path of the report."""
+    """Outcome of a reconstruction: the result of `faintfield reconstruct`, which adds the path of the report."""
 
     out: str
     report: str | UnsetType = UNSET

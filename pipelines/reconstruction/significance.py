@@ -1,4 +1,4 @@
-"""Whether depths that are found could be chance: views are shuffled between their places and compared again."""
+"""Test whether depths that are found could be chance: views are shuffled between their places and compared again."""
 
 from dataclasses import dataclass
 from itertools import permutations
@@ -45,7 +45,7 @@ _SEED = 20
 
 @dataclass(frozen=True)
 class _Views:
-    """What views show from each other's places; the arguments of `disagreement`, and the nodes."""
+    """Views from each other's places; the arguments of `disagreement`, and the nodes."""
 
     light_e: NDArray[np.float32]
     seen: NDArray[np.bool_]

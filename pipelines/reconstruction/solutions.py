@@ -1,4 +1,4 @@
-"""How planes are asked for and returned: settings, and solutions with their records."""
+"""Request and result of planes: settings, and solutions with their records."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,7 +13,7 @@ from faintfield.recon.solver.penalties import PenaltyName
 
 @dataclass(frozen=True)
 class Settings:
-    """How planes are reconstructed.
+    """Settings of the reconstruction of planes.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Pilot:
-    """What the prior of one colour begins with.
+    """Start of the prior of one colour.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ _LIGHT: dict[LightUnit, str] = {"electrons": "electrons", "dn": "DN", "relative"
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """What is known of each sample of a surface, all of one shape (row, column).
+    """Maps of a surface, all of one shape (row, column).
 
     Attributes
     ----------

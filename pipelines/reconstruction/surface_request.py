@@ -1,4 +1,4 @@
-"""What `--surface` is asked for."""
+"""Request for a surface."""
 
 import re
 from dataclasses import dataclass, field, replace

@@ -41,7 +41,7 @@ _MIN_LIGHT_SIGMAS, _MIN_LIGHT = 4.0, 0.03
 
 
 class Agreement(NamedTuple):
-    """How the views agree on each sample of a plane (row, column), how many see it, and its light.
+    """Agreement of the views on each sample of a plane (row, column), their number, and the light.
 
     `squares` is `Hᵀ[(g − b − H f)²/v]`, whose mean is s − 1 if the views differ by noise alone, like that of χ²;
     `light` and `light_variance` are the mean of the views, f, and its variance, in e⁻ and e⁻².

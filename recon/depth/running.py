@@ -14,7 +14,7 @@ _MIN_COVERAGE = 0.5
 
 
 class SeenByView(NamedTuple):
-    """What one view says of a plane: its light Hᵀ(g − b), and its coverage Hᵀ H 1, both (row, column)."""
+    """Contribution of one view to a plane: its light Hᵀ(g − b), and its coverage Hᵀ H 1, both (row, column)."""
 
     light: Image
     coverage: Image
@@ -70,7 +70,7 @@ class RunningPlane:
 
     @property
     def covered(self) -> NDArray[np.bool_]:
-        """Which samples at least half a view sees."""
+        """Mask of the samples that at least half a view sees."""
         return np.asarray(self._coverage.sum(axis=0) > _MIN_COVERAGE)
 
     def mean(self) -> Image:

@@ -1,4 +1,4 @@
-"""Whether views agree better at their places than shuffled: a permutation test."""
+"""Permutation test of views at their places against shuffled views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _EQUAL = 1e-5
 
 @dataclass(frozen=True)
 class Significance:
-    """How often shuffled views agree at least as well as those at their places.
+    """Share of shuffled orders that agree at least as well as the true one.
 
     Attributes
     ----------

@@ -57,7 +57,7 @@ class PixelLikelihood:
 
     @property
     def knows_read_noise(self) -> bool:
-        """Whether the model takes the read noise into account."""
+        """Return whether the model takes the read noise into account."""
         return self.name != "poisson"
 
 

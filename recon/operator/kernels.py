@@ -31,7 +31,7 @@ SCATTERING = (ADJOINT, RATIO, VALUE_AND_RATIO, NORMAL, PRECISION, PRECISION_OF_E
 
 
 class SceneGeometry(NamedTuple):
-    """Where the detector pixels of every view see the planes, as the kernels read it.
+    """Positions where the detector pixels of every view see the planes, as the kernels read them.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What nearer planes hide of the light of others, judged by the light of the nearer planes."""
+"""Occlusion by nearer planes, judged by their light."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple

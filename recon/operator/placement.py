@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def"
-"""Where a block of pixels of one detector row lies on each plane, compiled, and the memory of one worker."""
+"""Placement of a block of pixels of one detector row on each plane, compiled, and the memory of one worker."""
 
 from typing import Any, NamedTuple
 

@@ -31,7 +31,7 @@ _TINY = 1e-37
 
 
 class Hiding(NamedTuple):
-    """What nearer planes hide, as the kernel reads it.
+    """Occlusion by nearer planes, as the kernel reads it.
 
     Attributes
     ----------

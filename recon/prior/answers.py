@@ -1,4 +1,4 @@
-"""How a plane by a prior answers to noise in the data: what its standard deviation is found from."""
+"""Response of a plane by a prior to noise in the data, which gives its standard deviation."""
 
 from dataclasses import replace
 

@@ -17,7 +17,7 @@ _KAISER_BETA = 2.0
 
 
 class Patches(NamedTuple):
-    """How groups of alike patches are formed.
+    """Settings by which groups of similar patches are formed.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What the data say of each plane: a picture with its noise, and the same picture of a plane without noise."""
+"""Evidence of the data for each plane: a picture with its noise, and the same picture of a plane without noise."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -35,7 +35,7 @@ class Noise(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What some views say of one plane.
+    """Evidence of some views for one plane.
 
     Attributes
     ----------

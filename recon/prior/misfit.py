@@ -1,4 +1,4 @@
-"""Whether the views contradict planes by more than their noise: then noise is not what limits them."""
+"""Test whether the views contradict planes by more than their noise: then noise is not what limits them."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class Misfit(NamedTuple):
 
     @property
     def contradicts(self) -> bool:
-        """Whether the residuals in detail are larger than noise makes them, and larger than elsewhere."""
+        """Return whether the residuals in detail are larger than noise makes them, and larger than elsewhere."""
         chance = _SIGMAS * self.se
         return self.detail - 1 > _MAX_EXCESS + chance and self.detail - self.smooth > _MAX_BEYOND_SMOOTH + chance
 

@@ -22,7 +22,7 @@ _MAX_PENALTY_GRADIENT = 2 + 2**0.5
 
 @dataclass(frozen=True)
 class IterationStep:
-    """How far one pass over the data moved the plane.
+    """Change of the plane in one pass over the data.
 
     Attributes
     ----------

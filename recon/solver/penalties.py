@@ -49,7 +49,7 @@ class Penalty:
 
     @property
     def bounded(self) -> bool:
-        """Whether the derivative of φ never exceeds one."""
+        """Return whether the derivative of φ never exceeds one."""
         return self.name != "quadratic"
 
 

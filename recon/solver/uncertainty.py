@@ -44,7 +44,7 @@ _LEAST_ALTERNATION = 0.01
 
 @dataclass(frozen=True)
 class LocalFit:
-    """What the views say of a plane near its optimum: all that σ needs of them.
+    """Local model of a plane near its optimum: all that σ needs of the views.
 
     Attributes
     ----------
@@ -211,7 +211,7 @@ class Expected(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """How σ² is composed: of the square answers under two blurs, their mean over the region, and the square gradient.
+    """Composition of σ²: the square answers under two blurs, their mean over the region, and the square gradient.
 
     The last is for edges, which are more uncertain than the answers show: their place is. It is scaled such that its
     mean over the region is that of the square answers.
@@ -225,7 +225,7 @@ class Weights(NamedTuple):
 
 @dataclass(frozen=True)
 class UsualErrors:
-    """What is known of the squared errors of an estimate before they are measured.
+    """Prior knowledge of the squared errors of an estimate.
 
     Attributes
     ----------
@@ -251,11 +251,11 @@ class Answers(Protocol):
 
     @property
     def problem(self) -> LocalProblem:
-        """What the views say near the estimate."""
+        """Local model of the views near the estimate."""
 
     @property
     def usual(self) -> UsualErrors:
-        """What is known of its errors."""
+        """Prior knowledge of its errors."""
 
     def __call__(self, change: Image) -> Image:
         """Return the change of the estimate."""

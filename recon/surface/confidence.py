@@ -1,4 +1,4 @@
-"""How sure a depth is: the probability that it is right within 2 %, from what is known to go wrong."""
+"""Confidence of a depth: the probability that it is right within 2 %, from what is known to go wrong."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""What the views say of each depth of each sample: log-likelihood ratios against a surface assumed so far."""
+"""Evidence of the views for each depth of each sample: log-likelihood ratios against a surface assumed so far."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

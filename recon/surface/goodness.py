@@ -1,4 +1,4 @@
-"""How well a surface explains the views: what of their detail it predicts, and what it leaves unexplained."""
+"""Goodness of a surface: the part of the views' detail that it predicts, and what it leaves unexplained."""
 
 import numpy as np
 from numpy.typing import NDArray

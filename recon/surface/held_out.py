@@ -22,7 +22,7 @@ _LEVEL_SCALE = 8.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """How well views that were left out are predicted.
+    """Goodness of the prediction of views that were left out.
 
     Attributes
     ----------

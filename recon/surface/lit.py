@@ -1,4 +1,4 @@
-"""Which samples of a surface have light: black looks alike at all depths, so that nothing tells its own."""
+"""Mask of the samples of a surface that have light: black looks alike at all depths, so that nothing tells its own."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -17,7 +17,7 @@ type Decode = Callable[[Path], Pixels | None]
 
 
 class CameraReport(Struct, frozen=True):
-    """What the camera reports about itself.
+    """Identity and properties that a camera reports.
 
     Parameters
     ----------

@@ -51,7 +51,7 @@ class SettingChange(Struct, frozen=True):
 
     @property
     def frozen(self) -> bool:
-        """Whether a session keeps the value that it was begun with."""
+        """Return whether a session keeps the value that it was begun with."""
         return self.key.partition(".")[0] not in _OPEN_TABLES and self.key not in _OPEN_KEYS
 
     def __str__(self) -> str:

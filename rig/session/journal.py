@@ -49,7 +49,7 @@ _MAX_PENDING_TRAFFIC = 2000
 
 
 class FrameRecord(Struct, frozen=True):
-    """What the journal says about a frame besides its file.
+    """Entry of the journal about a frame, without its file.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ type Point = tuple[float, float, float]
 
 
 class Shape(Protocol):
-    """What a ray can meet; all coordinates are the reference camera's: x right, y down, z along its axis, mm."""
+    """Shape that a ray can meet; all coordinates are the reference camera's: x right, y down, z along its axis, mm."""
 
     def meet(self, origin_mm: NDArray[np.float64], directions: Vectors) -> Scalars:
         """Return s (ray,) of the first point `origin + s · direction`, s > 0, on the shape; inf where there is none."""

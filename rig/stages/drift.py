@@ -48,7 +48,7 @@ class Drift(Struct, frozen=True):
 
     @property
     def passed(self) -> bool:
-        """Whether no axis has drifted by more than the limit."""
+        """Return whether no axis has drifted by more than the limit."""
         return all(abs(value) <= self.limit_mm for value in self.away_mm)
 
 
@@ -74,17 +74,17 @@ class DriftWatch:
 
     @property
     def begun(self) -> bool:
-        """Whether there is something to compare with, so that drift can be checked."""
+        """Return whether there is a reference, so that drift can be checked."""
         return set(self._speed_mm_per_s) == set(self._homing_axes())
 
     @property
     def unchecked(self) -> tuple[object, ...]:
-        """What was recorded since the last passed check, and is judged by the next."""
+        """Frames recorded since the last passed check, which the next check judges."""
         return tuple(self._unchecked)
 
     @property
     def doubtful(self) -> tuple[object, ...]:
-        """What was recorded before a failed check, or not checked before the stage was homed again."""
+        """Frames recorded before a failed check, or not checked before the stage was homed again."""
         return tuple(self._doubtful)
 
     def note(self, what: object) -> None:

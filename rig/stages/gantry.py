@@ -47,12 +47,12 @@ class Gantry:
 
     @property
     def homings(self) -> int:
-        """How often it was homed: positions before and after a homing may differ by what the switches do."""
+        """Number of homings: positions before and after a homing may differ by what the switches do."""
         return self._homings
 
     @property
     def trusted(self) -> bool:
-        """Whether reported positions can be trusted."""
+        """Return whether reported positions can be trusted."""
         return self._trusted
 
     def connect(self) -> None:

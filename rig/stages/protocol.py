@@ -62,7 +62,7 @@ class MotionLimits(Struct, frozen=True):
 
 
 class Identity(Struct, frozen=True):
-    """What the controller reports about itself: firmware, limits, settings.
+    """Description of a controller: firmware, limits, settings.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class Position(Struct, frozen=True):
 
 
 class AnswerTime(NamedTuple):
-    """How long a command took (s), and by how much less it may have taken because its answer was read late."""
+    """Duration of a command (s), and by how much less it may have taken because its answer was read late."""
 
     taken_s: float
     late_s: float
@@ -138,7 +138,7 @@ class Homing(Struct, frozen=True):
 
     @property
     def duration_s(self) -> float:
-        """How long the controller took, at most."""
+        """Longest time that the controller may have taken (s)."""
         return self.time.taken_s
 
 
@@ -266,5 +266,5 @@ class StageSettings(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def simulated(self) -> bool:
-        """Whether the stage is simulated."""
+        """Return whether the stage is simulated."""
         return self.protocol == "simulated" or self.port.startswith(SIMULATED)

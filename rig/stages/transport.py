@@ -143,7 +143,7 @@ class LineTransport:
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection was opened and has not been lost since."""
+        """Return whether the connection was opened and has not been lost since."""
         return self._port is not None
 
     def open(self, wait_s: float = 0.0) -> None:

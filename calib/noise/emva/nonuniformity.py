@@ -1,4 +1,4 @@
-"""How pixels differ, as EMVA 1288 release 4.0 shows it: row, column and pixel parts, spectrograms and histograms.
+"""Non-uniformity of pixels by EMVA 1288 release 4.0: row, column and pixel parts, spectrograms and histograms.
 
 All functions take the mean image of a series (row, column) and the pixels to use. What temporal noise is left in a mean
 over frames is known from the scatter of the frames, and is taken out.

@@ -55,7 +55,7 @@ def snr(
 
 @dataclass(frozen=True)
 class Inputs:
-    """What the derived quantities follow from: values by name, the reasons for those without, and the covariance.
+    """Inputs of the derived quantities: values by name, the reasons for those without, and the covariance.
 
     Attributes
     ----------

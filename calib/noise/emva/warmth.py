@@ -1,4 +1,4 @@
-"""How the dark current grows with temperature, from dark frames at several temperatures."""
+"""Growth of the dark current with temperature, from dark frames at several temperatures."""
 
 import numpy as np
 from numpy.typing import NDArray

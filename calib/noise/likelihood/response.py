@@ -67,7 +67,7 @@ def _polynomial(coefficients: Sequence[Any], x: Any) -> Any:
 
 @dataclass(frozen=True)
 class Light:
-    """What is known of the light of the flat series.
+    """Known light of the flat series.
 
     Attributes
     ----------

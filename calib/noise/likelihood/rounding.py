@@ -30,7 +30,7 @@ _MAX_BLUR = 0.7
 
 @dataclass(frozen=True)
 class Rounding:
-    """What rounding does to the variance of a series' values beyond 1/12 DN².
+    """Effect of rounding on the variance of a series' values beyond 1/12 DN².
 
     Attributes
     ----------

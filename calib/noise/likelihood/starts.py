@@ -1,4 +1,4 @@
-"""Where the search for the likelihood of single values begins."""
+"""Start values of the search for the likelihood of single values."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,1 +1,1 @@
-"""What differs from pixel to pixel."""
+"""Maps of what differs from pixel to pixel."""

@@ -1,4 +1,4 @@
-"""What differs from pixel to pixel, in the order in which it is measured: noise, offset, response to light, gain."""
+"""Maps of the pixels in the order in which they are measured: noise, offset, response to light, gain."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _CENSORED = NoiseLikelihood.CENSORED
 
 @dataclass(frozen=True)
 class Pixels:
-    """What was measured of the pixels.
+    """Measurements of the pixels.
 
     Attributes
     ----------

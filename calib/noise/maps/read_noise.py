@@ -139,7 +139,7 @@ class _LineFactor:
 
     @property
     def varies(self) -> bool:
-        """Whether pixels differ."""
+        """Return whether pixels differ."""
         return bool(np.ptp(self.of_rows) > 0 or np.ptp(self.of_columns) > 0)
 
 

@@ -1,1 +1,1 @@
-"""Where the frames deny the model: scatter, goodness of fit, drift, contradictions."""
+"""Misfit of the model to the frames: scatter, goodness of fit, drift, contradictions."""

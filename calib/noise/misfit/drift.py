@@ -1,4 +1,4 @@
-"""What moves while the frames are taken: the lamp, the black level and the temperature."""
+"""Drift while the frames are taken: the lamp, the black level and the temperature."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""How well each series follows the model."""
+"""Goodness of fit of each series."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Scatter:
 
 @dataclass(frozen=True)
 class SeriesGoodness:
-    """How well one series follows the model.
+    """Goodness of fit of one series.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ _MAX_ROUNDS, _SETTLED = 5, 0.02
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of an excess variance: degrees of freedom, and its share in the variance that it is part of."""
+    """Knowledge of an excess variance: degrees of freedom, and its share in the variance that it is part of."""
 
     freedom: int
     share: float

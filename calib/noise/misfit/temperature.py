@@ -22,7 +22,7 @@ _USUAL_PER_K = 0.1
 
 @dataclass(frozen=True)
 class Warmth:
-    """What the temperatures of the darks say.
+    """Doubling temperature from the darks.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ _MAX_FILLED = 0.7
 
 @dataclass(frozen=True)
 class Saturation:
-    """Where a sensor saturates, and the series of flats within its range.
+    """Saturation of a sensor, and the series of flats within its range.
 
     Attributes
     ----------

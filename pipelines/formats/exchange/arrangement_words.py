@@ -1,4 +1,4 @@
-"""What was found of the views of a grid, in words: a table, and what a person should know before using the set."""
+"""Report on the views of a grid: a table, and what a person should know before using the set."""
 
 import numpy as np
 from rich.table import Table

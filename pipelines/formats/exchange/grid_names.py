@@ -1,4 +1,4 @@
-"""What the names of pictures say of their places on a grid: rows, columns, running numbers and measured positions."""
+"""Places on a grid from the names of pictures: rows, columns, running numbers and measured positions."""
 
 import math
 import re
@@ -41,7 +41,7 @@ _WITH_POSITIONS = [
 
 @dataclass(frozen=True)
 class Place:
-    """What a name says of its picture; None for what it does not say."""
+    """Place of a picture as its name states it; None for what the name does not state."""
 
     row: int | None = None
     column: int | None = None

@@ -34,7 +34,7 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True)
 class DescribedGrid:
-    """What `parameters.cfg` states.
+    """Content of `parameters.cfg`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class DescribedGrid:
 
     @property
     def disparity_px(self) -> float:
-        """How far points at the depth of focus moved from view to view before the views were sheared."""
+        """Disparity of points at the depth of focus before the views were sheared (px)."""
         return self.fx_px * self.pitch_mm / self.focus_mm
 
     def scale(

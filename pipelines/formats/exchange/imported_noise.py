@@ -81,7 +81,7 @@ class Pictures:
 
 
 class NoiseOrigin(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Where gain and read noise of an imported set come from, in provenance.json.
+    """Origin of gain and read noise of an imported set, in provenance.json.
 
     Attributes
     ----------

@@ -57,7 +57,7 @@ class PosedModel:
 
 
 class ImportProvenance(Provenance[dict[str, Any]], frozen=True, kw_only=True):
-    """How a set was imported: its tone curve, which was undone, and where its gain and read noise come from."""
+    """Record of an import: the tone curve, which was undone, and where its gain and read noise come from."""
 
     tone: Tone
     noise: NoiseOrigin

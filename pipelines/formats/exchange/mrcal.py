@@ -35,7 +35,7 @@ type _Pose = tuple[float, float, float, float, float, float]
 
 
 class _CameraModel(msgspec.Struct, frozen=True):
-    """What is read of a .cameramodel; `extrinsics` is the older name of the pose."""
+    """Part of a .cameramodel that is read; `extrinsics` is the older name of the pose."""
 
     lensmodel: str
     intrinsics: Annotated[tuple[float, ...], msgspec.Meta(min_length=4)]

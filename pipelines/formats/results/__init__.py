@@ -1,1 +1,1 @@
-"""What comes out: noise, geometry, planes and reconstructions, each with its record type."""
+"""Results: noise, geometry, planes and reconstructions, each with its record type."""

@@ -106,7 +106,7 @@ class PosesOfSession(CameraPoses, frozen=True, kw_only=True):
 
 
 class RepeatabilityRecord(Struct, frozen=True):
-    """How far the gantry comes back to a node in another sweep: standard deviation per axis, and its error."""
+    """Repeatability of the gantry at a node in another sweep: standard deviation per axis, and its error."""
 
     sd_mm: float
     se_mm: float

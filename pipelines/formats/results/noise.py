@@ -52,7 +52,7 @@ _NOT_STATED = Measured(None, why="not stated")
 
 
 class Quantities(Struct, frozen=True, kw_only=True):
-    """What is measured of a sensor, or of one phase of its colour filter mosaic.
+    """Measurements of a sensor, or of one phase of its colour filter mosaic.
 
     A reconstruction needs the first four. Only noise.json files that were written by hand lack any of the others.
     """
@@ -176,7 +176,7 @@ def write_noise(
 
 @dataclass(frozen=True)
 class FittedNoise:
-    """What a noise calibration says of a sensor.
+    """Noise model of a sensor from a calibration.
 
     Attributes
     ----------

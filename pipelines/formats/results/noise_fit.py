@@ -1,4 +1,4 @@
-"""How well the frames of a sensor fit: the part of `noise.json` about saturation, response and scatter."""
+"""Goodness of fit of a sensor's frames: the part of `noise.json` about saturation, response and scatter."""
 
 from typing import Literal
 
@@ -22,7 +22,7 @@ class ResponseRecord(Struct, frozen=True):
 
 
 class SaturationRecord(Struct, frozen=True):
-    """What ends the range of the flats, and where."""
+    """End of the range of the flats, and its reason."""
 
     limit: Literal["ADC", "full well", "not reached"]
     level_dn: float | None
@@ -30,7 +30,7 @@ class SaturationRecord(Struct, frozen=True):
 
 
 class GoodnessRecord(Struct, frozen=True, omit_defaults=True):
-    """How well one series follows the model, or why it was left out.
+    """Goodness of fit of one series, or the reason why it was left out.
 
     `noise_excess` is its variance over the model's, minus 1, with the error `noise_se` of Gaussian noise; the deviances
     of blocks of pixels, rows, columns and frames are per degree of freedom, 1 where the noise is Gaussian.
@@ -51,7 +51,7 @@ class GoodnessRecord(Struct, frozen=True, omit_defaults=True):
 
 
 class FitRecord(Struct, frozen=True):
-    """What the flats say of saturation and response, how far series scatter about the model, and how well each fits.
+    """Saturation and response from the flats, how far series scatter about the model, and how well each fits.
 
     `telegraph_pixels` is how many jump between two levels; `maps_absent` tells why there is no map of the gain per
     pixel, or of the read noise.

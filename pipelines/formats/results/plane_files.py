@@ -62,7 +62,7 @@ class _Part(Provenance[ReconstructionOptions], frozen=True):
 
 @dataclass(frozen=True)
 class PlaneFiles:
-    """Where the files of one plane by one method are, and what they must be made of.
+    """Paths of the files of one plane by one method, and their inputs.
 
     Attributes
     ----------

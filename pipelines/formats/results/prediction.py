@@ -79,7 +79,7 @@ class Alternative(Struct, frozen=True, kw_only=True):
 
 
 class PredictionRecord(Struct, frozen=True, kw_only=True):
-    """What a capture will show.
+    """Prediction of what a capture will show.
 
     Attributes
     ----------

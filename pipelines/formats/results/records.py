@@ -56,7 +56,7 @@ def record_name(name: str) -> str:
 
 
 class Certificate(Struct, frozen=True, kw_only=True):
-    """How far an iteration came.
+    """Convergence of an iteration.
 
     PMLEM to its optimum: `value` bounds the relative distance to the optimum (`stationarity` and `slack` are its
     parts), and `reached` says whether it is below `tolerance`. One-step-late: `relative_change` of the last pass.
@@ -77,7 +77,7 @@ class Certificate(Struct, frozen=True, kw_only=True):
 
     @property
     def is_bound(self) -> bool:
-        """Whether `value` bounds the distance to the optimum."""
+        """Return whether `value` bounds the distance to the optimum."""
         return self.value is not UNSET
 
 
@@ -96,7 +96,7 @@ class PenaltyRecord(Struct, frozen=True):
 
 
 class PriorRecord(Struct, frozen=True, kw_only=True):
-    """What a prior proposed for a plane, and what the data made of it.
+    """Proposal of a prior for a plane, and its change by the data.
 
     `mixture` has the weights of the candidates by region, with or without light and detail. `moved_sigma` is the root
     mean square of plane less proposal, in standard deviations of the back-projection's noise. `no_network`
@@ -111,7 +111,7 @@ class PriorRecord(Struct, frozen=True, kw_only=True):
 
 
 class SolveRecord(Struct, frozen=True, kw_only=True):
-    """How one colour of a plane was solved: the middle part of `PlaneRecord`."""
+    """Solution of one colour of a plane: the middle part of `PlaneRecord`."""
 
     penalty_weight: float | None
     penalty_weight_chosen: str
@@ -199,7 +199,7 @@ class FocusCurve(Struct, frozen=True, kw_only=True):
 
 
 class BestFocusRecord(Struct, frozen=True):
-    """How `--depth-mm auto` found its depths.
+    """Search by `--depth-mm auto` for depths of best focus.
 
     `p_value` is the share of `shuffles`, views exchanged between their places, whose views agree at least as well, and
     `z_shuffled` by how many of their standard deviations the stated places are better.
@@ -327,7 +327,7 @@ class PhotonsRecord(Struct, frozen=True):
 
 
 class GeometryErrors(Struct, frozen=True):
-    """How far the measured poses are off the true ones."""
+    """Errors of the measured poses."""
 
     nodes: int
     centre_rms_mm: float

@@ -49,7 +49,7 @@ class SurfaceOptions(Struct, frozen=True, kw_only=True):
 
 
 class HeldOutRecord(Struct, frozen=True, kw_only=True):
-    """How well views that were left out are predicted from the others.
+    """Prediction of views that were left out from the other views.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class HeldOutRecord(Struct, frozen=True, kw_only=True):
 
 
 class SurfaceChannel(Struct, frozen=True, kw_only=True):
-    """How one colour of the picture was solved."""
+    """Solution of one colour of the picture."""
 
     channel: str
     penalty_weight: float | None
@@ -88,7 +88,7 @@ class SurfaceChannel(Struct, frozen=True, kw_only=True):
 
 
 class SurfaceFacts(Struct, frozen=True, kw_only=True):
-    """What the estimation says of a surface, besides its maps.
+    """Record of the estimation of a surface, without its maps.
 
     Attributes
     ----------

@@ -50,7 +50,7 @@ _LEVELS_ABOVE = 2
 
 
 class ResultVerdict(Struct, frozen=True):
-    """What was found of results.
+    """Verdict on results.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""What goes in: elemental sets, sessions, noise sets, board sets, and the truth of simulated ones."""
+"""Inputs: elemental sets, sessions, noise sets, board sets, and the truth of simulated ones."""

@@ -33,7 +33,7 @@ class TruePlane(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TrueSurface(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What the reference camera would see without distortion and vignetting, on the samples of its own pixels.
+    """Light that the reference camera would see without distortion and vignetting, on the samples of its own pixels.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What is written of a set, in the units of the set: numbers of records, light, and names of planes."""
+"""Values in the units of a set: numbers of records, light, and names of planes."""
 
 from typing import Any
 

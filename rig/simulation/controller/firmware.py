@@ -1,4 +1,4 @@
-"""What the simulated GRBL and Marlin share: restarts, lines and homing, and a server that gives them a real port."""
+"""Common parts of the simulated GRBL and Marlin: restarts, lines, homing, and a server that gives them a real port."""
 
 import os
 import re
@@ -73,7 +73,7 @@ class SimulatedFirmware(ABC):
 
     @property
     def homing(self) -> bool:
-        """Whether the carriages are searching their switches."""
+        """Return whether the carriages are searching their switches."""
         return self._homing is not None
 
     @abstractmethod

@@ -152,7 +152,7 @@ class Mechanics:
 
     @property
     def moving(self) -> bool:
-        """Whether a motion is under way or queued."""
+        """Return whether a motion is under way or queued."""
         return self._motion is not None
 
     def commanded_mm(self) -> Vector:

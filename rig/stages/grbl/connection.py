@@ -62,7 +62,7 @@ class GrblConnection:
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection was opened and has not been lost since."""
+        """Return whether the connection was opened and has not been lost since."""
         return self._line.is_open
 
     @property

@@ -78,7 +78,7 @@ class Report(Struct, frozen=True):
 
     @property
     def emergency_stop(self) -> bool:
-        """Whether the emergency stop is pressed, which grblHAL tells among the inputs."""
+        """Return whether the emergency stop is pressed, which grblHAL reports among the inputs."""
         return "E" in self.pins
 
 

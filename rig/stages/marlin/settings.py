@@ -15,7 +15,7 @@ _HOMING_BOUND_S = 240.0
 
 
 class MarlinSettings:
-    """What one controller has reported.
+    """Settings that one controller has reported.
 
     Parameters
     ----------
