@@ -36,9 +36,9 @@ _NOTHING = np.zeros(0)
 
 def samples_of(folder: Path, truth: Path) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the features (sample, feature) of a set's depths, and which are right (sample,)."""
-    loaded = load_set(folder)
-    bins = default_bins(loaded)
-    views, nodes = between_pixels(luminance(loaded, bins)), nodes_of(loaded)
+    elemental_set = load_set(folder)
+    bins = default_bins(elemental_set)
+    views, nodes = between_pixels(luminance(elemental_set, bins)), nodes_of(elemental_set)
     true_mm = tifffile.imread(truth / "true_depth_mm.tiff")[bins // 2 :: bins, bins // 2 :: bins]
     true_mm = true_mm[: views.grid.shape[0], : views.grid.shape[1]]
     depths = equal_steps(views, 1 / (1.2 * float(np.nanmax(true_mm))), 1 / (0.85 * float(np.nanmin(true_mm))))

@@ -76,9 +76,9 @@ def test_wheel_needs_neither_mrcal_nor_second_opencv() -> None:
 
 def test_import_of_faintfield_loads_nothing_heavy() -> None:
     ended = subprocess.run([sys.executable, "-c", _IMPORT], cwd=_ROOT, capture_output=True, text=True, check=True)
-    loaded = ended.stdout.split()
-    assert "faintfield" in loaded
-    assert not [name for name in loaded if name.startswith(("faintfield.", "numpy", "numba", "cv2", "mrcal"))]
+    elemental_set = ended.stdout.split()
+    assert "faintfield" in elemental_set
+    assert not [name for name in elemental_set if name.startswith(("faintfield.", "numpy", "numba", "cv2", "mrcal"))]
 
 
 def test_public_names_load() -> None:

@@ -20,7 +20,7 @@ type Result = Darkened
 
 
 def darken(
-    elemental_set: Annotated[Path, Parameter(name="SET")],
+    set_path: Annotated[Path, Parameter(name="SET")],
     out: Path,
     /,
     *,
@@ -40,7 +40,7 @@ def darken(
 
     Parameters
     ----------
-    elemental_set
+    set_path
         Folder with elemental.toml of the bright set.
     out
         Folder to write.
@@ -59,11 +59,11 @@ def darken(
     overwrite
         Replace an earlier set in OUT.
     """
-    options = {name: value for name, value in locals().items() if name not in ("elemental_set", "out", "overwrite")}
+    options = {name: value for name, value in locals().items() if name not in ("set_path", "out", "overwrite")}
     from faintfield.pipelines.formats.sets.elemental_set import load_set
     from faintfield.pipelines.simulation.darken import darken_set
 
-    darkened = darken_set(load_set(elemental_set), out, DarkeningOptions(**options), overwrite=overwrite)
+    darkened = darken_set(load_set(set_path), out, DarkeningOptions(**options), overwrite=overwrite)
     measured = "no SNR" if darkened.snr_measured is None else f"SNR {darkened.snr_measured:.3f}"
     photons = f"{darkened.photons_on_object:.2f} photons per pixel on the object"
     inform(f"{out}: {measured} measured for {snr:g} asked; {photons}")

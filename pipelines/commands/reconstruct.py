@@ -24,7 +24,7 @@ type Result = Outcome
 
 
 def reconstruct(
-    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")],
+    set_path: Annotated[Path, Parameter(name="SESSION|SET")],
     /,
     *,
     out: Path | None = None,
@@ -40,7 +40,7 @@ def reconstruct(
 
     Parameters
     ----------
-    elemental_set
+    set_path
         A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder for the results; planes of the same depth are replaced. By default, for a session, its folder
@@ -61,16 +61,18 @@ def reconstruct(
         )
     asked = select_surface(options)
     if asked is not None:
-        loaded, page_in = open_set(elemental_set, out, scene, geometry)
-        return surface_and_report(loaded, out or page_in / SURFACE_FOLDER, asked.resolve(loaded), page_in=page_in)
+        elemental_set, page_in = open_set(set_path, out, scene, geometry)
+        return surface_and_report(
+            elemental_set, out or page_in / SURFACE_FOLDER, asked.resolve(elemental_set), page_in=page_in
+        )
     runner = make_runner(options.workers, options.scheduler)
     selection = select_planes(options)
-    loaded, out = open_set(elemental_set, out, scene, geometry)
-    return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
+    elemental_set, out = open_set(set_path, out, scene, geometry)
+    return reconstruct_and_report(elemental_set, out, resolve(selection, elemental_set, out), runner)
 
 
 def reconstruct_and_report(
-    loaded: "ElementalSet", out: Path, request: "Request", runner: "Runner | None" = None
+    elemental_set: "ElementalSet", out: Path, request: "Request", runner: "Runner | None" = None
 ) -> "Outcome":
     """Reconstruct planes of a set into `out`, and write the report of them.
 
@@ -88,7 +90,7 @@ def reconstruct_and_report(
 
     started = time.monotonic()
     with exclusive(out):
-        outcome = reconstruct_set(loaded, out, request, runner or run_serially)
+        outcome = reconstruct_set(elemental_set, out, request, runner or run_serially)
         with working("writing the report"):
             report = write_report(out)
     planes = len({record.file for record in outcome.planes})
@@ -96,7 +98,9 @@ def reconstruct_and_report(
     return msgspec.structs.replace(outcome, report=str(report))
 
 
-def surface_and_report(loaded: "ElementalSet", out: Path, request: "SurfaceRequest", *, page_in: Path) -> "Outcome":
+def surface_and_report(
+    elemental_set: "ElementalSet", out: Path, request: "SurfaceRequest", *, page_in: Path
+) -> "Outcome":
     """Reconstruct the surface of a set into `out`, and write the report of all that is in `page_in`, the same or above.
 
     Raises
@@ -114,14 +118,14 @@ def surface_and_report(loaded: "ElementalSet", out: Path, request: "SurfaceReque
     with ExitStack() as locks:
         for folder in dict.fromkeys((page_in, out)):
             locks.enter_context(exclusive(folder))
-        record = reconstruct_surface(loaded, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
+        record = reconstruct_surface(elemental_set, out, request, pages=(page_in / REPORT_FILE, out / REPORT_FILE))
         with working("writing the report"):
             report = write_report(page_in)
     sure = f"{record.known_share:.0%} of its depths known, {record.sure_share:.0%} sure"
     inform(f"a surface in {time.monotonic() - started:.1f} s, {sure}: {report}")
     return Outcome(
         out=str(out), report=str(report), planes=[], focus=None, best_focus=None, depth_map=None, metrics=None,
-        surface=record, units=loaded.units,
+        surface=record, units=elemental_set.units,
     )  # fmt: skip
 
 
@@ -135,11 +139,11 @@ def open_set(
     from faintfield.rig.session.session import has_session
 
     if has_session(folder):
-        loaded = load_session(folder, scene, geometry)
+        elemental_set = load_session(folder, scene, geometry)
         out = out or folder / RECONSTRUCTIONS / ("" if scene == "dark_scene" else scene)
     elif out is None:
         raise WrongUsage("no folder for the results is named; give --out")
     else:
-        loaded = load_set(folder)
-        loaded = loaded if geometry is None else with_measured_geometry(loaded, geometry)
-    return keeping_frames(loaded, out), out
+        elemental_set = load_set(folder)
+        elemental_set = elemental_set if geometry is None else with_measured_geometry(elemental_set, geometry)
+    return keeping_frames(elemental_set, out), out

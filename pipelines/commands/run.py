@@ -143,12 +143,12 @@ def _steps_of_planes(
 
     def options(folder: Path) -> object:
         earlier = record_of(read_content(session / folder / RECONSTRUCTION_FILE), ReconstructionRecord)
-        loaded, out = opened()
-        return resolve(selection, loaded, out, earlier).options(folders[folder], loaded.poses)
+        elemental_set, out = opened()
+        return resolve(selection, elemental_set, out, earlier).options(folders[folder], elemental_set.poses)
 
     def make() -> object:
-        loaded, out = opened()
-        return reconstruct_and_report(loaded, out, resolve(selection, loaded, out), runner)
+        elemental_set, out = opened()
+        return reconstruct_and_report(elemental_set, out, resolve(selection, elemental_set, out), runner)
 
     return [
         Step(
@@ -173,12 +173,12 @@ def _steps_of_surface(session: Path, opened: "Opened", selection: "SurfaceSelect
         return []
 
     def options() -> object:
-        loaded, _ = opened()
-        return selection.resolve(loaded).options(loaded.poses)
+        elemental_set, _ = opened()
+        return selection.resolve(elemental_set).options(elemental_set.poses)
 
     def make() -> object:
-        loaded, out = opened()
-        return surface_and_report(loaded, out / SURFACE_FOLDER, selection.resolve(loaded), page_in=out)
+        elemental_set, out = opened()
+        return surface_and_report(elemental_set, out / SURFACE_FOLDER, selection.resolve(elemental_set), page_in=out)
 
     return [
         Step(

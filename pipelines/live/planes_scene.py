@@ -34,7 +34,7 @@ class LiveScene:
 
     Attributes
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         A view per node; the names of its images mean nothing.
     layout : ChannelLayout
         The pixels that count: all of them, or the green ones of frames in RGB.
@@ -50,7 +50,7 @@ class LiveScene:
         Whether there is a noise model, without which PMLEM has no likelihood.
     """
 
-    loaded: ElementalSet
+    elemental_set: ElementalSet
     layout: ChannelLayout
     bins: int
     view_of: dict[Node, int]
@@ -81,13 +81,13 @@ def live_scene(order: LiveOrder, frozen: FrozenPlan, frame: Frame) -> LiveScene:
     fitted = _noise(noise_path, sensor, guess, size_px)
     mosaic = fitted.mosaic or frozen.rig.mosaic or frame.mosaic
     planned = _planned_set(session, frozen.plan, lens, fitted)
-    loaded, poses = _with_poses(planned, geometry_path, lens_words)
+    elemental_set, poses = _with_poses(planned, geometry_path, lens_words)
     plane_of_colour = 1 if frame.pixels_dn.ndim == 3 else None
     return LiveScene(
-        loaded,
+        elemental_set,
         ChannelLayout("grey", plane_of_colour, (Lattice((0, 0), (1, 1), (height, width)),)),
         bins_of(size_px, int(np.lcm(*mosaic_period(mosaic)))),
-        {view.node: index for index, view in enumerate(loaded.settings.view) if view.node is not None},
+        {view.node: index for index, view in enumerate(elemental_set.settings.view) if view.node is not None},
         poses,
         sensor.source,
         *(("e⁻/px", True) if _is_known(sensor) else ("DN/px", False)),

@@ -125,18 +125,18 @@ class PlanesSoFar:
         self.scene = scene
         self.frames: dict[int, LiveFrame] = {}
         self._folder, self._depths_mm = folder, depths_mm
-        loaded = scene.loaded
-        self._factory = OperatorFactory(loaded, scene.layout, None, bins=scene.bins)
-        self._grids = [plane_grid(loaded, depth).binned(scene.bins) for depth in depths_mm]
+        elemental_set = scene.elemental_set
+        self._factory = OperatorFactory(elemental_set, scene.layout, None, bins=scene.bins)
+        self._grids = [plane_grid(elemental_set, depth).binned(scene.bins) for depth in depths_mm]
         self._running = [RunningPlane(grid.shape) for grid in self._grids]
         self._latest: list[SeenByView | None] = [None] * len(depths_mm)
         self._refined: dict[int, _Refined] = {}
-        self._noise = lattice_noise(loaded, scene.layout.lattices[0], None)
-        width, height = loaded.settings.camera.size_px
-        shape, nodes = (height // scene.bins, width // scene.bins), len(loaded.settings.view)
+        self._noise = lattice_noise(elemental_set, scene.layout.lattices[0], None)
+        width, height = elemental_set.settings.camera.size_px
+        shape, nodes = (height // scene.bins, width // scene.bins), len(elemental_set.settings.view)
         self.stack_bytes = 4 * nodes * shape[0] * shape[1]
         keeps = scene.knows_noise and self.stack_bytes <= MAX_STACK_BYTES
-        self._complete = CompleteViews(shape, nodes, loaded.frames_per_view) if keeps else None
+        self._complete = CompleteViews(shape, nodes, elemental_set.frames_per_view) if keeps else None
 
     @property
     def nodes(self) -> set[tuple[int, int]]:
@@ -240,21 +240,21 @@ class PlanesSoFar:
 
     def _read(self, frame: LiveFrame) -> tuple[_Frame, NDArray[np.float32]]:
         """Return a frame in electrons, in bins and in pixels."""
-        loaded = self.scene.loaded
-        [(electrons, over)] = view_electrons(loaded, self.scene.layout, [self._folder / frame.file])
+        elemental_set = self.scene.elemental_set
+        [(electrons, over)] = view_electrons(elemental_set, self.scene.layout, [self._folder / frame.file])
         images = ElementalImages(
             electrons[np.newaxis],
             self._noise.background_e(frame.exposure_s),
             valid=~over[np.newaxis] if over.any() else None,
         )
-        total_s = loaded.settings.exposure_s or frame.exposure_s
+        total_s = elemental_set.settings.exposure_s or frame.exposure_s
         view = self.scene.view_of[frame.node]
         return _Frame(view, images.binned(self.scene.bins), frame.exposure_s / total_s), electrons
 
     def _known(self) -> tuple[float | Image, float | Image]:
         """Return background and read variance of a bin of a complete view."""
-        loaded, noise = self.scene.loaded, self._noise
-        background_e, variance_e2 = loaded.background_e(noise), loaded.read_variance_e2(noise)
+        elemental_set, noise = self.scene.elemental_set, self._noise
+        background_e, variance_e2 = elemental_set.background_e(noise), elemental_set.read_variance_e2(noise)
         return _binned_sum(background_e, self.scene.bins), _binned_sum(variance_e2, self.scene.bins)
 
 

@@ -136,20 +136,20 @@ def true_poses(session: Path) -> dict[Node, NDArray[np.float64]]:
 
 def true_set(session: Path, truth: Path) -> ElementalSet:
     """Return a session's dark-scene views with their true lens, poses, response and noise."""
-    loaded, free = nominal_session(session), load_set(truth / NOISE_FREE)
+    elemental_set, free = nominal_session(session), load_set(truth / NOISE_FREE)
     poses = {view.node: view.rt_cam_ref for view in free.settings.view}
-    views = [msgspec.structs.replace(view, rt_cam_ref=poses[view.node]) for view in loaded.settings.view]
-    camera = msgspec.structs.replace(free.settings.camera, flat=None, mosaic=loaded.settings.camera.mosaic)
+    views = [msgspec.structs.replace(view, rt_cam_ref=poses[view.node]) for view in elemental_set.settings.view]
+    camera = msgspec.structs.replace(free.settings.camera, flat=None, mosaic=elemental_set.settings.camera.mosaic)
     sensor = lab_experiment(_camera(session)).sensor
     names = ("offset_dn", "gain_dn_per_e", "read_noise_e", "dark_current_e_per_s", "quantum_efficiency")
     noise = NoiseModel(**{name: getattr(sensor, name) for name in names}, saturation_dn=float(sensor.saturation_dn))
     return replace(
-        loaded,
-        settings=msgspec.structs.replace(loaded.settings, camera=camera, view=views),
+        elemental_set,
+        settings=msgspec.structs.replace(elemental_set.settings, camera=camera, view=views),
         lens=free.lens,
         noise=noise,
         flat=free.flat,
-        unusable=np.zeros_like(loaded.unusable),
+        unusable=np.zeros_like(elemental_set.unusable),
         poses="true",
     )
 
@@ -176,9 +176,9 @@ def demo_metrics(out: Path, session: Path, truth: Path, methods: Sequence[Method
     metrics = assess(load_session(session), measured, truth)
     assert metrics is not None
     errors = list(metrics.planes)
-    for loaded in (nominal_session(session), true_set(session, truth)):
-        planes = {(compared, depth): out / loaded.poses / f"{plane_name(depth)}.tiff" for depth in depths}
-        assessed = assess(loaded, planes, truth)
+    for elemental_set in (nominal_session(session), true_set(session, truth)):
+        planes = {(compared, depth): out / elemental_set.poses / f"{plane_name(depth)}.tiff" for depth in depths}
+        assessed = assess(elemental_set, planes, truth)
         assert assessed is not None
         errors += assessed.planes
     geometry, noise = _geometry_errors(session), _noise_errors(session)

@@ -155,8 +155,8 @@ def _figure3(out: Path, _: FigureOptions) -> Figure3:
         for errors, record in zip(metrics.planes, outcome.planes, strict=True)
     ]
     numbers = Figure3(metrics.snr, metrics.photons_per_px, rows)
-    loaded = load_set(out / _SCENE)
-    dark = read_frame(loaded.image_paths[loaded.reference_view]).pixels_dn
+    elemental_set = load_set(out / _SCENE)
+    dark = read_frame(elemental_set.image_paths[elemental_set.reference_view]).pixels_dn
     reference = read_frame(out / _SCENE / NOISE_REFERENCE).pixels_dn
     planes = _shown(out / _DARK, outcome.planes)
     picture = draw_figure3(dark, reference, grey_scale_dn(dark), metrics.snr.measured, planes)
@@ -175,10 +175,10 @@ def _figure4(out: Path, options: FigureOptions) -> Figure4:
     return numbers
 
 
-def _reconstruct(elemental_set: Path, out: Path, method: Method) -> Outcome:
+def _reconstruct(set_path: Path, out: Path, method: Method) -> Outcome:
     """Reconstruct both planes of a set, and write the report of them."""
     with exclusive(out):
-        outcome = reconstruct_set(load_set(elemental_set), out, Request([*DEFAULT_DEPTHS_MM], [method]))
+        outcome = reconstruct_set(load_set(set_path), out, Request([*DEFAULT_DEPTHS_MM], [method]))
         write_report(out)
     return outcome
 

@@ -20,7 +20,7 @@ from faintfield.recon.solver.initialization import back_projection
 
 
 def assess(
-    loaded: ElementalSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
+    elemental_set: ElementalSet, planes: Mapping[tuple[Method, float], Path], truth_in: Path | None = None
 ) -> Metrics | None:
     """Return the errors of planes; None for a set without ground truth, or without planes at its objects.
 
@@ -35,14 +35,14 @@ def assess(
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set that was reconstructed.
     planes : mapping of (method, depth in mm) to Path
         Files of the planes.
     truth_in : Path, optional
         Folder of the truth; the set's own if None.
     """
-    folder = truth_in or loaded.folder
+    folder = truth_in or elemental_set.folder
     truth = read_truth(folder)
     depths = [depth for depth in dict.fromkeys(depth for _, depth in planes) if true_plane(truth, depth)]
     if truth is None or not depths:
@@ -50,14 +50,14 @@ def assess(
     noise_free = load_set(folder / truth.noise_free)
     bright = _back_projections(noise_free, depths)
     rows = [
-        _errors(folder, loaded.poses, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
+        _errors(folder, elemental_set.poses, truth, method, depth, read_frame(path).pixels_dn, bright[depth])
         for (method, depth), path in planes.items()
         if depth in depths
     ]
     return Metrics(
-        planes=[in_units(loaded, row) for row in rows if row is not None],
-        units=loaded.units,
-        snr=SnrRecord(truth.snr, brightness(loaded, folder / OBJECT_REGION).snr),
+        planes=[in_units(elemental_set, row) for row in rows if row is not None],
+        units=elemental_set.units,
+        snr=SnrRecord(truth.snr, brightness(elemental_set, folder / OBJECT_REGION).snr),
         photons_per_px=PhotonsRecord(truth.photons_linear, truth.photons_from_moments, truth.photons_on_object),
     )
 

@@ -56,11 +56,11 @@ class ChannelLayout:
         return pixels if self.plane_of_colour is None else pixels[:, :, self.plane_of_colour]
 
 
-def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
+def channel_layouts(elemental_set: ElementalSet) -> list[ChannelLayout]:
     """Return the colours of a set, as its first frame has them."""
-    width, height = loaded.settings.camera.size_px
-    frame = loaded.read_frame(loaded.image_paths[0], (width, height))
-    mosaic = loaded.settings.camera.mosaic or frame.mosaic
+    width, height = elemental_set.settings.camera.size_px
+    frame = elemental_set.read_frame(elemental_set.image_paths[0], (width, height))
+    mosaic = elemental_set.settings.camera.mosaic or frame.mosaic
     everything = Lattice((0, 0), (1, 1), (height, width))
     if frame.pixels_dn.ndim == 3:
         return [ChannelLayout(name, index, (everything,)) for index, name in enumerate(_RGB)]
@@ -76,7 +76,7 @@ def channel_layouts(loaded: ElementalSet) -> list[ChannelLayout]:
     return layouts
 
 
-def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
+def keeping_frames(elemental_set: ElementalSet, folder: Path) -> ElementalSet:
     """Return a set that decodes each frame once: what took decoding is kept in files in a folder.
 
     The files have no name, so they disappear with the set, however the process ends. They take at most a quarter of
@@ -84,8 +84,8 @@ def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
     """
     # A set is read once per colour, and again by searches and priors. Pixels are kept rather than electrons, as they
     # take half the room and serve all of these, and in files, as memory is for the solvers
-    if loaded.read_frame is not read_frame:
-        return loaded
+    if elemental_set.read_frame is not read_frame:
+        return elemental_set
     kept: dict[Path, Frame] = {}
     storing = Lock()
 
@@ -111,15 +111,15 @@ def keeping_frames(loaded: ElementalSet, folder: Path) -> ElementalSet:
                 kept[path] = replace(frame, pixels_dn=stored)
         return frame
 
-    return replace(loaded, read_frame=read)
+    return replace(elemental_set, read_frame=read)
 
 
-def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
+def load_channel(elemental_set: ElementalSet, layout: ChannelLayout, allocate: Allocate = np.empty) -> ElementalImages:
     """Read one colour of all views in electrons, each frame by one thread, directly into the stack.
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     layout : ChannelLayout
         The colour.
@@ -132,17 +132,17 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
         A frame does not match the set; the message names it.
     """
     phases = len(layout.lattices)
-    views = len(loaded.settings.view)
+    views = len(elemental_set.settings.view)
     shape = layout.lattices[0].shape
     electrons = allocate((views * phases, *shape), np.float32)
     valid: NDArray[np.bool_] | None = None
     allocating = Lock()
-    noise_of = _noise_by_frame(loaded, layout)
+    noise_of = _noise_by_frame(elemental_set, layout)
 
     def load(view: int) -> None:
         nonlocal valid
         part = slice(view * phases, (view + 1) * phases)
-        over = _add_up(loaded, layout, noise_of, loaded.frame_paths(view), electrons[part])
+        over = _add_up(elemental_set, layout, noise_of, elemental_set.frame_paths(view), electrons[part])
         if over.any():
             with allocating:
                 if valid is None:
@@ -154,14 +154,14 @@ def load_channel(loaded: ElementalSet, layout: ChannelLayout, allocate: Allocate
     noises = [noise_of(phase, None) for phase in range(phases)]
     return ElementalImages(
         electrons,
-        background_e=_stacked([loaded.background_e(noise) for noise in noises], shape),
-        read_variance_e2=_stacked([loaded.read_variance_e2(noise) for noise in noises], shape),
+        background_e=_stacked([elemental_set.background_e(noise) for noise in noises], shape),
+        read_variance_e2=_stacked([elemental_set.read_variance_e2(noise) for noise in noises], shape),
         valid=valid,
     )
 
 
 def view_electrons(
-    loaded: ElementalSet, layout: ChannelLayout, paths: Sequence[Path]
+    elemental_set: ElementalSet, layout: ChannelLayout, paths: Sequence[Path]
 ) -> list[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
     """Return for each lattice the electrons (row, column) of all frames of a view, and where any frame is saturated.
 
@@ -169,12 +169,12 @@ def view_electrons(
     Poisson counts is a Poisson count, and variances add.
     """
     sums = np.zeros((len(layout.lattices), *layout.lattices[0].shape), np.float32)
-    over = _add_up(loaded, layout, _noise_by_frame(loaded, layout), paths, sums)
+    over = _add_up(elemental_set, layout, _noise_by_frame(elemental_set, layout), paths, sums)
     return list(zip(sums, over, strict=True))
 
 
 def _add_up(
-    loaded: ElementalSet,
+    elemental_set: ElementalSet,
     layout: ChannelLayout,
     noise_of: Callable[[int, Frame | None], NoiseModel],
     paths: Sequence[Path],
@@ -183,7 +183,7 @@ def _add_up(
     """Write the electrons of all frames of a view to `sums` (lattice, row, column); return where any is saturated."""
     over = np.zeros(sums.shape, bool)
     for number, path in enumerate(paths):
-        frame = checked_frame(loaded, path, layout)
+        frame = checked_frame(elemental_set, path, layout)
         pixels = layout.of(frame.pixels_dn)
         for index, lattice in enumerate(layout.lattices):
             noise, pixels_dn = noise_of(index, frame), lattice.of(pixels)
@@ -195,9 +195,9 @@ def _add_up(
     return over
 
 
-def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
+def checked_frame(elemental_set: ElementalSet, path: Path, layout: ChannelLayout) -> Frame:
     """Read a frame, and check that it fits the camera and the noise model of the set."""
-    frame = loaded.read_frame(path, loaded.settings.camera.size_px)
+    frame = elemental_set.read_frame(path, elemental_set.settings.camera.size_px)
     found = frame.pixels_dn
     if (found.ndim == 3) != (layout.plane_of_colour is not None):
         kind = "colour" if found.ndim == 3 else "grey"
@@ -208,45 +208,45 @@ def checked_frame(loaded: ElementalSet, path: Path, layout: ChannelLayout) -> Fr
         raise WrongBitDepth(
             f"{path}: holds {found.dtype} pixels; elemental images are 8- or 16-bit whole numbers; export them so"
         )
-    saturation_dn = loaded.noise.saturation_dn
+    saturation_dn = elemental_set.noise.saturation_dn
     if found.dtype == np.uint8 and np.isfinite(saturation_dn) and saturation_dn > 255:
         raise WrongBitDepth(
             f"{path}: has 8 bits per pixel, but the noise model saturates at {saturation_dn:.0f} DN; "
             "export 16-bit images, or state the noise of the 8-bit ones (saturation_dn = 255)"
         )
-    if loaded.offset_from_files and frame.black_dn is None:
-        raise BadValue(f"{path}: brings no black level of its own; state noise.offset_dn in {loaded.folder}")
+    if elemental_set.offset_from_files and frame.black_dn is None:
+        raise BadValue(f"{path}: brings no black level of its own; state noise.offset_dn in {elemental_set.folder}")
     return frame
 
 
-def lattice_noise(loaded: ElementalSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
+def lattice_noise(elemental_set: ElementalSet, lattice: Lattice, frame: Frame | None) -> NoiseModel:
     """Return the noise model of a lattice; a raw frame has its own black level and saturation if none is stated."""
-    values = {name: getattr(loaded.noise, name) for name in _NOISE_MAPS}
+    values = {name: getattr(elemental_set.noise, name) for name in _NOISE_MAPS}
     maps: dict[str, Any] = {name: lattice.of(value) for name, value in values.items() if np.ndim(value) == 2}
-    if loaded.noise.response is not None:
-        maps["response"] = loaded.noise.response.part(lattice.of)
-    return replace(loaded.noise, **maps | ({} if frame is None else _of_file(loaded, lattice, frame)))
+    if elemental_set.noise.response is not None:
+        maps["response"] = elemental_set.noise.response.part(lattice.of)
+    return replace(elemental_set.noise, **maps | ({} if frame is None else _of_file(elemental_set, lattice, frame)))
 
 
-def _of_file(loaded: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, Any]:
+def _of_file(elemental_set: ElementalSet, lattice: Lattice, frame: Frame) -> dict[str, Any]:
     """Return what a frame's own file says of the noise of a lattice and the set does not, by name."""
     own: dict[str, Any] = {}
-    if loaded.offset_from_files and frame.black_dn is not None:
+    if elemental_set.offset_from_files and frame.black_dn is not None:
         black_dn = frame.black_dn[lattice.first] if frame.mosaic is not None else frame.black_dn.mean()
         own["offset_dn"] = float(black_dn)
-    if not np.isfinite(loaded.noise.saturation_dn) and frame.saturation_dn is not None:
+    if not np.isfinite(elemental_set.noise.saturation_dn) and frame.saturation_dn is not None:
         own["saturation_dn"] = frame.saturation_dn
     return own
 
 
-def _noise_by_frame(loaded: ElementalSet, layout: ChannelLayout) -> Callable[[int, Frame | None], NoiseModel]:
+def _noise_by_frame(elemental_set: ElementalSet, layout: ChannelLayout) -> Callable[[int, Frame | None], NoiseModel]:
     """Return a function that gives the noise model of a lattice, by its index, in a frame."""
     # Checking the maps of a model takes longer than converting a frame by it, so frames that say the same share one
-    noises = [lattice_noise(loaded, lattice, None) for lattice in layout.lattices]
+    noises = [lattice_noise(elemental_set, lattice, None) for lattice in layout.lattices]
     known: dict[tuple[int, tuple[tuple[str, float], ...]], NoiseModel] = {}
 
     def noise_of(index: int, frame: Frame | None) -> NoiseModel:
-        own = {} if frame is None else _of_file(loaded, layout.lattices[index], frame)
+        own = {} if frame is None else _of_file(elemental_set, layout.lattices[index], frame)
         key = (index, tuple(own.items()))
         if key not in known:
             known[key] = replace(noises[index], **own)

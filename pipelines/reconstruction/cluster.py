@@ -44,17 +44,19 @@ def make_runner(workers: int | None, scheduler: str | None) -> Runner:
     if scheduler is not None:
         _distributed()
 
-    def run(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+    def run(
+        elemental_set: ElementalSet, out: Path, tasks: Sequence[PlaneTask]
+    ) -> Generator[tuple[PlaneTask, list[str]]]:
         if not tasks:
             return
         with _shared_folder(out) as shared:
             if scheduler is None:
-                jobs = list(_jobs(loaded, shared, tasks))
+                jobs = list(_jobs(elemental_set, shared, tasks))
                 for job, messages in in_processes(workers or 1, _do, jobs):
                     yield job.task, messages
             else:
                 with _client(scheduler) as client:
-                    yield from _as_done(client, _jobs(loaded, shared, tasks))
+                    yield from _as_done(client, _jobs(elemental_set, shared, tasks))
 
     return run
 
@@ -107,7 +109,7 @@ class _Colour:
         Path of the arrays, without suffix.
     shape : tuple of int
         Of its electrons (view, row, column).
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set without its maps and its noise: what a task says is small.
     layout : ChannelLayout
         Position of the colour in the frames.
@@ -115,7 +117,7 @@ class _Colour:
 
     path: Path
     shape: tuple[int, ...]
-    loaded: ElementalSet = field(compare=False)
+    elemental_set: ElementalSet = field(compare=False)
     layout: ChannelLayout = field(compare=False)
 
     @property
@@ -136,13 +138,13 @@ class _Job:
     colours: tuple[_Colour, ...]
 
 
-def _jobs(loaded: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]) -> Iterator[_Job]:
+def _jobs(elemental_set: ElementalSet, shared: Path, tasks: Sequence[PlaneTask]) -> Iterator[_Job]:
     """Return what workers do for each task; the images of a colour are written when the first task needs them."""
     colours: dict[str, _Colour] = {}
     for task in tasks:
         for layout in task.layouts:
             if layout.name not in colours:
-                colours[layout.name] = _share(loaded, layout, shared)
+                colours[layout.name] = _share(elemental_set, layout, shared)
         elsewhere = tuple(replace(files, folder=files.folder.resolve()) for files in task.files)
         yield _Job(replace(task, files=elsewhere), tuple(colours[layout.name] for layout in task.layouts))
 
@@ -172,26 +174,26 @@ def _as_done(client: Any, jobs: Iterable[_Job]) -> Generator[tuple[PlaneTask, li
             client.run(_opened.cache_clear)
 
 
-def _share(loaded: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
+def _share(elemental_set: ElementalSet, layout: ChannelLayout, shared: Path) -> _Colour:
     """Read a colour into files that all workers map: its electrons, its valid pixels, and the maps of the detector."""
-    plain = replace(loaded, noise=NoiseModel(0.0, 1.0, 0.0), flat=None, unusable=np.zeros((0, 0), bool))
+    plain = replace(elemental_set, noise=NoiseModel(0.0, 1.0, 0.0), flat=None, unusable=np.zeros((0, 0), bool))
     without_maps = replace(plain, read_frame=read_frame)
-    shape = (len(loaded.settings.view) * len(layout.lattices), *layout.lattices[0].shape)
+    shape = (len(elemental_set.settings.view) * len(layout.lattices), *layout.lattices[0].shape)
     colour = _Colour(shared / layout.name, shape, without_maps, layout)
 
     def allocate(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
         with translated_write_errors(shared.parent), colour.pixels(dtype).open("wb+") as file:
             return mapped(file, shape, dtype)
 
-    images = load_channel(loaded, layout, allocate)
-    flat = {} if loaded.flat is None else {"flat": loaded.flat}
+    images = load_channel(elemental_set, layout, allocate)
+    flat = {} if elemental_set.flat is None else {"flat": elemental_set.flat}
     with translated_write_errors(shared.parent):
         np.savez(
             colour.maps,
             allow_pickle=False,
             background_e=images.background_e,
             read_variance_e2=images.read_variance_e2,
-            unusable=loaded.unusable,
+            unusable=elemental_set.unusable,
             **flat,
         )
     return colour
@@ -202,11 +204,11 @@ def _opened(colour: _Colour) -> Channel:
     """Return the colour of files of `_share`; a worker keeps the last one."""
     with np.load(colour.maps, allow_pickle=False) as file:
         maps: dict[str, Any] = {name: values if values.ndim else float(values) for name, values in file.items()}
-    loaded = replace(colour.loaded, flat=maps.pop("flat", None), unusable=maps.pop("unusable"))
+    elemental_set = replace(colour.elemental_set, flat=maps.pop("flat", None), unusable=maps.pop("unusable"))
     electrons = np.asarray(np.memmap(colour.pixels(np.float32), np.float32, "r", shape=colour.shape))
     mask = colour.pixels(np.bool_)
     valid = np.asarray(np.memmap(mask, np.bool_, "r", shape=colour.shape)) if mask.is_file() else None
-    return Channel(loaded, colour.layout, ElementalImages(electrons, valid=valid, **maps))
+    return Channel(elemental_set, colour.layout, ElementalImages(electrons, valid=valid, **maps))
 
 
 def _do(job: _Job) -> list[str]:

@@ -54,7 +54,7 @@ class BinnedViews:
 
     Attributes
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set, whose poses are those of the views.
     colours : list of (ChannelLayout, ElementalImages)
         The pixels of each colour, added up; the middle one of the colours first.
@@ -62,7 +62,7 @@ class BinnedViews:
         Width of the bins in detector pixels.
     """
 
-    loaded: ElementalSet
+    elemental_set: ElementalSet
     colours: list[tuple[ChannelLayout, ElementalImages]]
     bins_px: int
 
@@ -70,50 +70,54 @@ class BinnedViews:
         """Compare the views at each depth."""
         planes: list[Agreement] = []
         for layout, images in self.colours:
-            factory = OperatorFactory(self.loaded, layout, images, bins=self.bins_px // max(layout.lattices[0].step))
+            factory = OperatorFactory(
+                self.elemental_set, layout, images, bins=self.bins_px // max(layout.lattices[0].step)
+            )
             found = [
-                agreement(factory.at(depth, _between_bins(self.loaded, depth, self.bins_px)), images)
+                agreement(factory.at(depth, _between_bins(self.elemental_set, depth, self.bins_px)), images)
                 for depth in progress(depths_mm, f"comparing the views, {layout.name}")
             ]
             planes = [_sum(*pair) for pair in zip(planes, found, strict=True)] if planes else found
         return Compared(planes, depths_mm, self.bins_px)
 
 
-def _between_bins(loaded: ElementalSet, depth_mm: float, bins_px: int) -> PlaneGrid:
+def _between_bins(elemental_set: ElementalSet, depth_mm: float, bins_px: int) -> PlaneGrid:
     """Return the samples of a plane between the bins of the reference view, so that no depth is favoured.
 
     Where all views are at whole bins, none is blurred by interpolation, and detail that is not blurred agrees best.
     """
-    grid = plane_grid(loaded, depth_mm).binned(bins_px)
+    grid = plane_grid(elemental_set, depth_mm).binned(bins_px)
     moved_mm = BETWEEN_PIXELS * grid.pitch_mm
     return replace(grid, origin_mm=(grid.origin_mm[0] + moved_mm, grid.origin_mm[1] + moved_mm))
 
 
-def binned_views(loaded: ElementalSet, middle_mm: float, out: Path, *, min_bins_px: int = 1) -> BinnedViews:
+def binned_views(elemental_set: ElementalSet, middle_mm: float, out: Path, *, min_bins_px: int = 1) -> BinnedViews:
     """Return the views in bins of pixels; the images of one colour at a time are in memory, or in a file in `out`.
 
     Pixels are added up in bins of at least `min_bins_px`, larger ones in low light at the depth `middle_mm`. Where that
     leaves many bins, the middle colour is enough.
     """
-    layouts = channel_layouts(loaded)
+    layouts = channel_layouts(elemental_set)
     middle = len(layouts) // 2
-    images = load_channel(loaded, layouts[middle], memory_or_file(out))
-    bins = _bins(loaded, layouts[middle], images, middle_mm, min_bins_px)
+    images = load_channel(elemental_set, layouts[middle], memory_or_file(out))
+    bins = _bins(elemental_set, layouts[middle], images, middle_mm, min_bins_px)
     colours = [(layouts[middle], images.binned(bins))]
     if np.prod(colours[0][1].electrons.shape[1:]) <= _ENOUGH_BINS:
         for layout in layouts[:middle] + layouts[middle + 1 :]:
             del images  # before the next colour is read
-            images = load_channel(loaded, layout, memory_or_file(out))
+            images = load_channel(elemental_set, layout, memory_or_file(out))
             colours.append((layout, images.binned(bins)))
-    return BinnedViews(loaded, colours, bins * max(layouts[middle].lattices[0].step))
+    return BinnedViews(elemental_set, colours, bins * max(layouts[middle].lattices[0].step))
 
 
 def _bins(
-    loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages, middle_mm: float, min_bins_px: int
+    elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages, middle_mm: float, min_bins_px: int
 ) -> int:
     """Return the width of the bins in pixels of a colour."""
     lattice = layout.lattices[0]
-    needed = bins_for(OperatorFactory(loaded, layout, images).at(middle_mm, plane_grid(loaded, middle_mm)), images)
+    needed = bins_for(
+        OperatorFactory(elemental_set, layout, images).at(middle_mm, plane_grid(elemental_set, middle_mm)), images
+    )
     return min(max(needed, -(-min_bins_px // max(lattice.step))), min(lattice.shape) // _MIN_BINS_ACROSS)
 
 

@@ -18,13 +18,13 @@ _RIGHT = 0.02
 
 
 def write_depth_errors(
-    loaded: ElementalSet, folder: Path, file: str, unit: Literal["mm", "px", "relative"]
+    elemental_set: ElementalSet, folder: Path, file: str, unit: Literal["mm", "px", "relative"]
 ) -> DepthErrors | None:
     """Compare a map in a folder of results with the set's true depth, and write its errors beside it.
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set that was reconstructed.
     folder : Path
         Of the results; an earlier comparison in it is removed.
@@ -39,12 +39,12 @@ def write_depth_errors(
         None if the set brings no truth, or none for any sample of the map.
     """
     remove(folder / DEPTH_ERRORS_FILE)
-    true_mm = read_true_depth_mm(loaded.folder)
-    if true_mm is None or loaded.units.depth != "mm":
+    true_mm = read_true_depth_mm(elemental_set.folder)
+    if true_mm is None or elemental_set.units.depth != "mm":
         return None
     found_mm = np.asarray(read_frame(folder / file).pixels_dn, np.float64)
     if unit == "px":
-        found_mm = _depth_of(loaded, found_mm)
+        found_mm = _depth_of(elemental_set, found_mm)
     if found_mm.shape != true_mm.shape:
         inform(f"{file}: is of shape {found_mm.shape}, the true depth {true_mm.shape} (rows, columns): not compared")
         return None
@@ -76,8 +76,8 @@ def _errors(file: str, found_mm: NDArray[np.float64], true_mm: NDArray[np.float6
     )
 
 
-def _depth_of(loaded: ElementalSet, disparity_px: NDArray[np.float64]) -> NDArray[np.float64]:
+def _depth_of(elemental_set: ElementalSet, disparity_px: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the depths of disparities, NaN where they belong to none."""
-    at_zero, slope = loaded.inverse_depth_of_disparity()
+    at_zero, slope = elemental_set.inverse_depth_of_disparity()
     inverse = at_zero + slope * disparity_px
     return np.where(inverse > 0, 1 / np.where(inverse > 0, inverse, 1.0), np.nan)

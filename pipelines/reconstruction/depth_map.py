@@ -48,7 +48,7 @@ class _Map:
     confidence: NDArray[np.float64]
 
 
-def check_sweep(loaded: ElementalSet, depths_mm: Sequence[float]) -> None:
+def check_sweep(elemental_set: ElementalSet, depths_mm: Sequence[float]) -> None:
     """Refuse a set or a sweep that can have no depth map, before its planes are made.
 
     Raises
@@ -62,18 +62,18 @@ def check_sweep(loaded: ElementalSet, depths_mm: Sequence[float]) -> None:
     """
     from faintfield.pipelines.reconstruction.surface_depths import check_overlap, check_views
 
-    check_views(loaded, "a depth map")
-    check_overlap(loaded, (min(depths_mm), max(depths_mm)))
+    check_views(elemental_set, "a depth map")
+    check_overlap(elemental_set, (min(depths_mm), max(depths_mm)))
 
 
-def check_light(loaded: ElementalSet, depths_mm: Sequence[float], out: Path) -> None:
+def check_light(elemental_set: ElementalSet, depths_mm: Sequence[float], out: Path) -> None:
     """Refuse views that agree no better than shuffled ones in a sweep (NothingInFocus).
 
     `out` is for a temporary file if memory is short.
     """
     from faintfield.pipelines.reconstruction.surface_depths import check_agreement
 
-    check_agreement(loaded, (min(depths_mm), max(depths_mm)), out)
+    check_agreement(elemental_set, (min(depths_mm), max(depths_mm)), out)
 
 
 def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Origin]) -> DepthMapRecord | None:
@@ -85,7 +85,7 @@ def kept_depth_map(folders: Mapping[Method, Path], origins: Mapping[Method, Orig
 
 
 def write_depth_map(
-    loaded: ElementalSet,
+    elemental_set: ElementalSet,
     planes: Mapping[tuple[Method, float], Path],
     disparities_px: Mapping[float, float],
     origins: Mapping[Method, Origin],
@@ -96,7 +96,7 @@ def write_depth_map(
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     planes : mapping of (method, depth in mm) to Path
         Files of the planes; each method has a folder.
@@ -115,7 +115,7 @@ def write_depth_map(
     if kept is not None:
         return kept
     depths = sorted({depth for _, depth in planes})
-    found = _map_of(loaded, depths, disparities_px)
+    found = _map_of(elemental_set, depths, disparities_px)
     for method, folder in folders.items():
         remove(folder / DEPTH_MAP_FILE)
         sharp = _all_in_focus([planes[method, depth] for depth in depths], found.index)
@@ -125,20 +125,22 @@ def write_depth_map(
     return found.record
 
 
-def _map_of(loaded: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
+def _map_of(elemental_set: ElementalSet, depths_mm: Sequence[float], disparities_px: Mapping[float, float]) -> _Map:
     """Return the depth map of a sweep, nearest depth first, in px if there are disparities."""
     # Here, because planes need none of it
     from faintfield.pipelines.reconstruction.luminance import default_bins
     from faintfield.pipelines.reconstruction.surface_depths import depths_of_set, enlarged, in_unit
     from faintfield.recon.surface.confidence import SURE
 
-    bins, shape = default_bins(loaded), plane_grid(loaded, 1.0).shape
-    _, estimate = depths_of_set(loaded, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
+    bins, shape = default_bins(elemental_set), plane_grid(elemental_set, 1.0).shape
+    _, estimate = depths_of_set(elemental_set, bins, (depths_mm[0], depths_mm[-1]), find_range=False)
     inverse_depth, confidence = (enlarged(part, shape, bins) for part in (estimate.inverse_depth, estimate.confidence))
-    unit = unit_of_maps(loaded.units, as_px=bool(disparities_px))
-    scale = [disparities_px[depth] if disparities_px else in_unit(loaded, 1 / depth, unit) for depth in depths_mm]
+    unit = unit_of_maps(elemental_set.units, as_px=bool(disparities_px))
+    scale = [
+        disparities_px[depth] if disparities_px else in_unit(elemental_set, 1 / depth, unit) for depth in depths_mm
+    ]
     known = confidence.astype(np.float32) >= SURE  # as in the file
-    values = np.clip(in_unit(loaded, inverse_depth, unit), min(scale), max(scale))
+    values = np.clip(in_unit(elemental_set, inverse_depth, unit), min(scale), max(scale))
     record = DepthMapRecord(
         file=_FILES[unit],
         confidence=f"{CONFIDENCE}.tiff",

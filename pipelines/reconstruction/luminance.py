@@ -20,16 +20,16 @@ from faintfield.recon.threads import map_in_threads
 _MAX_PIXELS, _MIN_SIDE_PX = 80_000, 120
 
 
-def default_bins(loaded: ElementalSet) -> int:
+def default_bins(elemental_set: ElementalSet) -> int:
     """Return the width in detector pixels of the bins: two, or more if views are large; whole periods of a mosaic."""
-    width, height = loaded.settings.camera.size_px
-    period = int(np.lcm(*channel_layouts(loaded)[0].lattices[0].step))
+    width, height = elemental_set.settings.camera.size_px
+    period = int(np.lcm(*channel_layouts(elemental_set)[0].lattices[0].step))
     needed = int(np.ceil(np.sqrt(width * height / _MAX_PIXELS)))
     smallest = 2 if min(width, height) >= _MIN_SIDE_PX else 1
     return -(-max(needed, smallest) // period) * period
 
 
-def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
+def luminance(elemental_set: ElementalSet, bins: int) -> PinholeViews:
     """Return the light of all views, in bins of `bins` by `bins` detector pixels, with distortion undone.
 
     Each view is read by one thread.
@@ -39,21 +39,21 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
     WrongSize, WrongBitDepth, UnreadableImage
         A frame does not match the set; the message names it.
     """
-    layouts = channel_layouts(loaded)
+    layouts = channel_layouts(elemental_set)
     parts = [(layout, lattice) for layout in layouts for lattice in layout.lattices]
-    responses = [_response(loaded, lattice, bins) for _, lattice in parts]
-    backgrounds, variances = zip(*(_known(loaded, lattice) for _, lattice in parts), strict=True)
-    grid = plane_grid(loaded, 1.0).binned(bins)
-    views = len(loaded.settings.view)
-    width, height = loaded.settings.camera.size_px
+    responses = [_response(elemental_set, lattice, bins) for _, lattice in parts]
+    backgrounds, variances = zip(*(_known(elemental_set, lattice) for _, lattice in parts), strict=True)
+    grid = plane_grid(elemental_set, 1.0).binned(bins)
+    views = len(elemental_set.settings.view)
+    width, height = elemental_set.settings.camera.size_px
     shape = (height // bins, width // bins)
     light = np.empty((views, *shape), np.float32)
-    undistorted = _undistorted_places(loaded, bins, shape)
+    undistorted = _undistorted_places(elemental_set, bins, shape)
 
     def read(view: int) -> None:
         total = np.zeros(shape, np.float32)
         for response, background, (lattice, sum_e, over) in zip(
-            responses, backgrounds, _electrons(loaded, layouts, view), strict=True
+            responses, backgrounds, _electrons(elemental_set, layouts, view), strict=True
         ):
             usable = (response > 0) & (_summed(over, lattice, bins) == 0)
             light_e = _summed(sum_e - np.asarray(background, np.float32), lattice, bins)
@@ -62,20 +62,20 @@ def luminance(loaded: ElementalSet, bins: int) -> PinholeViews:
 
     with working("reading views"):
         map_in_threads(read, range(views))
-    camera = loaded.settings.camera
+    camera = elemental_set.settings.camera
     return PinholeViews(
         light,
         float(np.sum(variances)) * _pixels(parts[0][1], bins),
-        ray_from_surface(loaded.poses_rt_cam_ref, principal_shift(loaded)),
+        ray_from_surface(elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)),
         (camera.fx_px / bins, camera.fy_px / bins),
         ((camera.cx_px + 0.5) / bins - 0.5, (camera.cy_px + 0.5) / bins - 0.5),
         grid,
     )
 
 
-def _response(loaded: ElementalSet, lattice: Lattice, bins: int) -> NDArray[np.float32]:
+def _response(elemental_set: ElementalSet, lattice: Lattice, bins: int) -> NDArray[np.float32]:
     """Return the response of bins of a lattice (row, column), zero where one of their pixels is unusable."""
-    response, pixels = response_of(loaded, lattice), _pixels(lattice, bins)
+    response, pixels = response_of(elemental_set, lattice), _pixels(lattice, bins)
     whole = _summed(response > 0, lattice, bins) == pixels
     return np.where(whole, _summed(response, lattice, bins) / np.float32(pixels), np.float32(0))
 
@@ -94,33 +94,33 @@ def _summed(values: NDArray[Any], lattice: Lattice, bins: int) -> NDArray[Any]:
 
 
 def _electrons(
-    loaded: ElementalSet, layouts: list[ChannelLayout], view: int
+    elemental_set: ElementalSet, layouts: list[ChannelLayout], view: int
 ) -> Iterator[tuple[Lattice, NDArray[np.float32], NDArray[np.bool_]]]:
     """Yield the electrons of a view on each lattice of each colour, and where they are saturated."""
     for layout in layouts:
-        found = view_electrons(loaded, layout, loaded.frame_paths(view))
+        found = view_electrons(elemental_set, layout, elemental_set.frame_paths(view))
         for lattice, (sum_e, over) in zip(layout.lattices, found, strict=True):
             yield lattice, sum_e, over
 
 
-def _known(loaded: ElementalSet, lattice: Lattice) -> tuple[float | NDArray[np.floating], float]:
+def _known(elemental_set: ElementalSet, lattice: Lattice) -> tuple[float | NDArray[np.floating], float]:
     """Return the background of a lattice (row, column), and the mean variance that is not of the light."""
-    noise = lattice_noise(loaded, lattice, None)
-    background_e = loaded.background_e(noise)
-    return background_e, float(np.mean(background_e)) + float(np.mean(loaded.read_variance_e2(noise)))
+    noise = lattice_noise(elemental_set, lattice, None)
+    background_e = elemental_set.background_e(noise)
+    return background_e, float(np.mean(background_e)) + float(np.mean(elemental_set.read_variance_e2(noise)))
 
 
 def _undistorted_places(
-    loaded: ElementalSet, bins: int, shape: tuple[int, int]
+    elemental_set: ElementalSet, bins: int, shape: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
     """Return column and row (row, column) of the bin that a pinhole camera's bin shows; None without distortion."""
-    camera = loaded.settings.camera
+    camera = elemental_set.settings.camera
     if not any(camera.distortion):
         return None
     rows, columns = np.indices(shape, np.float64)
     pixel_x, pixel_y = (columns + 0.5) * bins - 0.5, (rows + 0.5) * bins - 0.5
     directions = [(pixel_x - camera.cx_px) / camera.fx_px, (pixel_y - camera.cy_px) / camera.fy_px, np.ones(shape)]
-    seen = loaded.lens.project(np.stack(directions, -1).reshape(-1, 3)).reshape(*shape, 2)
+    seen = elemental_set.lens.project(np.stack(directions, -1).reshape(-1, 3)).reshape(*shape, 2)
     places = ((seen + 0.5) / bins - 0.5).astype(np.float32)
     return np.ascontiguousarray(places[:, :, 0]), np.ascontiguousarray(places[:, :, 1])
 

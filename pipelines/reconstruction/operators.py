@@ -30,19 +30,19 @@ def check_in_front(depth_mm: float) -> None:
         raise GeometryMismatch(f"a plane at {depth_mm} mm is not in front of the camera; depth_mm must be positive")
 
 
-def default_pitch_px(loaded: ElementalSet, layouts: list[ChannelLayout]) -> int:
+def default_pitch_px(elemental_set: ElementalSet, layouts: list[ChannelLayout]) -> int:
     """Return the default distance of a plane's samples in detector pixels: 1 if the views can fill that.
 
     A view sees only some pixels in each colour of a mosaic; with fewer views than it takes to fill the gaps, the
     samples are a period of the mosaic apart.
     """
-    views = len(loaded.settings.view)
+    views = len(elemental_set.settings.view)
     step = layouts[0].lattices[0].step
     fewest_per_sample = min(views * len(layout.lattices) / (step[0] * step[1]) for layout in layouts)
     return 1 if fewest_per_sample >= 1 else max(step)
 
 
-def plane_grid(loaded: ElementalSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
+def plane_grid(elemental_set: ElementalSet, depth_mm: float, pitch_mm: float | None = None) -> PlaneGrid:
     """Return the samples of the plane at a depth, one per pixel of the reference view by default.
 
     Raises
@@ -51,8 +51,8 @@ def plane_grid(loaded: ElementalSet, depth_mm: float, pitch_mm: float | None = N
         The plane is not in front of the camera, or the pitch leaves it without samples.
     """
     check_in_front(depth_mm)
-    camera = loaded.settings.camera
-    cx_px, cy_px = loaded.principal_points_px()[loaded.reference_view].tolist()
+    camera = elemental_set.settings.camera
+    cx_px, cy_px = elemental_set.principal_points_px()[elemental_set.reference_view].tolist()
     width, height = camera.size_px
     mm_per_px_x, mm_per_px_y = depth_mm / camera.fx_px, depth_mm / camera.fy_px
     try:
@@ -64,10 +64,10 @@ def plane_grid(loaded: ElementalSet, depth_mm: float, pitch_mm: float | None = N
             pitch_mm=mm_per_px_x if pitch_mm is None else pitch_mm,
         )
     except ValueError as failure:
-        raise GeometryMismatch(f"plane at {loaded.depth_text(depth_mm)}: {failure}") from failure
+        raise GeometryMismatch(f"plane at {elemental_set.depth_text(depth_mm)}: {failure}") from failure
 
 
-def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:
+def tilted_grid(elemental_set: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> PlaneGrid:
     """Return the samples of a plane of any pose: of its stated size, or what the reference view sees of it.
 
     Raises
@@ -75,13 +75,13 @@ def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> Pl
     GeometryMismatch
         A part of the reference view does not meet the plane in front of the camera, or only very far away.
     """
-    width, height = loaded.settings.camera.size_px
+    width, height = elemental_set.settings.camera.size_px
     if not plane.depth_mm > 0:
         raise GeometryMismatch(
             f"plane '{plane.name}': lies behind the camera, at {plane.depth_mm:g} mm along its axis; z points forward: "
             "correct its pose"
         )
-    low, high = _covered_part(loaded, plane)
+    low, high = _covered_part(elemental_set, plane)
     samples, max_samples = float(np.prod((high - low) / pitch_mm)), _MAX_SAMPLES_PER_PIXEL * width * height
     if samples > max_samples:
         raise GeometryMismatch(
@@ -94,16 +94,18 @@ def tilted_grid(loaded: ElementalSet, plane: TiltedPlane, pitch_mm: float) -> Pl
         raise GeometryMismatch(f"plane '{plane.name}': {failure}") from failure
 
 
-def _covered_part(loaded: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _covered_part(elemental_set: ElementalSet, plane: TiltedPlane) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the lowest and highest x, y in mm of a plane: of its stated size, or what the reference view sees."""
     if plane.size_mm is not None:
         half = np.array(plane.size_mm) / 2
         return -half, half
-    camera = loaded.settings.camera
+    camera = elemental_set.settings.camera
     width, height = camera.size_px
     columns, rows = np.meshgrid(np.linspace(-0.5, width - 0.5, 3), np.linspace(-0.5, height - 0.5, 3))
-    shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()[loaded.reference_view]
-    rays = loaded.lens.rays_at(np.column_stack([columns.ravel(), rows.ravel()]) + shift_px)
+    shift_px = (
+        np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px()[elemental_set.reference_view]
+    )
+    rays = elemental_set.lens.rays_at(np.column_stack([columns.ravel(), rows.ravel()]) + shift_px)
     points = plane.on_plane(np.column_stack([rays, np.ones(len(rays))]))
     if np.isnan(points).any():
         raise GeometryMismatch(
@@ -121,20 +123,20 @@ class OperatorFactory:
     """
 
     def __init__(
-        self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages | None, *, bins: int = 1
+        self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages | None, *, bins: int = 1
     ) -> None:
-        self._loaded = loaded
+        self._loaded = elemental_set
         self._valid = None if images is None else images.valid
         self._phases = len(layout.lattices)
         lattices = layout.lattices
         rays = np.empty((len(lattices), *lattices[0].shape, 2), np.float32)
         for part, at in zip(rays, lattices, strict=True):  # one at a time: they are as large as two images each
-            part[:] = loaded.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]]
+            part[:] = elemental_set.lens.rays(at.first, at.step)[: at.shape[0], : at.shape[1]]
         rays = np.moveaxis(binned(np.moveaxis(rays, -1, 0), bins), 0, -1)
-        response = np.stack([response_of(loaded, lattice) for lattice in lattices])
+        response = np.stack([response_of(elemental_set, lattice) for lattice in lattices])
         whole = binned(response > 0, bins) == 1  # a bin with an unusable pixel holds the electrons of that, too
         self._maps = DetectorMaps(rays, np.where(whole, binned(response, bins), 0))
-        self._poses, self._principal_shift = loaded.poses_rt_cam_ref, principal_shift(loaded)
+        self._poses, self._principal_shift = elemental_set.poses_rt_cam_ref, principal_shift(elemental_set)
 
     def at(self, place: Place, grid: PlaneGrid) -> PlaneOperator:
         """Return H of a plane at a depth, or of a pose."""
@@ -185,17 +187,17 @@ class OperatorFactory:
         return {"valid": self._valid, "lattice_of_view": lattices}
 
 
-def response_of(loaded: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
+def response_of(elemental_set: ElementalSet, lattice: Lattice) -> NDArray[np.float32]:
     """Return the flat field of a lattice (row, column), zero at unusable pixels."""
-    flat = np.ones(lattice.shape, np.float32) if loaded.flat is None else lattice.of(loaded.flat).copy()
-    flat[lattice.of(loaded.unusable)] = 0
+    flat = np.ones(lattice.shape, np.float32) if elemental_set.flat is None else lattice.of(elemental_set.flat).copy()
+    flat[lattice.of(elemental_set.unusable)] = 0
     return flat
 
 
-def principal_shift(loaded: ElementalSet) -> NDArray[np.float64] | None:
+def principal_shift(elemental_set: ElementalSet) -> NDArray[np.float64] | None:
     """Return the shift (view, 2) of the rays of views with a principal point of their own, None without such views."""
-    camera = loaded.settings.camera
-    shift_px = np.array([camera.cx_px, camera.cy_px]) - loaded.principal_points_px()
+    camera = elemental_set.settings.camera
+    shift_px = np.array([camera.cx_px, camera.cy_px]) - elemental_set.principal_points_px()
     if not shift_px.any():
         return None
     if any(camera.distortion):

@@ -41,36 +41,38 @@ _OUTLINE_RGB = (240, 120, 0)
 type Region = NDArray[np.bool_]
 
 
-def object_region(loaded: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
+def object_region(elemental_set: ElementalSet, path: Path | None = None) -> tuple[Region | None, str]:
     """Return the object region (row, column) of the reference view, None if it is not known, and its name.
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     path : Path, optional
         Mask to use instead of the set's own.
     """
-    path = path or loaded.folder / OBJECT_REGION
+    path = path or elemental_set.folder / OBJECT_REGION
     if path.is_file():
-        return read_frame(path, loaded.settings.camera.size_px).pixels_dn > 127, "object region"
-    light_e = bright_electrons(loaded)
-    region = None if light_e is None else segmented(light_e, ~loaded.unusable)
+        return read_frame(path, elemental_set.settings.camera.size_px).pixels_dn > 127, "object region"
+    light_e = bright_electrons(elemental_set)
+    region = None if light_e is None else segmented(light_e, ~elemental_set.unusable)
     return (None, "whole view") if region is None else (region, "object region of the bright view")
 
 
-def bright_electrons(loaded: ElementalSet) -> NDArray[np.float32] | None:
+def bright_electrons(elemental_set: ElementalSet) -> NDArray[np.float32] | None:
     """Return the electrons of the reference view in plenty of light (row, column), above dark; None if there is none.
 
     A colour camera gives the mean of the colours around each pixel, enough to tell where objects are.
     """
-    if loaded.bright_view is None:
+    if elemental_set.bright_view is None:
         return None
-    path, exposure_s = loaded.bright_view
-    frame = read_frame(path, loaded.settings.camera.size_px)
+    path, exposure_s = elemental_set.bright_view
+    frame = read_frame(path, elemental_set.settings.camera.size_px)
     pixels = frame.pixels_dn if frame.pixels_dn.ndim == 2 else frame.pixels_dn.mean(axis=2)
-    light_e = loaded.noise.electrons(pixels) - np.asarray(loaded.noise.background_e(exposure_s), np.float32)
-    mosaic = loaded.settings.camera.mosaic or frame.mosaic
+    light_e = elemental_set.noise.electrons(pixels) - np.asarray(
+        elemental_set.noise.background_e(exposure_s), np.float32
+    )
+    mosaic = elemental_set.settings.camera.mosaic or frame.mosaic
     return np.asarray(light_e if mosaic is None else cv2.blur(light_e, (len(mosaic[0]), len(mosaic))), np.float32)
 
 
@@ -89,40 +91,42 @@ def segmented(light_e: NDArray[np.float32], usable: Region) -> Region | None:
     return region if region.any() else None
 
 
-def brightness(loaded: ElementalSet, region_path: Path | None = None) -> Brightness:
+def brightness(elemental_set: ElementalSet, region_path: Path | None = None) -> Brightness:
     """Measure the reference view of a set, all colours together; over the set's own object region by default."""
-    return brightness_within(loaded, *object_region(loaded, region_path))
+    return brightness_within(elemental_set, *object_region(elemental_set, region_path))
 
 
-def brightness_within(loaded: ElementalSet, region: Region | None, name: str) -> Brightness:
+def brightness_within(elemental_set: ElementalSet, region: Region | None, name: str) -> Brightness:
     """Measure the reference view over a region (row, column) called `name`; over the whole view if it is None."""
-    has_reference = len(loaded.noise_reference) >= loaded.frames_per_view
+    has_reference = len(elemental_set.noise_reference) >= elemental_set.frames_per_view
     signal, reference = [], []
-    for layout in channel_layouts(loaded):
-        images = view_electrons(loaded, layout, loaded.frame_paths(loaded.reference_view))
-        no_light = view_electrons(loaded, layout, loaded.noise_reference[: loaded.frames_per_view])
+    for layout in channel_layouts(elemental_set):
+        images = view_electrons(elemental_set, layout, elemental_set.frame_paths(elemental_set.reference_view))
+        no_light = view_electrons(elemental_set, layout, elemental_set.noise_reference[: elemental_set.frames_per_view])
         for index, lattice in enumerate(layout.lattices):
             where = np.ones(lattice.shape, bool) if region is None else lattice.of(region)
             signal.append(images[index][0][where])
             if has_reference:
                 reference.append(no_light[index][0].ravel())
             else:
-                noise = lattice_noise(loaded, lattice, None)
-                dark_e = loaded.background_e(noise)
-                power = np.broadcast_to(loaded.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape)
+                noise = lattice_noise(elemental_set, lattice, None)
+                dark_e = elemental_set.background_e(noise)
+                power = np.broadcast_to(
+                    elemental_set.read_variance_e2(noise) + dark_e + np.square(dark_e), lattice.shape
+                )
                 reference.append(np.sqrt(power).ravel())
     noise_from = "noise reference" if has_reference else "noise model"
-    return _figures(loaded, name, noise_from, np.concatenate(signal), np.concatenate(reference))
+    return _figures(elemental_set, name, noise_from, np.concatenate(signal), np.concatenate(reference))
 
 
 def _figures(
-    loaded: ElementalSet, region: str, noise_from: str, signal_e: NDArray[Any], reference_e: NDArray[Any]
+    elemental_set: ElementalSet, region: str, noise_from: str, signal_e: NDArray[Any], reference_e: NDArray[Any]
 ) -> Brightness:
     """Return the figures by eq. (4) and (7), given the electrons of the region and of the noise reference."""
-    noise = loaded.noise
-    read_noise_e = float(np.sqrt(loaded.frames_per_view * np.mean(np.square(noise.read_noise_e))))
+    noise = elemental_set.noise
+    read_noise_e = float(np.sqrt(elemental_set.frames_per_view * np.mean(np.square(noise.read_noise_e))))
     snr = snr_from_powers(signal_e, reference_e) if read_noise_e > 0 else None
-    dark_e = float(np.mean(loaded.background_e(noise)))
+    dark_e = float(np.mean(elemental_set.background_e(noise)))
     linear_e = moments_e = None
     if snr and snr > 0:
         # With a quantum efficiency of 1 the formulas for photons give electrons
@@ -150,7 +154,7 @@ class SetAtAGlance:
     record: Overview
 
 
-def look_at(loaded: ElementalSet) -> SetAtAGlance:
+def look_at(elemental_set: ElementalSet) -> SetAtAGlance:
     """Return a set at a glance; all its views share one grey scale.
 
     Every view is read, so that one that cannot be used is found before planes are made.
@@ -160,57 +164,57 @@ def look_at(loaded: ElementalSet) -> SetAtAGlance:
     InputError
         A file cannot be used, or the light of the set is beyond all bounds.
     """
-    size_px = loaded.settings.camera.size_px
-    reference = loaded.read_frame(loaded.image_paths[loaded.reference_view], size_px).pixels_dn
+    size_px = elemental_set.settings.camera.size_px
+    reference = elemental_set.read_frame(elemental_set.image_paths[elemental_set.reference_view], size_px).pixels_dn
     black, white = grey_scale_dn(reference)
-    grid = _grid(loaded)
-    columns = grid[1] if grid else int(np.ceil(np.sqrt(len(loaded.settings.view))))
+    grid = _grid(elemental_set)
+    columns = grid[1] if grid else int(np.ceil(np.sqrt(len(elemental_set.settings.view))))
     small_px = max(_SHEET_WIDTH_PX // columns, 24)
 
     def shrunk_view(path: Path) -> Picture:
-        return grey_levels(_every_nth(_pixels_like(loaded, reference, path), small_px), white, black)
+        return grey_levels(_every_nth(_pixels_like(elemental_set, reference, path), small_px), white, black)
 
-    small = map_in_threads(shrunk_view, loaded.image_paths)
+    small = map_in_threads(shrunk_view, elemental_set.image_paths)
     pictures = {
         INTEGRAL_IMAGE: contact_sheet(small, columns),
         REFERENCE_VIEW: grey_levels(reference, white, black),
     }
-    if loaded.noise_reference:
-        no_light = read_frame(loaded.noise_reference[0], size_px).pixels_dn
+    if elemental_set.noise_reference:
+        no_light = read_frame(elemental_set.noise_reference[0], size_px).pixels_dn
         pictures[NOISE_REFERENCE_VIEW] = grey_levels(no_light, white, black)
-    region, name = object_region(loaded)
-    pictures |= _bright_views(loaded, region)
-    noise, exposure_s = loaded.noise, loaded.settings.exposure_s
+    region, name = object_region(elemental_set)
+    pictures |= _bright_views(elemental_set, region)
+    noise, exposure_s = elemental_set.noise, elemental_set.settings.exposure_s
     record = Overview(
-        units=loaded.units,
-        set=loaded.folder.resolve().name,
-        views=len(loaded.settings.view),
+        units=elemental_set.units,
+        set=elemental_set.folder.resolve().name,
+        views=len(elemental_set.settings.view),
         grid=grid,
-        poses=loaded.poses,
-        size_px=loaded.settings.camera.size_px,
+        poses=elemental_set.poses,
+        size_px=elemental_set.settings.camera.size_px,
         exposure_s=exposure_s,
-        frames_per_view=loaded.frames_per_view,
+        frames_per_view=elemental_set.frames_per_view,
         read_noise_e=float(np.sqrt(np.mean(np.square(noise.read_noise_e)))),
-        has_noise_reference=bool(loaded.noise_reference),
+        has_noise_reference=bool(elemental_set.noise_reference),
         quantum_efficiency=noise.quantum_efficiency,
-        dark_e=float(np.mean(loaded.background_e(noise))),
+        dark_e=float(np.mean(elemental_set.background_e(noise))),
         grey_scale_dn=(black, white),
-        brightness=brightness_within(loaded, region, name),
+        brightness=brightness_within(elemental_set, region, name),
     )
-    record = in_units(loaded, record)
+    record = in_units(elemental_set, record)
     try:
         msgspec.json.decode(msgspec.json.encode(record), type=Overview)  # null stands for what is not finite
     except msgspec.ValidationError as failure:
         raise BadValue(
-            f"{loaded.folder}: its light is not finite ({failure}); correct its noise model or object region"
+            f"{elemental_set.folder}: its light is not finite ({failure}); correct its noise model or object region"
         ) from failure
     return SetAtAGlance({name: encoded(picture, ".png") for name, picture in pictures.items()}, record)
 
 
-def _pixels_like(loaded: ElementalSet, reference: NDArray[Any], path: Path) -> NDArray[Any]:
+def _pixels_like(elemental_set: ElementalSet, reference: NDArray[Any], path: Path) -> NDArray[Any]:
     """Return the pixels of a view, which must have the shape of the reference view's."""
     height, width = reference.shape[:2]
-    pixels = loaded.read_frame(path, (width, height)).pixels_dn
+    pixels = elemental_set.read_frame(path, (width, height)).pixels_dn
     if pixels.shape != reference.shape:
         kind = "colour" if pixels.ndim == 3 else "grey"
         raise UnreadableImage(
@@ -226,9 +230,9 @@ def write_overview(glance: SetAtAGlance, out: Path) -> None:
     write_record(out / OVERVIEW_FILE, glance.record)
 
 
-def _bright_views(loaded: ElementalSet, region: Region | None) -> dict[str, Picture]:
+def _bright_views(elemental_set: ElementalSet, region: Region | None) -> dict[str, Picture]:
     """Return the reference view in plenty of light if there is one, and again with the object region outlined."""
-    light_e = bright_electrons(loaded)
+    light_e = bright_electrons(elemental_set)
     if light_e is None:
         return {}
     picture = grey_levels(light_e, white_level(light_e))
@@ -253,10 +257,10 @@ def _every_nth(pixels: NDArray[Any], width_px: int) -> NDArray[Any]:
     return pixels[step // 2 :: step, step // 2 :: step]
 
 
-def _grid(loaded: ElementalSet) -> tuple[int, int] | None:
+def _grid(elemental_set: ElementalSet) -> tuple[int, int] | None:
     """Return rows and columns of the grid, None unless every view states its node and most nodes have a view."""
-    nodes = [view.node for view in loaded.settings.view if view.node is not None]
-    if len(nodes) < len(loaded.settings.view):
+    nodes = [view.node for view in elemental_set.settings.view if view.node is not None]
+    if len(nodes) < len(elemental_set.settings.view):
         return None
     rows, columns = (int(np.ptp(places)) + 1 for places in zip(*nodes, strict=True))
     return (rows, columns) if rows * columns <= _MAX_NODES_PER_VIEW * len(nodes) else None

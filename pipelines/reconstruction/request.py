@@ -34,7 +34,7 @@ _MIN_DEPTHS_OF_A_MAP = 5
 _WITH_PRIOR: frozenset[Method] = frozenset({"pmlem", *JOINT_METHODS})
 
 
-def distinct_depths(depths: list[float], loaded: ElementalSet | None = None) -> list[float]:
+def distinct_depths(depths: list[float], elemental_set: ElementalSet | None = None) -> list[float]:
     """Return each depth once; refuse those behind the camera, and two different ones that would share a file name.
 
     Names and messages are those of a set; of one in mm if it is not given.
@@ -42,9 +42,13 @@ def distinct_depths(depths: list[float], loaded: ElementalSet | None = None) -> 
     by_name: dict[str, float] = {}
     for depth in depths:
         check_in_front(depth)
-        other = by_name.setdefault(plane_stem(loaded, depth) if loaded else plane_name(depth), depth)
+        other = by_name.setdefault(plane_stem(elemental_set, depth) if elemental_set else plane_name(depth), depth)
         if other != depth:
-            pair = loaded.depths_text(other, depth, join=" and ") if loaded else f"{other:g} and {depth:g} mm"
+            pair = (
+                elemental_set.depths_text(other, depth, join=" and ")
+                if elemental_set
+                else f"{other:g} and {depth:g} mm"
+            )
             apart = "0.1 mm apart" if pair.endswith(" mm") else "farther apart"
             raise WrongUsage(f"planes at {pair} would share a file name; keep them {apart}")
     return list(by_name.values())
@@ -270,7 +274,7 @@ def _check_methods(selection: Selection, methods: list[Method], settings: Settin
 
 
 def resolve(
-    selection: Selection, loaded: ElementalSet, out: Path, earlier: ReconstructionRecord | None = None
+    selection: Selection, elemental_set: ElementalSet, out: Path, earlier: ReconstructionRecord | None = None
 ) -> Request:
     """Return the request for a set: disparities become depths, and `auto` the depths that are found.
 
@@ -282,28 +286,28 @@ def resolve(
     WrongUsage, BadValue, NothingInFocus
         The depths do not suit the options, a disparity has no depth, or the search finds none.
     """
-    _refuse_mm(selection, loaded)
-    selection = _in_unit(selection, loaded)
+    _refuse_mm(selection, elemental_set)
+    selection = _in_unit(selection, elemental_set)
     disparities_px = [*selection.disparities_px, *selection.swept_px]
-    of_disparity = {loaded.depth_of_disparity(disparity_px): disparity_px for disparity_px in disparities_px}
+    of_disparity = {elemental_set.depth_of_disparity(disparity_px): disparity_px for disparity_px in disparities_px}
     depths = [*selection.depths_mm, *selection.swept_mm, *of_disparity]
     found = None
     if selection.auto:
         range_mm = (min(depths), max(depths)) if depths else None
         if earlier is None:
-            found = best_focus(loaded, out, range_mm)
+            found = best_focus(elemental_set, out, range_mm)
         else:
-            found = _found_earlier(earlier, range_mm or searched_range_mm(loaded))
+            found = _found_earlier(earlier, range_mm or searched_range_mm(elemental_set))
         depths, of_disparity = found.depth_mm if found else [], {}
     swept_mm: list[float] = []
     if selection.auto_sweep:
         if earlier is None:
-            swept_mm = sweep_of_range(loaded, found_range_mm(loaded, out))
+            swept_mm = sweep_of_range(elemental_set, found_range_mm(elemental_set, out))
         elif earlier.options.auto_sweep and earlier.options.depth_mm:
             swept_mm = earlier.options.depth_mm[-earlier.options.auto_sweep :]
         depths = [*depths, *swept_mm]
     return Request(
-        distinct_depths(depths, loaded),
+        distinct_depths(depths, elemental_set),
         selection.methods,
         selection.settings,
         selection.pitch_mm,
@@ -323,22 +327,23 @@ def _found_earlier(earlier: ReconstructionRecord, range_mm: tuple[float, float])
     return found if found and found.searched_mm[0] == (near_mm, far_mm) else None
 
 
-def _refuse_mm(selection: Selection, loaded: ElementalSet) -> None:
+def _refuse_mm(selection: Selection, elemental_set: ElementalSet) -> None:
     """Refuse depths in mm for a set without a scale (WrongUsage)."""
-    if loaded.units.depth == "mm" or not (selection.depths_mm or selection.swept_mm):
+    if elemental_set.units.depth == "mm" or not (selection.depths_mm or selection.swept_mm):
         return
     given = "--depth-mm" if selection.depths_mm else "--sweep-mm"
     own = given.removesuffix("-mm")
     other = f"{own}, in its own unit, or {'--disparity-px' if selection.depths_mm else '--sweep-px'}"
     raise WrongUsage(
-        f"{given} {[*selection.depths_mm, *selection.swept_mm][0]:g}: {loaded.folder} has no scale, its depths are "
-        f"{'disparities' if loaded.units.depth == 'disparity_px' else 'relative'}; give {other}, or auto"
+        f"{given} {[*selection.depths_mm, *selection.swept_mm][0]:g}: "
+        f"{elemental_set.folder} has no scale, its depths are "
+        f"{'disparities' if elemental_set.units.depth == 'disparity_px' else 'relative'}; give {other}, or auto"
     )
 
 
-def _in_unit(selection: Selection, loaded: ElementalSet) -> Selection:
+def _in_unit(selection: Selection, elemental_set: ElementalSet) -> Selection:
     """Return a selection whose depths in the unit of the set are depths or disparities."""
-    if loaded.units.depth == "disparity_px":
+    if elemental_set.units.depth == "disparity_px":
         return replace(
             selection,
             disparities_px=[*selection.disparities_px, *selection.own],

@@ -61,7 +61,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     units: StatedUnits | UnsetType = UNSET
 
 
-def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
+def reconstruct_set(elemental_set: ElementalSet, out: Path, request: Request, runner: Runner = run_serially) -> Outcome:
     """Reconstruct planes of a set, and write them with their provenance and their errors.
 
     Planes that exist and were made from the same files with the same options are kept. An earlier report is removed,
@@ -73,28 +73,28 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
         A depth map is asked for, and a folder of planes holds a surface, whose files have the same names.
     """
     started = time.monotonic()
-    depths, methods = distinct_depths(request.depths_mm, loaded), list(dict.fromkeys(request.methods))
-    found = in_units(loaded, request.found) if request.found else None
+    depths, methods = distinct_depths(request.depths_mm, elemental_set), list(dict.fromkeys(request.methods))
+    found = in_units(elemental_set, request.found) if request.found else None
     request = replace(request, depths_mm=depths, methods=methods)
-    loaded = keeping_frames(loaded, out)
-    _refuse_pitch(loaded, request)
+    elemental_set = keeping_frames(elemental_set, out)
+    _refuse_pitch(elemental_set, request)
     folders = {name: folder_of_method(out, name, methods) for name in methods}
     if request.with_depth_map:
         _refuse_surfaces(list(folders.values()))
-        check_sweep(loaded, depths)
-    sweep = _sweep(loaded, folders, request)
-    glance = look_at(loaded)  # here, as what is wrong with a set is to be found before its planes are made
-    read_truth(loaded.folder)
+        check_sweep(elemental_set, depths)
+    sweep = _sweep(elemental_set, folders, request)
+    glance = look_at(elemental_set)  # here, as what is wrong with a set is to be found before its planes are made
+    read_truth(elemental_set.folder)
     if request.with_depth_map and kept_depth_map(folders, sweep.origins) is None:
-        check_light(loaded, depths, out)
+        check_light(elemental_set, depths, out)
     _make_planes(sweep, folders, out, runner)
     write_overview(glance, out)
     depth_map = None
     if request.with_depth_map:
-        depth_map = write_depth_map(loaded, sweep.written, request.disparities_px, sweep.origins)
+        depth_map = write_depth_map(elemental_set, sweep.written, request.disparities_px, sweep.origins)
         for folder in folders.values():
-            write_depth_errors(loaded, folder, depth_map.file, depth_map.unit)
-    metrics = assess(loaded, sweep.written)
+            write_depth_errors(elemental_set, folder, depth_map.file, depth_map.unit)
+    metrics = assess(elemental_set, sweep.written)
     remove(out / METRICS_FILE)  # of earlier planes
     if metrics:
         write_record(out / METRICS_FILE, metrics)
@@ -111,20 +111,20 @@ def reconstruct_set(loaded: ElementalSet, out: Path, request: Request, runner: R
         )
         write_record(folder / RECONSTRUCTION_FILE, result)
         if request.with_focus:
-            write_stack(folder, result.planes, loaded.units)
+            write_stack(folder, result.planes, elemental_set.units)
         shutil.rmtree(folder / PARTS, ignore_errors=True)  # also those of another call that was interrupted
-    _warn(loaded, records)
+    _warn(elemental_set, records)
     return Outcome(
         out=str(out), planes=records, focus=focus, best_focus=found, depth_map=depth_map, metrics=metrics,
-        units=loaded.units,
+        units=elemental_set.units,
     )  # fmt: skip
 
 
-def _refuse_pitch(loaded: ElementalSet, request: Request) -> None:
+def _refuse_pitch(elemental_set: ElementalSet, request: Request) -> None:
     """Refuse a pitch in mm for a set that knows no lengths (BadValue)."""
-    if request.pitch_mm and loaded.units.depth == "disparity_px":
+    if request.pitch_mm and elemental_set.units.depth == "disparity_px":
         raise BadValue(
-            f"{loaded.folder}: knows disparities, no lengths; a pitch of {request.pitch_mm:g} means nothing; "
+            f"{elemental_set.folder}: knows disparities, no lengths; a pitch of {request.pitch_mm:g} means nothing; "
             "leave --pitch-mm out, or import the pictures again with the pitch of the nodes and the focal length"
         )
 
@@ -155,32 +155,34 @@ def _make_planes(sweep: Sweep, folders: dict[Method, Path], out: Path, runner: R
                 (folder / PARTS).rmdir()  # stays while it holds colours of incomplete planes
 
 
-def _sweep(loaded: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
+def _sweep(elemental_set: ElementalSet, folders: dict[Method, Path], request: Request) -> Sweep:
     """Return the planes of a request, none of them made yet."""
-    layouts = channel_layouts(loaded)
-    mm_per_depth = default_pitch_px(loaded, layouts) / loaded.settings.camera.fx_px
+    layouts = channel_layouts(elemental_set)
+    mm_per_depth = default_pitch_px(elemental_set, layouts) / elemental_set.settings.camera.fx_px
     grids: dict[Place, PlaneGrid] = {
-        depth: plane_grid(loaded, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm
+        depth: plane_grid(elemental_set, depth, request.pitch_mm or depth * mm_per_depth) for depth in request.depths_mm
     }
     for plane in request.tilted:
-        grids[plane] = tilted_grid(loaded, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
-    inputs = loaded.input_hashes()
-    units = loaded.units
+        grids[plane] = tilted_grid(elemental_set, plane, request.pitch_mm or plane.depth_mm * mm_per_depth)
+    inputs = elemental_set.input_hashes()
+    units = elemental_set.units
     all_planes = {
-        name: provenance("reconstruct", in_units(loaded, request.options(name, loaded.poses)), inputs, units)
+        name: provenance(
+            "reconstruct", in_units(elemental_set, request.options(name, elemental_set.poses)), inputs, units
+        )
         for name in folders
     }
     channels = tuple(layout.name for layout in layouts)
     files = []
     for place in grids:
         for name, folder in folders.items():
-            options = in_units(loaded, request.of_plane(name, place).options(name, loaded.poses))
+            options = in_units(elemental_set, request.of_plane(name, place).options(name, elemental_set.poses))
             origin = msgspec.structs.replace(all_planes[name], options=options)
-            files.append(PlaneFiles(folder, name, place, channels, origin, plane_stem(loaded, place)))
-    return Sweep(loaded, layouts, grids, files, all_planes, request.settings, request.with_focus)
+            files.append(PlaneFiles(folder, name, place, channels, origin, plane_stem(elemental_set, place)))
+    return Sweep(elemental_set, layouts, grids, files, all_planes, request.settings, request.with_focus)
 
 
-def _warn(loaded: ElementalSet, records: list[PlaneRecord]) -> None:
+def _warn(elemental_set: ElementalSet, records: list[PlaneRecord]) -> None:
     """Inform the user of planes that may be wrong: unsettled, not converged, or without light."""
     certificates = [
         record.certificate for record in records if record.certificate and record.certificate.oscillates is not UNSET
@@ -210,9 +212,9 @@ def _warn(loaded: ElementalSet, records: list[PlaneRecord]) -> None:
         inform(
             f"the prior is left out of {len(without)} of {len(records)} planes, total variation's stay: {without[0]}"
         )
-    black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(loaded)]
+    black = [record for record in records if record.mean_e <= _BLACK_E * light_per_e(elemental_set)]
     if black:
-        first = loaded.units.depths_text([black[0].depth_mm])
+        first = elemental_set.units.depths_text([black[0].depth_mm])
         inform(
             f"{len(black)} of {len(records)} planes are black ({black[0].method}, {first} for "
             "one): the views are no brighter than offset_dn and dark_current_e_per_s say of darkness; compare these "

@@ -89,10 +89,10 @@ def check_places(views: BinnedViews, range_mm: tuple[float, float]) -> Significa
     shuffled = [shown.tried(places) for places in progress(_shuffles(count), "comparing shuffled views")]
     found = significance(stated, shuffled)
     largest = next(p_value for fewest, p_value in _LARGEST_P.items() if count >= fewest)
-    _refuse_rearranged(views.loaded, shown, stated, shuffled, min(largest, _MAX_P_REARRANGED))
+    _refuse_rearranged(views.elemental_set, shown, stated, shuffled, min(largest, _MAX_P_REARRANGED))
     if found.p_value > largest:
         raise NothingInFocus(
-            f"{views.loaded.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
+            f"{views.elemental_set.folder}: the views agree no better than shuffled ones (p = {found.p_value:.2g} of "
             f"{found.shuffles} shuffles, at most {largest:g} is needed): nothing moves between them as their places "
             "say; correct order and places of the pictures, use more light, or make planes at depths given by --depth"
         )
@@ -117,7 +117,7 @@ def _shuffles(count: int) -> list[NDArray[np.intp]]:
 
 
 def _refuse_rearranged(
-    loaded: ElementalSet, shown: _Views, stated: float, shuffled: list[float], largest_p: float
+    elemental_set: ElementalSet, shown: _Views, stated: float, shuffled: list[float], largest_p: float
 ) -> None:
     """Refuse views that agree clearly better with their rows or columns reversed, or exchanged (NothingInFocus)."""
     chance = float(np.mean(shuffled))
@@ -127,7 +127,8 @@ def _refuse_rearranged(
     best, remedy = min(tried)
     if significance(best, shuffled).p_value <= largest_p and chance - best > _CLEARLY * (chance - stated):
         raise NothingInFocus(
-            f"{loaded.folder}: the views agree better with {remedy}: by {chance - best:.3g} in squared deviations, "
+            f"{elemental_set.folder}: the views agree better with {remedy}: "
+            f"by {chance - best:.3g} in squared deviations, "
             f"and by {chance - stated:.3g} as stated; import the pictures again so"
         )
 
@@ -158,7 +159,7 @@ def _arrangements(nodes: list[tuple[int, int] | None]) -> list[tuple[str, NDArra
 def _compared(views: BinnedViews) -> list[int]:
     """Return the views that are compared: evenly chosen, without those that are largely saturated or masked."""
     layout, images = views.colours[0]
-    chosen = _evenly(views.loaded)
+    chosen = _evenly(views.elemental_set)
     if images.valid is None:
         return chosen
     known = images.valid.reshape(-1, len(layout.lattices), images.valid[0].size).mean(axis=(1, 2))
@@ -167,7 +168,7 @@ def _compared(views: BinnedViews) -> list[int]:
 
 def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[float]) -> _Views:
     """Return what some views show of the planes, in one colour, if taken from each of their places."""
-    loaded, (layout, images) = views.loaded, views.colours[0]
+    elemental_set, (layout, images) = views.elemental_set, views.colours[0]
     shape, bins = images.electrons.shape[1:], 1
     while (shape[0] // bins) * (shape[1] // bins) > _MAX_SAMPLES and min(shape) // (2 * bins) >= _MIN_BINS:
         bins *= 2
@@ -176,7 +177,7 @@ def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[floa
     )
     light = electrons.reshape(-1, len(layout.lattices), *electrons.shape[1:]).mean(axis=1)[chosen] * bins**2
     known = (float(np.mean(images.background_e)) + float(np.mean(images.read_variance_e2))) * bins**2
-    places_px = _places_px(loaded, chosen, depths_mm, light.shape[1:], views.bins_px * bins)
+    places_px = _places_px(elemental_set, chosen, depths_mm, light.shape[1:], views.bins_px * bins)
     shown = np.empty((len(chosen), len(chosen), *places_px.shape[1:3]), np.float32)
     for place, at in enumerate(places_px):
         for view, image in enumerate(light.astype(np.float32)):
@@ -185,22 +186,25 @@ def _from_all_places(views: BinnedViews, chosen: list[int], depths_mm: list[floa
             )
     inside = (places_px >= 0) & (places_px <= np.array(light.shape[:0:-1]) - 1)
     return _Views(
-        shown, inside.all(axis=-1), known / len(layout.lattices), [loaded.settings.view[view].node for view in chosen]
+        shown,
+        inside.all(axis=-1),
+        known / len(layout.lattices),
+        [elemental_set.settings.view[view].node for view in chosen],
     )
 
 
 def _places_px(
-    loaded: ElementalSet, chosen: list[int], depths_mm: list[float], shape: tuple[int, ...], bins_px: int
+    elemental_set: ElementalSet, chosen: list[int], depths_mm: list[float], shape: tuple[int, ...], bins_px: int
 ) -> NDArray[np.float32]:
     """Return where others see the bins of the reference view at each depth: column, row (view, depth, bin, 2)."""
     rows, columns = np.indices(shape)
     pixels = (np.stack([columns.ravel(), rows.ravel()], axis=-1) + 0.5) * bins_px - 0.5
-    camera, poses = loaded.settings.camera, loaded.poses_rt_cam_ref
-    shifts = loaded.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
-    straight = pixels - shifts[loaded.reference_view]
+    camera, poses = elemental_set.settings.camera, elemental_set.poses_rt_cam_ref
+    shifts = elemental_set.principal_points_px() - np.array([camera.cx_px, camera.cy_px])
+    straight = pixels - shifts[elemental_set.reference_view]
     seen = [
         [
-            transfer(loaded.lens, poses[view], fronto_parallel_rt_ref_plane(depth), straight) + shifts[view]
+            transfer(elemental_set.lens, poses[view], fronto_parallel_rt_ref_plane(depth), straight) + shifts[view]
             for depth in depths_mm
         ]
         for view in chosen
@@ -210,9 +214,9 @@ def _places_px(
     return np.clip(np.nan_to_num(places, nan=-1.0), -1.0, shape[::-1]).astype(np.float32)
 
 
-def _evenly(loaded: ElementalSet) -> list[int]:
+def _evenly(elemental_set: ElementalSet) -> list[int]:
     """Return the views that are compared: all, or those of some rows and columns, evenly and symmetrically chosen."""
-    nodes = [view.node for view in loaded.settings.view]
+    nodes = [view.node for view in elemental_set.settings.view]
     if len(nodes) <= _MAX_VIEWS:
         return list(range(len(nodes)))
     if any(node is None for node in nodes):

@@ -65,7 +65,7 @@ _NUMBERS, _NUMBERS_PER_COLOUR, _POINT_BYTES, _FIXED_BYTES = 4, 2, 27, 30_000_000
 
 
 def reconstruct_surface(
-    loaded: ElementalSet, out: Path, request: SurfaceRequest, pages: Sequence[Path] = ()
+    elemental_set: ElementalSet, out: Path, request: SurfaceRequest, pages: Sequence[Path] = ()
 ) -> SurfaceRecord:
     """Reconstruct the surface of a set, and write it with its record; one that is up to date is kept.
 
@@ -73,7 +73,7 @@ def reconstruct_surface(
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     out : Path
         Folder of the files.
@@ -95,52 +95,53 @@ def reconstruct_surface(
         and none is found.
     """
     started = time.monotonic()
-    _check(loaded, out)
-    loaded = keeping_frames(loaded, out)
-    unit = unit_of_maps(loaded.units, as_px=request.unit == "px")
-    options = in_units(loaded, request.options(loaded.poses))
-    origin = provenance("reconstruct", options, loaded.input_hashes(), loaded.units)
+    _check(elemental_set, out)
+    elemental_set = keeping_frames(elemental_set, out)
+    unit = unit_of_maps(elemental_set.units, as_px=request.unit == "px")
+    options = in_units(elemental_set, request.options(elemental_set.poses))
+    origin = provenance("reconstruct", options, elemental_set.input_hashes(), elemental_set.units)
     kept = read_current(out / SURFACE_FILE, SurfaceFileRecord, origin)
     if kept is not None:
         return kept.surface
-    layouts = channel_layouts(loaded)
-    grid = plane_grid(loaded, 1.0)
+    layouts = channel_layouts(elemental_set)
+    grid = plane_grid(elemental_set, 1.0)
     needed_bytes = _needed_bytes(grid.shape, len(layouts), proposal=request.settings.proposal)
     require_room(out, int(needed_bytes / (1 - SHARE_OF_DISK)))  # decoded frames take the rest
-    range_mm = limits_mm(loaded, request)
-    find_range = request.depth_range_mm is None and imported_range_px(loaded) is None
+    range_mm = limits_mm(elemental_set, request)
+    find_range = request.depth_range_mm is None and imported_range_px(elemental_set) is None
     remove_leftovers(out)
-    bins = default_bins(loaded)
-    depths, estimate = depths_of_set(loaded, bins, range_mm, find_range=find_range, out=out)
+    bins = default_bins(elemental_set)
+    depths, estimate = depths_of_set(elemental_set, bins, range_mm, find_range=find_range, out=out)
     far, near = float(depths[0]), float(depths[-1])
     inverse_depth = enlarged(estimate.inverse_depth, grid.shape, bins)
-    with naming_range(loaded, far, near):
+    with naming_range(elemental_set, far, near):
         lights = {
-            layout.name: _light(loaded, layout, inverse_depth, request, out) for layout in progress(layouts, "picture")
+            layout.name: _light(elemental_set, layout, inverse_depth, request, out)
+            for layout in progress(layouts, "picture")
         }
     facts = SurfaceFacts(
         unit=unit,
-        searched=(in_unit(loaded, near, unit), in_unit(loaded, far, unit)),
+        searched=(in_unit(elemental_set, near, unit), in_unit(elemental_set, far, unit)),
         range_found=request.depth_range_mm is None,
         depths=len(depths),
         bins_px=bins,
         rounds=estimate.rounds,
         sure_above=SURE,
         held_out=_held_out(estimate.prediction),
-        channels=[in_units(loaded, _channel(name, light)) for name, light in lights.items()],
+        channels=[in_units(elemental_set, _channel(name, light)) for name, light in lights.items()],
         wall_time_s=time.monotonic() - started,
     )
-    maps = _maps(loaded, inverse_depth, estimate, list(lights.values()), unit, bins)
+    maps = _maps(elemental_set, inverse_depth, estimate, list(lights.values()), unit, bins)
     for page in pages:
         remove(page)
     record = write_surface(out, maps, facts, origin)
-    write_depth_errors(loaded, out, record.depth, record.unit)
+    write_depth_errors(elemental_set, out, record.depth, record.unit)
     return record
 
 
-def _check(loaded: ElementalSet, out: Path) -> None:
+def _check(elemental_set: ElementalSet, out: Path) -> None:
     """Refuse sets and folders for which no surface can be made."""
-    check_views(loaded, "a surface")
+    check_views(elemental_set, "a surface")
     if (out / DEPTH_MAP_FILE).exists():
         raise OutputExists(
             f"{out}: holds the depth map of a sweep, whose files have the names of the surface's; give another --out"
@@ -155,16 +156,20 @@ def _needed_bytes(shape: tuple[int, int], colours: int, *, proposal: bool) -> in
 
 
 def _light(
-    loaded: ElementalSet, layout: ChannelLayout, inverse_depth: NDArray[np.floating], request: SurfaceRequest, out: Path
+    elemental_set: ElementalSet,
+    layout: ChannelLayout,
+    inverse_depth: NDArray[np.floating],
+    request: SurfaceRequest,
+    out: Path,
 ) -> Solution:
     """Return one colour of the picture on a surface of known depth, with `sigma` and `visibility` beside it.
 
     `sigma` is that of total variation's picture; it is computed when the images are gone.
     """
-    images = load_channel(loaded, layout, memory_or_file(out))
-    factory = OperatorFactory(loaded, layout, images)
-    operator = factory.of_surface(inverse_depth, plane_grid(loaded, 1.0))
-    _name_blind_views(loaded, operator, len(layout.lattices))
+    images = load_channel(elemental_set, layout, memory_or_file(out))
+    factory = OperatorFactory(elemental_set, layout, images)
+    operator = factory.of_surface(inverse_depth, plane_grid(elemental_set, 1.0))
+    _name_blind_views(elemental_set, operator, len(layout.lattices))
     objective = Objective.of(SceneProblem(operator, images), request.settings)
     solution, sigma = solve_then_sigma(objective, request.settings)
     if request.filtered:
@@ -187,11 +192,11 @@ def _visibility(operator: SurfaceOperator, layout: ChannelLayout) -> NDArray[np.
     return operator.adjoint_of_map(inverse) * operator.dtype.type(samples_per_px)
 
 
-def _name_blind_views(loaded: ElementalSet, operator: SurfaceOperator, phases: int) -> None:
+def _name_blind_views(elemental_set: ElementalSet, operator: SurfaceOperator, phases: int) -> None:
     """Inform the user of views that see nothing of the surface: a pose may be wrong."""
     blind = {int(view) // phases for view in np.setdiff1d(operator.all_views, operator.seeing_views)}
     if blind:
-        first = loaded.settings.view[min(blind)].image
+        first = elemental_set.settings.view[min(blind)].image
         inform(f"{len(blind)} views see nothing of the surface, {first} for one; are their poses right?")
 
 
@@ -226,7 +231,7 @@ def _held_out(prediction: Prediction | None) -> HeldOutRecord | None:
 
 
 def _maps(
-    loaded: ElementalSet,
+    elemental_set: ElementalSet,
     inverse_depth: NDArray[np.float64],
     estimate: SurfaceEstimate,
     lights: list[Solution],
@@ -234,14 +239,14 @@ def _maps(
     bins: int,
 ) -> SurfaceMaps:
     """Return what is known of each sample."""
-    grid = plane_grid(loaded, 1.0)
+    grid = plane_grid(elemental_set, 1.0)
     confidence = enlarged(estimate.confidence, grid.shape, bins).astype(np.float32)
     known = confidence >= UNKNOWN_BELOW
-    depth = in_unit(loaded, inverse_depth, unit)
+    depth = in_unit(elemental_set, inverse_depth, unit)
     # Of a normal distribution that lies within the tolerance with this probability
     sigma = RIGHT_WITHIN / (np.sqrt(2) * erfinv(np.maximum(confidence, UNKNOWN_BELOW)))
-    slope = np.abs(in_unit(loaded, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
-    light = light_per_e(loaded)
+    slope = np.abs(in_unit(elemental_set, inverse_depth * (1 + 1e-6), unit) - depth) / 1e-6
+    light = light_per_e(elemental_set)
     proposed = all("proposal" in solution.sidecars for solution in lights)
     return SurfaceMaps(
         grid=grid,
@@ -254,7 +259,7 @@ def _maps(
         depth_confidence=confidence,
         visibility=np.mean([solution.sidecars["visibility"] for solution in lights], axis=0),
         inverse_depth=inverse_depth,
-        aperture_mm=aperture_of(loaded.poses_rt_cam_ref),
+        aperture_mm=aperture_of(elemental_set.poses_rt_cam_ref),
     )
 
 

@@ -39,12 +39,12 @@ _MIN_OVERLAP, _TRIED = 0.1, 8
 _COARSE, _TOO_COARSE = 3.5, 16.0
 
 
-def check_views(loaded: ElementalSet, wanted: str) -> None:
+def check_views(elemental_set: ElementalSet, wanted: str) -> None:
     """Refuse a set whose views tell no depths.
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     wanted : str
         What the depths are for, as the messages name it.
@@ -56,24 +56,25 @@ def check_views(loaded: ElementalSet, wanted: str) -> None:
     NothingInFocus
         All views were taken from one place.
     """
-    views, size_px = len(loaded.settings.view), loaded.settings.camera.size_px
+    views, size_px = len(elemental_set.settings.view), elemental_set.settings.camera.size_px
     if views < _MIN_VIEWS:
         raise BadValue(
-            f"{loaded.folder}: has {views} views, and {wanted} needs at least {_MIN_VIEWS}; capture more nodes"
+            f"{elemental_set.folder}: has {views} views, and {wanted} needs at least {_MIN_VIEWS}; capture more nodes"
         )
     if min(size_px) < _MIN_SIDE_PX:
         raise BadValue(
-            f"{loaded.folder}: has views of {size_px[0]} x {size_px[1]} px, and {wanted} needs at least "
+            f"{elemental_set.folder}: has views of {size_px[0]} x {size_px[1]} px, and {wanted} needs at least "
             f"{_MIN_SIDE_PX} px along each side; use larger ones"
         )
-    if not np.linalg.norm(loaded.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
+    if not np.linalg.norm(elemental_set.poses_rt_cam_ref[:, 3:], axis=1).max() > 0:
         raise NothingInFocus(
-            f"{loaded.folder}: all views were taken from one place, which tells no depths apart; correct the poses, or "
+            f"{elemental_set.folder}: all views were taken from one place, "
+            "which tells no depths apart; correct the poses, or "
             "capture several nodes"
         )
 
 
-def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, float]:
+def limits_mm(elemental_set: ElementalSet, request: SurfaceRequest) -> tuple[float, float]:
     """Return the nearest and farthest depth to consider: those given, or where the views overlap.
 
     Raises
@@ -84,27 +85,27 @@ def limits_mm(loaded: ElementalSet, request: SurfaceRequest) -> tuple[float, flo
         The views overlap nowhere.
     """
     if request.depth_range_mm is None:
-        return searched_range_mm(loaded)
-    check_overlap(loaded, request.depth_range_mm)
+        return searched_range_mm(elemental_set)
+    check_overlap(elemental_set, request.depth_range_mm)
     return request.depth_range_mm
 
 
-def check_agreement(loaded: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:
+def check_agreement(elemental_set: ElementalSet, range_mm: tuple[float, float], out: Path) -> None:
     """Refuse views that agree no better than shuffled ones in a range of depths (NothingInFocus).
 
     `out` is for a temporary file if memory is short.
     """
-    check_places(views_of_search(loaded, range_mm, out), range_mm)
+    check_places(views_of_search(elemental_set, range_mm, out), range_mm)
 
 
-def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
+def check_overlap(elemental_set: ElementalSet, range_mm: tuple[float, float]) -> None:
     """Refuse a range of depths, nearest and farthest, at which the views share too little (GeometryMismatch)."""
     near_mm, far_mm = range_mm
     depths = 1 / np.linspace(1 / near_mm, 1 / far_mm, _TRIED)
-    own = 1 / len(loaded.settings.view)  # the share of the reference view itself
-    shared = (max(overlap(loaded, depth) for depth in depths.tolist()) - own) / (1 - own)
+    own = 1 / len(elemental_set.settings.view)  # the share of the reference view itself
+    shared = (max(overlap(elemental_set, depth) for depth in depths.tolist()) - own) / (1 - own)
     if shared < _MIN_OVERLAP:
-        between = loaded.depths_text(near_mm, far_mm, join=" and ")
+        between = elemental_set.depths_text(near_mm, far_mm, join=" and ")
         raise GeometryMismatch(
             f"between {between} the other views see {shared:.0%} of what the reference view sees, "
             f"on average, and {_MIN_OVERLAP:.0%} are needed; correct the range, or the poses and their signs"
@@ -112,7 +113,7 @@ def check_overlap(loaded: ElementalSet, range_mm: tuple[float, float]) -> None:
 
 
 def depths_of_set(
-    loaded: ElementalSet,
+    elemental_set: ElementalSet,
     bins: int,
     range_mm: tuple[float, float],
     *,
@@ -125,7 +126,7 @@ def depths_of_set(
 
     Parameters
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     bins : int
         Pixels along a side of a bin.
@@ -143,44 +144,44 @@ def depths_of_set(
     NothingInFocus
         Nothing is found in the range, or the views agree no better than shuffled ones.
     """
-    nodes, views = nodes_of(loaded), between_pixels(luminance(loaded, bins))
+    nodes, views = nodes_of(elemental_set), between_pixels(luminance(elemental_set, bins))
     near, far = 1 / range_mm[0], 1 / range_mm[1]
-    with naming_range(loaded, far, near):
+    with naming_range(elemental_set, far, near):
         if find_range:
             with working("searching the range of depths"):
                 far, near = found_range(views, nodes, far, near)
         depths = equal_steps(views, far, near)
         _check_steps(views, depths)
     if out is not None:
-        check_agreement(loaded, range_mm, out)
-    with naming_range(loaded, far, near):
-        inform(f"surface {_between(loaded, far, near)}: comparing {len(depths)} depths")
+        check_agreement(elemental_set, range_mm, out)
+    with naming_range(elemental_set, far, near):
+        inform(f"surface {_between(elemental_set, far, near)}: comparing {len(depths)} depths")
         with working("finding the depths of the surface"):
             return depths, estimate_surface(views, depths, nodes)
 
 
 @contextmanager
-def naming_range(loaded: ElementalSet, far: float, near: float) -> Iterator[None]:
+def naming_range(elemental_set: ElementalSet, far: float, near: float) -> Iterator[None]:
     """Name the range of 1/depth in which views, poses and surface do not fit together."""
     try:
         yield
     except GeometryMismatch as failure:
-        raise GeometryMismatch(f"surface {_between(loaded, far, near)}: {failure}") from failure
+        raise GeometryMismatch(f"surface {_between(elemental_set, far, near)}: {failure}") from failure
     except NothingInFocus as failure:
-        option = "--disparity-range-px" if loaded.units.depth == "disparity_px" else "--depth-range-mm"
+        option = "--disparity-range-px" if elemental_set.units.depth == "disparity_px" else "--depth-range-mm"
         raise NothingInFocus(
-            f"{_between(loaded, far, near)} {failure}; give the range by {option} NEAR:FAR, or more light"
+            f"{_between(elemental_set, far, near)} {failure}; give the range by {option} NEAR:FAR, or more light"
         ) from failure
 
 
-def _between(loaded: ElementalSet, far: float, near: float) -> str:
+def _between(elemental_set: ElementalSet, far: float, near: float) -> str:
     """Return a range of 1/depth in words."""
-    return f"between {loaded.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
+    return f"between {elemental_set.depths_text(float(f'{1 / near:.4g}'), float(f'{1 / far:.4g}'), join=' and ')}"
 
 
-def nodes_of(loaded: ElementalSet) -> NDArray[np.intp]:
+def nodes_of(elemental_set: ElementalSet) -> NDArray[np.intp]:
     """Return row and column of the node of each view; a row of views if no nodes are stated."""
-    views = loaded.settings.view
+    views = elemental_set.settings.view
     if any(view.node is None for view in views):
         return np.array([(0, index) for index in range(len(views))])
     return np.array([view.node for view in views])
@@ -235,10 +236,10 @@ def enlarged(
 
 
 def in_unit[Numbers: (float, NDArray[np.float64])](
-    loaded: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px", "relative"]
+    elemental_set: ElementalSet, inverse_depth: Numbers, unit: Literal["mm", "px", "relative"]
 ) -> Numbers:
     """Return depths as the poses have them, or disparities in px from one node to the next."""
     if unit != "px":
         return 1 / inverse_depth
-    at_zero, slope = loaded.inverse_depth_of_disparity()
+    at_zero, slope = elemental_set.inverse_depth_of_disparity()
     return (inverse_depth - at_zero) / slope

@@ -77,7 +77,7 @@ class SurfaceSelection:
     settings: Settings
     filtered: bool
 
-    def resolve(self, loaded: ElementalSet) -> SurfaceRequest:
+    def resolve(self, elemental_set: ElementalSet) -> SurfaceRequest:
         """Return the request for a set, whose disparities become depths.
 
         Raises
@@ -87,7 +87,7 @@ class SurfaceSelection:
         """
         if self.range_px is None:
             return SurfaceRequest(self.range_mm, "mm", self.settings, self.filtered)
-        near_mm, far_mm = sorted(loaded.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
+        near_mm, far_mm = sorted(elemental_set.depth_of_disparity(disparity_px) for disparity_px in self.range_px)
         return SurfaceRequest((near_mm, far_mm), "px", self.settings, self.filtered)
 
 

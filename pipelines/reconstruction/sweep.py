@@ -31,14 +31,18 @@ from faintfield.recon.operator.grid import PlaneGrid
 type Runner = Callable[[ElementalSet, Path, Sequence[PlaneTask]], Generator[tuple[PlaneTask, list[str]]]]
 
 
-def run_serially(loaded: ElementalSet, out: Path, tasks: Sequence[PlaneTask]) -> Generator[tuple[PlaneTask, list[str]]]:
+def run_serially(
+    elemental_set: ElementalSet, out: Path, tasks: Sequence[PlaneTask]
+) -> Generator[tuple[PlaneTask, list[str]]]:
     """Do tasks in this process with all its threads, one colour at a time, from a file if memory is short."""
     held: list[tuple[ChannelLayout, Channel]] = []
 
     def opened(layout: ChannelLayout) -> Channel:
         if not held or held[0][0] is not layout:
             held.clear()  # frees the previous channel before the next is read
-            held.append((layout, Channel(loaded, layout, load_channel(loaded, layout, memory_or_file(out)))))
+            held.append(
+                (layout, Channel(elemental_set, layout, load_channel(elemental_set, layout, memory_or_file(out))))
+            )
         return held[0][1]
 
     for task in tasks:
@@ -51,7 +55,7 @@ class Sweep:
 
     Attributes
     ----------
-    loaded : ElementalSet
+    elemental_set : ElementalSet
         The set.
     layouts : list of ChannelLayout
         Its colours.
@@ -69,7 +73,7 @@ class Sweep:
         The planes that are there.
     """
 
-    loaded: ElementalSet
+    elemental_set: ElementalSet
     layouts: list[ChannelLayout]
     grids: dict[Place, PlaneGrid]
     files: Sequence[PlaneFiles]
@@ -102,7 +106,7 @@ class Sweep:
             )
         tasks = self._tasks()
         self._write_complete(self.files)
-        with closing(runner(self.loaded, out, tasks)) as done:
+        with closing(runner(self.elemental_set, out, tasks)) as done:
             for task, messages in progress(done, "reconstructing planes", len(tasks)):
                 for message in messages:
                     inform(message)
@@ -162,7 +166,7 @@ class Sweep:
         method = self.files[0].method
         depths = [place for place in self.grids if not isinstance(place, TiltedPlane)]
         curve = [_sum(self.finished[method, depth].focus) for depth in depths]
-        stated = self.loaded.stated_depth
+        stated = self.elemental_set.stated_depth
         return FocusCurve(
             depth_mm=[stated(depth) for depth in depths],
             detail_e2=[point.detail_e2 for point in curve],

@@ -54,12 +54,12 @@ class PlaneTask:
 class Channel:
     """One colour of a set in memory: what all of its tasks share."""
 
-    def __init__(self, loaded: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
-        self._loaded = loaded
+    def __init__(self, elemental_set: ElementalSet, layout: ChannelLayout, images: ElementalImages) -> None:
+        self._loaded = elemental_set
         self._layout = layout
         self._images = images
         self._phases = len(layout.lattices)
-        self._factory = OperatorFactory(loaded, layout, images)
+        self._factory = OperatorFactory(elemental_set, layout, images)
 
     def total_variation(self, task: PlaneTask) -> dict[Place, Solution]:
         """Return the planes from which the priors of a task begin."""

@@ -132,7 +132,7 @@ def faults(library: Path, warm_up: Sequence[Sequence[str]] = ()) -> Iterator[Fau
             process.kill()
 
 
-def loaded() -> ctypes.CDLL:
+def elemental_set() -> ctypes.CDLL:
     """Return the library that stands between this process and the C library."""
     library = ctypes.CDLL(None)
     library.faults_arm.argtypes = (
@@ -195,7 +195,7 @@ def _serve(warm_up: list[list[str]]) -> None:
     os.dup2(2, 1)
     for words in warm_up:
         assert run(words) == 0, words
-    library = loaded()
+    library = elemental_set()
     for line in sys.stdin.buffer:
         answers.write(msgspec.json.encode(_tried(msgspec.json.decode(line, type=Trial), library)) + b"\n")
 

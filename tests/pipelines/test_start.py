@@ -77,11 +77,11 @@ def test_version_and_help_load_nothing_heavy() -> None:
     commands = list(_commands(app))
     assert {"run", "demo", "stage test", "import grid", "export zarr"} <= {*commands}
     lines = _complaint(_LOADED_BY_EACH, *commands).split("\n")[:-1]
-    loaded = {name: {*modules} for name, *modules in (line.split(",") for line in lines)}
-    assert loaded.keys() == {"--version", *commands}
-    assert "faintfield.pipelines.cli" in loaded["--version"]
-    assert not loaded["--version"] & {"cyclopts", "rich", "msgspec", "logging"}
-    for command, modules in loaded.items():
+    elemental_set = {name: {*modules} for name, *modules in (line.split(",") for line in lines)}
+    assert elemental_set.keys() == {"--version", *commands}
+    assert "faintfield.pipelines.cli" in elemental_set["--version"]
+    assert not elemental_set["--version"] & {"cyclopts", "rich", "msgspec", "logging"}
+    for command, modules in elemental_set.items():
         assert "0" in modules
         assert not modules & HEAVY, command
 

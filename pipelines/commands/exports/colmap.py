@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 
 def export_colmap(
-    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")],
+    set_path: Annotated[Path, Parameter(name="SESSION|SET")],
     out: Path,
     /,
     *,
@@ -22,7 +22,7 @@ def export_colmap(
 
     Parameters
     ----------
-    elemental_set
+    set_path
         A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder to write.
@@ -37,17 +37,19 @@ def export_colmap(
     from faintfield.pipelines.formats.sets.session_set import load_set_or_session
     from faintfield.pipelines.formats.sets.stated import stated_length
 
-    loaded = load_set_or_session(elemental_set)
-    lenses = lens_of_each_view(loaded)
+    elemental_set = load_set_or_session(set_path)
+    lenses = lens_of_each_view(elemental_set)
     cameras = {lens: number for number, lens in enumerate(dict.fromkeys(lenses), start=1)}
     model = ColmapModel(
         {number: lens for lens, number in cameras.items()},
         [
             ColmapImage(view.image, cameras[lens], pose)
-            for view, lens, pose in zip(loaded.settings.view, lenses, loaded.poses_rt_cam_ref, strict=True)
+            for view, lens, pose in zip(
+                elemental_set.settings.view, lenses, elemental_set.poses_rt_cam_ref, strict=True
+            )
         ],
     )
-    unit = stated_length(loaded, "mm")
+    unit = stated_length(elemental_set, "mm")
     with writing_folder(out, replace_only=MODEL_FILES if overwrite else ()) as folder:
         write_model(folder, model, binary=binary)
     return {"out": str(out), "views": len(model.images), "unit": unit}

@@ -9,7 +9,7 @@ from faintfield.pipelines.errors import BadValue
 
 
 def export_mrcal(
-    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
+    set_path: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
 ) -> dict[str, str | int]:
     """Write the lens and poses of an elemental set as .cameramodel files, one per view, in metres.
 
@@ -17,7 +17,7 @@ def export_mrcal(
 
     Parameters
     ----------
-    elemental_set
+    set_path
         A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder to write.
@@ -30,14 +30,16 @@ def export_mrcal(
     from faintfield.pipelines.formats.sets.session_set import load_set_or_session
     from faintfield.pipelines.formats.sets.stated import stated_length
 
-    loaded = load_set_or_session(elemental_set)
+    elemental_set = load_set_or_session(set_path)
     models: dict[str, str] = {}
-    for view, lens, pose in zip(loaded.settings.view, lens_of_each_view(loaded), loaded.poses_rt_cam_ref, strict=True):
+    for view, lens, pose in zip(
+        elemental_set.settings.view, lens_of_each_view(elemental_set), elemental_set.poses_rt_cam_ref, strict=True
+    ):
         name = Path(view.image).with_suffix(SUFFIX).name
         if name in models:
-            raise BadValue(f"{elemental_set}: {view.image} would become {name} like another view; rename its image")
+            raise BadValue(f"{set_path}: {view.image} would become {name} like another view; rename its image")
         models[name] = camera_model_text(lens, lens_model_of(lens), pose)
-    unit = stated_length(loaded, "m")
+    unit = stated_length(elemental_set, "m")
     with writing_folder(out, replace_only=[f"*{SUFFIX}"] if overwrite else ()) as folder:
         for name, text in models.items():
             write_whole(folder / name, text)

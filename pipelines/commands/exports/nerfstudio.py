@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 
 def export_nerfstudio(
-    elemental_set: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
+    set_path: Annotated[Path, Parameter(name="SESSION|SET")], out: Path, /, *, overwrite: bool = False
 ) -> dict[str, str | int]:
     """Write lens and poses of an elemental set as a transforms.json of nerfstudio and instant-ngp.
 
@@ -17,7 +17,7 @@ def export_nerfstudio(
 
     Parameters
     ----------
-    elemental_set
+    set_path
         A session whose noise and geometry were measured, or a folder with elemental.toml.
     out
         Folder to write.
@@ -29,8 +29,8 @@ def export_nerfstudio(
     from faintfield.pipelines.formats.files import writing_folder
     from faintfield.pipelines.formats.sets.session_set import load_set_or_session
 
-    loaded = load_set_or_session(elemental_set)
-    names = [view.image for view in loaded.settings.view]
+    elemental_set = load_set_or_session(set_path)
+    names = [view.image for view in elemental_set.settings.view]
     with writing_folder(out, replace_only=[FILE_NAME] if overwrite else ()) as folder:
-        write_transforms(folder, names, lens_of_each_view(loaded), loaded.poses_rt_cam_ref)
+        write_transforms(folder, names, lens_of_each_view(elemental_set), elemental_set.poses_rt_cam_ref)
     return {"out": str(out), "views": len(names)}

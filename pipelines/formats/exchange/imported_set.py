@@ -298,6 +298,9 @@ def _copy(path: Path, folder: Path, first: Frame, tone: Tone) -> str:
     return name
 
 
-def lens_of_each_view(loaded: ElementalSet) -> list[Lens]:
+def lens_of_each_view(elemental_set: ElementalSet) -> list[Lens]:
     """Return the lens of each view: the camera's, with the principal point of the view."""
-    return [replace(loaded.lens, cx_px=cx_px, cy_px=cy_px) for cx_px, cy_px in loaded.principal_points_px().tolist()]
+    return [
+        replace(elemental_set.lens, cx_px=cx_px, cy_px=cy_px)
+        for cx_px, cy_px in elemental_set.principal_points_px().tolist()
+    ]

@@ -285,7 +285,7 @@ def _read_flat(path: Path, size_px: tuple[int, int]) -> NDArray[np.float32]:
     return np.asarray(flat, np.float32)
 
 
-def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
+def with_measured_geometry(elemental_set: ElementalSet, path: Path) -> ElementalSet:
     """Return a set with the lens of a geometry.json and each view at its node's measured pose.
 
     Raises
@@ -294,13 +294,13 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
         A view has no node, a node was not measured, the reference is another, or the image has another size.
     """
     path = path / GEOMETRY_FILE if is_folder(path) else path
-    geometry, settings = read_geometry(path, CameraPoses), loaded.settings
+    geometry, settings = read_geometry(path, CameraPoses), elemental_set.settings
     poses = {entry.node: entry.rt_cam_ref for entry in geometry.nodes}
-    _check_match(path, geometry, loaded)
+    _check_match(path, geometry, elemental_set)
     lens = geometry.camera_lens()
     stated = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion")
     camera = msgspec.structs.replace(settings.camera, **{name: getattr(lens, name) for name in stated})
-    shifts_mm = _homing_shifts_mm(path, geometry, loaded)
+    shifts_mm = _homing_shifts_mm(path, geometry, elemental_set)
     views = [
         msgspec.structs.replace(
             view, rt_cam_ref=_shifted(poses[view.node], shifts_mm[view.homing]), cx_px=None, cy_px=None
@@ -309,18 +309,18 @@ def with_measured_geometry(loaded: ElementalSet, path: Path) -> ElementalSet:
         if view.node is not None
     ]
     measured = msgspec.structs.replace(settings, camera=camera, view=views)
-    return replace(loaded, settings=measured, lens=lens, measured_in=path, poses="measured")
+    return replace(elemental_set, settings=measured, lens=lens, measured_in=path, poses="measured")
 
 
-def _homing_shifts_mm(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> dict[int, NDArray[np.float64]]:
+def _homing_shifts_mm(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> dict[int, NDArray[np.float64]]:
     """Return by how much the cameras of each homing are shifted from those of the reference view's."""
-    views = loaded.settings.view
-    of_reference = views[loaded.settings.reference_view].homing
+    views = elemental_set.settings.view
+    of_reference = views[elemental_set.settings.reference_view].homing
     shifts = {homing: geometry.homing_shift_mm(of_reference, homing) for homing in {view.homing for view in views}}
     unknown = [view for view in views if shifts[view.homing] is None]
     if unknown:
         inform(
-            f"{loaded.folder}: the stage homed while the views were taken; {path} knows no shift by that, so "
+            f"{elemental_set.folder}: the stage homed while the views were taken; {path} knows no shift by that, so "
             f"{len(unknown)} of {len(views)} views ({unknown[0].image} is the first) may be off by as much as the "
             "switches repeat; show boards before and after within one sweep, or take the scene again"
         )
@@ -336,9 +336,9 @@ def _shifted(rt_cam_ref: Pose, shift_mm: NDArray[np.float64]) -> Pose:
     return a, b, c, x, y, z
 
 
-def _check_match(path: Path, geometry: CameraPoses, loaded: ElementalSet) -> None:
+def _check_match(path: Path, geometry: CameraPoses, elemental_set: ElementalSet) -> None:
     """Refuse a geometry of images of another size, of other nodes, or with another reference than the set."""
-    settings, nodes = loaded.settings, {entry.node for entry in geometry.nodes}
+    settings, nodes = elemental_set.settings, {entry.node for entry in geometry.nodes}
     if geometry.size_px != settings.camera.size_px:
         raise BadValue(
             f"{path}: is of {geometry.size_px} px images, the set has {settings.camera.size_px}; use its own"

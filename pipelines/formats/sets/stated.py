@@ -26,7 +26,7 @@ _LIGHT = frozenset(
 _UNITS = frozenset({"unit", "depth_map"})
 
 
-def light_per_e(loaded: ElementalSet) -> float:
+def light_per_e(elemental_set: ElementalSet) -> float:
     """Return how much light one electron is, in the unit of the set: by this, light is multiplied where it is written.
 
     Raises
@@ -34,7 +34,7 @@ def light_per_e(loaded: ElementalSet) -> float:
     BadValue
         Light is relative to white, and the set does not say what white is.
     """
-    light, noise = loaded.units.light, loaded.noise
+    light, noise = elemental_set.units.light, elemental_set.noise
     if light == "electrons":
         return 1.0
     gain = float(np.mean(noise.gain_dn_per_e))
@@ -43,10 +43,10 @@ def light_per_e(loaded: ElementalSet) -> float:
     white_dn = float(np.mean(noise.saturation_dn)) - float(np.mean(noise.offset_dn))
     if not (np.isfinite(white_dn) and white_dn > 0):
         raise BadValue(
-            f"{loaded.folder}: light is relative to white, which is {white_dn:g} DN above the dark level; state "
+            f"{elemental_set.folder}: light is relative to white, which is {white_dn:g} DN above the dark level; state "
             "noise.saturation_dn, or units.light"
         )
-    return gain / (white_dn * loaded.frames_per_view)
+    return gain / (white_dn * elemental_set.frames_per_view)
 
 
 def unit_of_maps(units: StatedUnits, *, as_px: bool = False) -> Any:
@@ -54,50 +54,55 @@ def unit_of_maps(units: StatedUnits, *, as_px: bool = False) -> Any:
     return "px" if as_px else units.length or "relative"
 
 
-def stated_length(loaded: ElementalSet, unit: str) -> str:
+def stated_length(elemental_set: ElementalSet, unit: str) -> str:
     """Return the unit of lengths of an export, "relative" if the set has no scale, which a message then says."""
-    if loaded.units.depth == "mm":
+    if elemental_set.units.depth == "mm":
         return unit
-    nodes = " from node to node, for a focal length that was taken" if loaded.units.depth == "disparity_px" else ""
-    inform(f"{loaded.folder}: has no scale, so that lengths are relative{nodes}; scale them when something is measured")
+    nodes = (
+        " from node to node, for a focal length that was taken" if elemental_set.units.depth == "disparity_px" else ""
+    )
+    inform(
+        f"{elemental_set.folder}: has no scale, so that lengths are relative{nodes}; "
+        "scale them when something is measured"
+    )
     return "relative"
 
 
-def plane_stem(loaded: ElementalSet, place: Place) -> str:
+def plane_stem(elemental_set: ElementalSet, place: Place) -> str:
     """Return the name of a plane's files without suffix, by its depth in the unit of the set.
 
     `plane_00500.0` is at 500 mm, `plane_px_-003.250` at a disparity of -3.25 px, and `plane_rel_4.63158` at a relative
     depth, given to six digits.
     """
-    if isinstance(place, TiltedPlane) or loaded.units.depth == "mm":
+    if isinstance(place, TiltedPlane) or elemental_set.units.depth == "mm":
         return plane_name(place)
-    depth = loaded.stated_depth(place)
-    return f"plane_px_{depth:+08.3f}" if loaded.units.depth == "disparity_px" else f"plane_rel_{depth:.6g}"
+    depth = elemental_set.stated_depth(place)
+    return f"plane_px_{depth:+08.3f}" if elemental_set.units.depth == "disparity_px" else f"plane_rel_{depth:.6g}"
 
 
-def rounded_depth(loaded: ElementalSet, depth_mm: float) -> float:
+def rounded_depth(elemental_set: ElementalSet, depth_mm: float) -> float:
     """Return a depth as precisely as the name of a plane states it: to 0.1 mm, 0.001 px of disparity, six digits."""
-    if loaded.units.depth == "mm":
+    if elemental_set.units.depth == "mm":
         return round(depth_mm, 1)
-    if loaded.units.depth == "relative":
+    if elemental_set.units.depth == "relative":
         return float(f"{depth_mm:.6g}")
-    return loaded.depth_of_disparity(round(loaded.disparity_of_depth(depth_mm), 3))
+    return elemental_set.depth_of_disparity(round(elemental_set.disparity_of_depth(depth_mm), 3))
 
 
-def in_units[Record: Struct](loaded: ElementalSet, record: Record) -> Record:
+def in_units[Record: Struct](elemental_set: ElementalSet, record: Record) -> Record:
     """Return a record whose numbers are in the units of the set, given one in mm and electrons."""
-    units = loaded.units
+    units = elemental_set.units
     if (units.depth, units.light) == ("mm", "electrons"):
         return record
-    return _Converter(loaded).record(record)
+    return _Converter(elemental_set).record(record)
 
 
 class _Converter:
     """Converts the numbers of records by the names of their fields."""
 
-    def __init__(self, loaded: ElementalSet) -> None:
-        self._loaded = loaded
-        self._light = light_per_e(loaded)
+    def __init__(self, elemental_set: ElementalSet) -> None:
+        self._loaded = elemental_set
+        self._light = light_per_e(elemental_set)
 
     def record[Record: Struct](self, record: Record) -> Record:
         depth_mm = getattr(record, "depth_mm", None)

@@ -124,15 +124,15 @@ def test_interrupted_pmlem_continues(session: Path) -> None:
 def test_measured_poses_precede_nominal_ones(session: Path, tmp_path: Path) -> None:
     measured = scene_of(session)
     assert measured.poses == f"measured, of {session / 'geometry.json'}"
-    assert measured.loaded.poses_rt_cam_ref[0, 0] == 0.0
-    assert measured.loaded.poses_rt_cam_ref[0, 1] == 0.001
+    assert measured.elemental_set.poses_rt_cam_ref[0, 0] == 0.0
+    assert measured.elemental_set.poses_rt_cam_ref[0, 1] == 0.001
     write_geometry(tmp_path / "geometry.json", 1)
     lacking = scene_of(session, geometry=str(tmp_path))
     assert lacking.poses.startswith("nominal, as the stage is told, because ")
     assert "has no pose for 6 of 9 views" in lacking.poses
-    assert lacking.loaded.lens.fx_px == 400.0
-    np.testing.assert_array_equal(lacking.loaded.poses_rt_cam_ref[:, :3], 0.0)
-    np.testing.assert_allclose(lacking.loaded.poses_rt_cam_ref[0], [0, 0, 0, 30, 30, 0])
+    assert lacking.elemental_set.lens.fx_px == 400.0
+    np.testing.assert_array_equal(lacking.elemental_set.poses_rt_cam_ref[:, :3], 0.0)
+    np.testing.assert_allclose(lacking.elemental_set.poses_rt_cam_ref[0], [0, 0, 0, 30, 30, 0])
 
 
 def unknown_camera(session: Path) -> tuple[FrozenPlan, Frame]:
@@ -148,7 +148,7 @@ def test_missing_noise_gives_dn_but_lens_is_needed(session: Path, tmp_path: Path
     with pytest.raises(MissingFile, match=r"no lens is known, and live planes need one; run .* --geometry or --fx-px"):
         live_scene(order, frozen, frame)
     scene = live_scene(msgspec.structs.replace(order, fx_px=410.0), frozen, frame)
-    assert (scene.unit, scene.knows_noise, scene.loaded.lens.fx_px) == ("DN/px", False, 410.0)
+    assert (scene.unit, scene.knows_noise, scene.elemental_set.lens.fx_px) == ("DN/px", False, 410.0)
     planes = PlanesSoFar(scene, session / "frames", [_DEPTH_MM])
     planes.add(frames_of(session)[8], [0])
     found = planes.picture(0, "view")
