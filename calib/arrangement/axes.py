@@ -109,12 +109,12 @@ def _compare(tables: Tables, chance: Tables, pooled: bool) -> Axes:
         _answer(tables, transposed, opposed, pooled)
         for transposed, opposed in product((False, True), (False, True) if both else (False,))
     ]
-    best = max(answers, key=lambda it: float(it.score.mean()))
+    best = max(answers, key=lambda answer: float(answer.score.mean()))
     others = [answer for answer in answers if answer.transposed != best.transposed]
     contrary = [answer for answer in answers if answer.transposed == best.transposed and answer.opposed != best.opposed]
     by_chance = max(
         (_answer(chance, transposed, opposed, pooled) for transposed, opposed in product((False, True), repeat=2)),
-        key=lambda it: float(it.score.mean()),
+        key=lambda answer: float(answer.score.mean()),
     )
     return Axes(
         best.transposed,
@@ -134,8 +134,8 @@ def _answer(tables: Tables, transposed: bool, opposed: bool, pooled: bool) -> _A
         _Answer(transposed, opposed, float(ratio), _scores(combined(tables, transposed, opposed, float(ratio)), pooled))
         for ratio in ratios
     ]
-    best = max(tried, key=lambda it: float(it.score.mean()))
-    square = min(tried, key=lambda it: abs(np.log(it.ratio)))
+    best = max(tried, key=lambda answer: float(answer.score.mean()))
+    square = min(tried, key=lambda answer: abs(np.log(answer.ratio)))
     # Another ratio needs a reason
     return best if _z(best.score, [square]) > SURE else square
 

@@ -230,7 +230,7 @@ def _shared_noise(fitted: SeriesFit, quantile: float) -> dict[str, Estimate]:
 
 def _profiles(fitted: SeriesFit) -> dict[str, Estimate]:
     """Return the fixed patterns of rows and columns: EMVA 1288's DSNU.row and DSNU.col, in DN."""
-    dark = max(fitted.darks, key=lambda one: one.frames)
+    dark = max(fitted.darks, key=lambda dark: dark.frames)
     parts = nonuniformity(
         map_of(dark.mean_of, fitted.used.shape, np.float64), fitted.used, temporal_noise(dark, fitted.used)
     )

@@ -142,7 +142,7 @@ def _dark_image(
         return None
     most = 0 if nearest else max(item.frames for item in several)
     enough = [dark for dark in several if dark.frames >= most]
-    dark = min(enough, key=lambda one: abs(one.conditions.exposure_s - exposure_s))
+    dark = min(enough, key=lambda dark: abs(dark.conditions.exposure_s - exposure_s))
     mean = map_of(dark.mean_of, used.shape, np.float64)
     offset = calibration.estimates["offset_dn"].value or 0.0
     return MeanImage(dark, mean, temporal_noise(dark, used), mean_over(lambda rows: mean[rows], used) - offset)
@@ -159,7 +159,7 @@ def _bright_image(darks: list[Series], calibration: NoiseCalibration) -> MeanIma
     def off(one: Series) -> float:
         return abs((float(one.levels_dn.mean()) - offset) / span - _BRIGHT_SHARE)
 
-    flat = min(several, key=lambda one: (-one.frames, off(one)) if off(one) < _BRIGHT_WITHIN else (0, off(one)))
+    flat = min(several, key=lambda flat: (-flat.frames, off(flat)) if off(flat) < _BRIGHT_WITHIN else (0, off(flat)))
     dark = _dark_image(darks, calibration, flat.conditions.exposure_s, nearest=True)
     if dark is None:
         return None

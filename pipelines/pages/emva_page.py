@@ -133,10 +133,10 @@ def _in_other_units(known: Mapping[str, Estimate]) -> dict[str, Estimate]:
     """Return 1/K, the dark noise with that of rounding, and DSNU in DN."""
     gain = known["gain_dn_per_e"].value or 0.0
     return {
-        "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda it: 1 / it),
-        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda it: float(np.sqrt(it**2 + ROUNDING_DN2))),
+        "gain_e_per_dn": _mapped(known["gain_dn_per_e"], lambda value: 1 / value),
+        "dark_noise_dn": _mapped(known["read_noise_dn"], lambda noise_dn: float(np.sqrt(noise_dn**2 + ROUNDING_DN2))),
         # DSNU in electrons is that in DN over K, whose own error is not in its interval
-        "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda it: it * gain),
+        "dsnu_total_dn": _mapped(known["dsnu_total_e"], lambda electrons: electrons * gain),
     }
 
 

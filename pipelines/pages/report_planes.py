@@ -144,7 +144,9 @@ def read_planes(directory: Path, results: dict[Path, ReconstructionRecord]) -> l
                 Plane(column, method, result.options.poses, records[0].depth_mm, path, records, units_of(result))
             )
     poses, methods = _POSES_IN_ORDER.index, list(METHOD_NAMES).index
-    return sorted(planes, key=lambda it: (poses(it.poses), it.column.rpartition("/")[0], methods(it.method)))
+    return sorted(
+        planes, key=lambda plane: (poses(plane.poses), plane.column.rpartition("/")[0], methods(plane.method))
+    )
 
 
 def _existing(path: Path) -> Path:

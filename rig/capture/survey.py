@@ -77,7 +77,7 @@ def check_plan(plan: CapturePlan, stage: Gantry, camera: CameraReport) -> None:
     for exposure_s in sorted({exposure_s for step in plan.steps for exposure_s in step.exposure_s}):
         if not camera.offers(exposure_s):
             offered = camera.exposures_s or camera.exposure_range_s or ()
-            nearest = min(offered, key=lambda it: abs(math.log(it / exposure_s)), default=math.nan)
+            nearest = min(offered, key=lambda offer: abs(math.log(offer / exposure_s)), default=math.nan)
             raise PlanRefused(
                 f"exposure_s = {exposure_s:g} is not offered by the camera, the nearest that is: {nearest:g}; "
                 "correct it in rig.toml"

@@ -153,7 +153,7 @@ def line_pattern(darks: Sequence[Series], dsnu_dn2: float) -> LinePattern:
     dsnu_dn2 : float
         Variance of the offsets of the pixels, which scatters the means of rows and columns, too.
     """
-    most = max(darks, key=lambda one: one.frames)
+    most = max(darks, key=lambda dark: dark.frames)
     rows, columns = most.pattern_dn.shape
     patterns, error = [], 0.0
     lines = (most.row_dn, most.row_noise_dn2, columns), (most.column_dn, most.column_noise_dn2, rows)

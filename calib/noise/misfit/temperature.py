@@ -101,7 +101,7 @@ def _doubling(darks: Sequence[Series]) -> Estimate:
 
 def _stated_doubling_k(darks: Sequence[Series]) -> float | None:
     """Return the kelvins over which the stated dark current doubles, None if none is stated."""
-    low, high = (pick(darks, key=lambda one: one.conditions.temperature_c or 0.0).conditions for pick in (min, max))
+    low, high = (pick(darks, key=lambda dark: dark.conditions.temperature_c or 0.0).conditions for pick in (min, max))
     if low.dark_factor == high.dark_factor or low.temperature_c is None or high.temperature_c is None:
         return None
     return float((high.temperature_c - low.temperature_c) / np.log2(high.dark_factor / low.dark_factor))

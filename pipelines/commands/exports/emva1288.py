@@ -78,7 +78,7 @@ def _ordered(folder: Path, settings: "NoiseSet") -> "list[tuple[Conditions, list
                 f"{paths[0]}: states no photons, which an EMVA 1288 descriptor gives for every bright image; add "
                 "photons to its entry, or leave it out"
             )
-    return sorted(series, key=lambda one: (one[0].kind != "flat", one[0].level, one[0].exposure_s))
+    return sorted(series, key=lambda item: (item[0].kind != "flat", item[0].level, item[0].exposure_s))
 
 
 def _bits(settings: "NoiseSet", first: "Frame") -> int:

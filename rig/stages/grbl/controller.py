@@ -125,10 +125,10 @@ class GrblController:
         """Close the connection."""
         self._grbl.close()
 
-    def _unlock_if_kept(self, here: Point) -> bool:
+    def _unlock_if_kept(self, point: Point) -> bool:
         """Clear the lock if the alarm kept the position; return whether it did."""
         # A controller that has restarted unseen reports zero.
-        if self._grbl.alarm != SOFT_LIMIT_ALARM or self._grbl.count_lost or here == (0.0, 0.0):
+        if self._grbl.alarm != SOFT_LIMIT_ALARM or self._grbl.count_lost or point == (0.0, 0.0):
             return False
         self._grbl.alarm = None
         self._grbl.command("$X")

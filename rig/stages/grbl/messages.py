@@ -87,12 +87,12 @@ type Message = Ok | ErrorCode | Alarm | Banner | GrblSetting | Feedback | Report
 
 def parse(line: str) -> Message:
     """Return `line` as a message."""
-    return next((make(found) for form, make in _FORMS if (found := form.fullmatch(line))), Unknown(line))
+    return next((make(match) for form, make in _FORMS if (match := form.fullmatch(line))), Unknown(line))
 
 
-def _report(found: re.Match[str]) -> Report:
+def _report(match: re.Match[str]) -> Report:
     """Return the status report of a match."""
-    state, substate, frame, position, fields = found.groups()
+    state, substate, frame, position, fields = match.groups()
     offset, pins = _OFFSET.search(fields), _PINS.search(fields)
     return Report(
         state=state,
@@ -119,9 +119,9 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] =
         ),
         _report,
     ),
-    (re.compile(r"error:(\d{1,3})"), lambda found: ErrorCode(int(found[1]))),
-    (re.compile(r"ALARM:(\d{1,3})"), lambda found: Alarm(int(found[1]))),
-    (re.compile(rf"\$(\d{{1,3}})=({_NUMBER})"), lambda found: GrblSetting(int(found[1]), found[2])),
-    (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda found: Feedback(found[1], found[2])),
-    (re.compile(r"(Grbl|GrblHAL) (\d{1,2}\.\d{1,2}[a-z]?)(?: .*)?"), lambda found: Banner(found[1], found[2])),
+    (re.compile(r"error:(\d{1,3})"), lambda match: ErrorCode(int(match[1]))),
+    (re.compile(r"ALARM:(\d{1,3})"), lambda match: Alarm(int(match[1]))),
+    (re.compile(rf"\$(\d{{1,3}})=({_NUMBER})"), lambda match: GrblSetting(int(match[1]), match[2])),
+    (re.compile(r"\[([A-Za-z0-9]+):(.*)\]"), lambda match: Feedback(match[1], match[2])),
+    (re.compile(r"(Grbl|GrblHAL) (\d{1,2}\.\d{1,2}[a-z]?)(?: .*)?"), lambda match: Banner(match[1], match[2])),
 )

@@ -97,7 +97,7 @@ type Message = (
 
 def parse(line: str) -> Message:
     """Return `line` as a message."""
-    return next((make(found) for form, make in _FORMS if (found := form.fullmatch(line))), Unknown(line))
+    return next((make(match) for form, make in _FORMS if (match := form.fullmatch(line))), Unknown(line))
 
 
 def numbered(number: int, command: str) -> bytes:
@@ -106,34 +106,34 @@ def numbered(number: int, command: str) -> bytes:
     return line + b"*%d\n" % reduce(xor, line)
 
 
-def _position(found: re.Match[str]) -> PositionReport:
+def _position(match: re.Match[str]) -> PositionReport:
     """Return the positions of a match, by axis."""
-    axes = re.findall(rf"([XYZ]):\s?({_NUMBER})", found[2])
-    return PositionReport({axis: float(value) for axis, value in axes}, is_ok=found[1] is not None)
+    axes = re.findall(rf"([XYZ]):\s?({_NUMBER})", match[2])
+    return PositionReport({axis: float(value) for axis, value in axes}, is_ok=match[1] is not None)
 
 
-def _limits(found: re.Match[str]) -> Limits:
+def _limits(match: re.Match[str]) -> Limits:
     """Return the reachable positions of a match."""
-    x_min, y_min, x_max, y_max = map(float, found.groups())
+    x_min, y_min, x_max, y_max = map(float, match.groups())
     return Limits((x_min, x_max), (y_min, y_max))
 
 
-def _setting(found: re.Match[str]) -> MarlinSetting:
+def _setting(match: re.Match[str]) -> MarlinSetting:
     """Return the command and the parameters of a match."""
-    return MarlinSetting(found[1], {word[0]: float(word[1:]) for word in found[2].split()})
+    return MarlinSetting(match[1], {word[0]: float(word[1:]) for word in match[2].split()})
 
 
 # The forms of lines, each with the function that makes its message of a match.
 _FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] = (
     (re.compile(r"ok(?: N\d+| P\d+| B\d+)*"), lambda _: Ok()),
     (re.compile(rf"(ok )?({_AXES})(?: E:{_NUMBER})?(?: Count:? .*)?"), _position),
-    (re.compile(r"Resend: ?(\d{1,9})"), lambda found: Resend(int(found[1]))),
-    (re.compile(r"(?:echo:)?busy: ?(.*)"), lambda found: Busy("paused" in found[1])),
+    (re.compile(r"Resend: ?(\d{1,9})"), lambda match: Resend(int(match[1]))),
+    (re.compile(r"(?:echo:)?busy: ?(.*)"), lambda match: Busy("paused" in match[1])),
     (re.compile(r"start"), lambda _: Start()),
-    (re.compile(r"echo:(Unknown command:.*|Home .*First.*)", re.IGNORECASE), lambda found: Refusal(found[1])),
-    (re.compile(r"(?:Error: ?|!! ?)(.+)"), lambda found: ErrorText(found[1], bool(_TRANSMISSION.search(found[1])))),
-    (re.compile(r"FIRMWARE_NAME:(.+?)(?: [A-Z_]+:.*)?"), lambda found: Firmware(found[1])),
-    (re.compile(r"Cap:([A-Z0-9_]+):([01])"), lambda found: Capability(found[1], found[2] == "1")),
+    (re.compile(r"echo:(Unknown command:.*|Home .*First.*)", re.IGNORECASE), lambda match: Refusal(match[1])),
+    (re.compile(r"(?:Error: ?|!! ?)(.+)"), lambda match: ErrorText(match[1], bool(_TRANSMISSION.search(match[1])))),
+    (re.compile(r"FIRMWARE_NAME:(.+?)(?: [A-Z_]+:.*)?"), lambda match: Firmware(match[1])),
+    (re.compile(r"Cap:([A-Z0-9_]+):([01])"), lambda match: Capability(match[1], match[2] == "1")),
     (re.compile(rf"area:\{{.*work:\{{{_AREA_BOX}.*"), _limits),
     (
         re.compile(
@@ -142,6 +142,6 @@ _FORMS: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Message]], ...] =
         ),
         _limits,
     ),
-    (re.compile(r"([xyz]_(?:min|max)): (open|TRIGGERED)"), lambda found: Switch(found[1], found[2] == "TRIGGERED")),
+    (re.compile(r"([xyz]_(?:min|max)): (open|TRIGGERED)"), lambda match: Switch(match[1], match[2] == "TRIGGERED")),
     (re.compile(rf"(?:echo:)?\s*([MG]\d{{1,4}})((?: [A-Z]{_NUMBER})+)(?: ;.*)?"), _setting),
 )
